@@ -151,8 +151,8 @@ fn an_agent_shows_what_it_believes_of_the_worlds_that_are_decided_for() {
     let observer = Observer::agents(&server.instance).expect("observe");
     let (agent, learner) = start_at(&server.instance, 1, "--worlds 2");
     for (objectives, expected) in [
-        ([Some(2), Some(3)], vec![(1, "fire"), (2, "entropy")]),
-        ([None, Some(0)], vec![(2, "normal")]),
+        ([Some(0), Some(3)], vec![(1, "exploit"), (2, "entropy")]),
+        ([None, Some(4)], vec![(2, "coverage")]),
     ] {
         let mut shown = BTreeSet::new();
         let are_shown = eventually(PATIENCE, || {

@@ -3,7 +3,7 @@
 use crate::commands::{agent, check};
 use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::student::network::{KIND, SavedNetwork};
+use agent::learning::learners::network::{KIND, SavedNetwork};
 use protocol::Move;
 use std::path::Path;
 use tests::harness::{AGENT, Server, fly};
@@ -120,39 +120,24 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
 }
 
 #[test]
-fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
-    for (input, length) in [("after_frame", 4), ("summary", 74)] {
-        let place = place(&SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{input}\"")));
-        place.learn("out", &format!("{WORLD} --steps 15"));
-        let stored = state(&contents(&place.checkpoint("out")));
-        let transitions = stored.dqn.transitions;
-        assert_eq!(transitions.len(), 15, "{input}");
-        for pair in transitions.windows(2) {
-            assert_eq!(pair[0].next.len(), length, "{input}");
-            assert_eq!(pair[0].next, pair[1].input, "{input}");
-        }
-        if input == "after_frame" {
-            assert_eq!(transitions[14].next, stored.position.follower.hidden());
-        }
-        let checkpoint = place.checkpoint("out");
-        let checkpoint = checkpoint.display();
-        let worlds = format!("--seeds 3..4 --steps 5 {WORLD} --shooting-samples 16");
-        let policies = "--policies autoencoder_policy,coverage --baseline coverage";
-        let compared = agent(&format!(
-            "compare {policies} --checkpoint {checkpoint} {worlds}"
-        ));
-        compared.check_prints("autoencoder_policy");
-        let other = if input == "summary" {
-            "after_frame"
-        } else {
-            "summary"
-        };
-        let settings = SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{other}\""));
-        place.set(&settings);
-        let resume = place.words("out", &format!("{WORLD} --steps 8 --resume"));
-        let words = format!("dqn.input: expected {other}, got {input}");
-        check(AGENT, &resume, &words);
+fn actions_go_by_the_hidden_vector() {
+    let place = place(SETTINGS);
+    place.learn("out", &format!("{WORLD} --steps 15"));
+    let stored = state(&contents(&place.checkpoint("out")));
+    let transitions = stored.dqn.transitions;
+    assert_eq!(transitions.len(), 15);
+    for pair in transitions.windows(2) {
+        assert_eq!((pair[0].next.len(), &pair[0].next), (4, &pair[1].input));
     }
+    assert_eq!(transitions[14].next, stored.position.follower.hidden());
+    let checkpoint = place.checkpoint("out");
+    let checkpoint = checkpoint.display();
+    let worlds = format!("--seeds 3..4 --steps 5 {WORLD} --shooting-samples 16");
+    let policies = "--policies autoencoder_policy,coverage --baseline coverage";
+    let compared = agent(&format!(
+        "compare {policies} --checkpoint {checkpoint} {worlds}"
+    ));
+    compared.check_prints("autoencoder_policy");
 }
 
 #[test]

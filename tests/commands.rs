@@ -1,6 +1,6 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use agent::planning::policy;
+use agent::policy;
 use protocol::Model;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
@@ -85,9 +85,9 @@ serve-decisions --instance nobody --wait 0 => no server on instance "nobody"
 serve-decisions --instance a/b => instance name | "a/b"
 serve-decisions --world x => --world | 'x'
 serve-decisions --worlds 0 => --worlds | 1..=1024
-serve-decisions --planner random_walk => --planner | beam, shooting
-serve-decisions --planner => --planner | beam, shooting
-serve-decisions --estimator truth => --estimator | known_model, spatial_filter
+serve-decisions --estimator truth => --estimator | known_model, spatial_filter, learned_filter
+serve-decisions --estimator learned_filter => --estimator learned_filter: expected --checkpoint FILE
+serve-decisions --checkpoint no.safetensors => no.safetensors | No such file
 serve-decisions --model no.toml => model file no.toml | No such file
 serve-decisions --config no.toml => config file no.toml | No such file
 serve-decisions --preset paper --config config/agent.toml => expected no file beside --preset paper

@@ -205,8 +205,8 @@ fn a_second_model_runs_from_end_to_end() {
         &folder.path().join("ice.csv"),
         &format!("{flags} {figures}"),
     );
-    // Fourteen policies: the ladder has one for each of three states beside the one that pays.
-    assert_eq!(rows.len(), 14 * 2, "{rows:?}");
+    // Fifteen policies: the ladder has one for each of three states beside the one that pays.
+    assert_eq!(rows.len(), 15 * 2, "{rows:?}");
     assert!(folder.path().join("figures/snapshot.png").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");

@@ -2,9 +2,10 @@
 
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
+use agent::client::errors;
 use agent::config::AgentConfig;
-use agent::planning::policy::{EstimatorKind, PlannerKind};
-use agent::server::errors;
+use agent::learning::learned::Learned;
+use agent::policy::EstimatorKind;
 use protocol::Client;
 use protocol::channels::{ChannelError, Instance};
 use protocol::client::Claim;
@@ -62,10 +63,10 @@ fn attach(server: &Server) -> Decider {
         worlds: 0..1,
         takeover: false,
         estimator: EstimatorKind::KnownModel,
-        planner: PlannerKind::Beam,
         config: AgentConfig::default(),
+        learned: Learned::default(),
     };
-    let (info, model) = prepare(&task.instance, &task.worlds, None).expect("a server");
+    let (info, model) = prepare(&task.instance, &task.worlds, None, true).expect("a server");
     let shape = info.shape().expect("a grid");
     let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
     Decider::attach(&task, model, prior.expect("a belief")).expect("attach")

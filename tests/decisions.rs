@@ -10,12 +10,15 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use rustix::process::Signal;
 use tests::harness::{Program, SMALL, Server, frames_until, new_instance, seed, seen_in};
 use tests::learner::{
-    Learner, decide, decisions, refusal, reset, start_agent, start_at, start_with_learner,
+    Learner, decide, decisions, features, refusal, reset, start_agent, start_at, start_with_learner,
 };
 use tests::wire::control_header;
 
 /// A world in which something burns.
 const BURNING: &str = "--height 32 --width 24 --moves 24 --burn-in 10000";
+
+/// The objective to exploit.
+const EXPLOIT: u64 = 0;
 
 /// What does not depend on what the learner decided before the reset.
 fn comparable(decision: Decision) -> Decision {
@@ -45,15 +48,16 @@ fn hello_tells_what_can_be_decided() {
     assert_eq!(info.pid, agent.pid());
     assert_eq!(info.instance, server.instance.name());
     assert_eq!(info.states, ["normal", "latent", "fire"]);
-    assert_eq!(info.objectives, ["normal", "latent", "fire", "entropy"]);
-    assert_eq!((&*info.estimator, &*info.planner), ("known_model", "beam"));
-    assert_eq!(info.summary.len(), learner.last().summary.len());
+    assert_eq!(info.objectives.len(), 8);
+    assert_eq!(info.objectives[0], "exploit");
+    assert_eq!((&*info.estimator, info.features.len()), ("known_model", 26));
+    assert_eq!(features(&learner.last()).len(), 8 * 26);
     assert_eq!(server.status().worlds[0].holder_pids, [Some(agent.pid())]);
 }
 
 #[test]
-fn a_decision_is_the_step_that_an_agent_of_that_objective_makes() {
-    assert_the_same_steps("beam_fire", "known_model");
+fn exploiting_makes_the_steps_of_a_policy_that_does() {
+    assert_the_same_steps("beam_exploit", "known_model");
 }
 
 #[test]
@@ -61,7 +65,7 @@ fn decisions_are_made_on_the_spatial_belief() {
     assert_the_same_steps("spatial_beam", "spatial_filter");
 }
 
-/// A policy that plans for fire makes the steps of decisions for fire with an estimator.
+/// A policy that exploits makes the steps of decisions to exploit with its estimator.
 fn assert_the_same_steps(policy: &str, estimator: &str) {
     let flags = format!("{BURNING} --seed 2");
     let (server, other) = (Server::start(&flags), Server::start(&flags));
@@ -83,33 +87,61 @@ fn assert_the_same_steps(policy: &str, estimator: &str) {
             learner.reset(seed);
         }
         for (world, robot, _) in &flown {
-            let made = learner.decide(2);
+            let made = learner.decide(EXPLOIT);
             assert_eq!((made.step, made.reward), (world.step, world.reward));
             assert_eq!(made.n_hits, world.n_hits);
             assert_eq!(made.robot, [robot.row, robot.col]);
-            assert_eq!(made.objective, Some(2));
-            let mut summary = made.summary.iter();
-            assert!(summary.all(|number| (0.0..=1.0).contains(number)));
+            assert_eq!(made.objective, Some(EXPLOIT));
         }
     }
 }
 
 #[test]
+fn features_say_what_the_paths_will_find_and_what_the_last_one_found() {
+    let server = Server::start(&format!("{BURNING} --seed 2"));
+    let (_agent, learner) = start_with_learner(&server.instance, "");
+    let info = learner.hello();
+    let feature = |made: &Decision, name: &str, objective: usize| {
+        let at = info.features.iter().position(|known| known == name);
+        features(made)[objective * info.features.len() + at.expect(name)]
+    };
+    let first = learner.reset(2);
+    for (objective, name) in info.objectives.iter().enumerate() {
+        for which in 0..info.objectives.len() {
+            let is_it = f32::from(u8::from(which == objective));
+            assert_eq!(feature(&first, &format!("is_{name}"), which), is_it);
+        }
+        assert_eq!(feature(&first, "n_paths", objective), 0.0);
+    }
+    let next = learner.decide(EXPLOIT);
+    for objective in 0..info.objectives.len() {
+        assert_eq!(feature(&next, "n_paths", objective), 1.0 / 200.0);
+        let reward = feature(&next, "last_reward", objective);
+        assert_eq!(reward, next.reward as f32 / info.n_moves as f32);
+    }
+    // No path promises more of what pays than the one that is planned for it, nor more that is new.
+    let most = |name: &str| {
+        let values = (0..info.objectives.len()).map(|objective| feature(&next, name, objective));
+        values.fold(0.0, f32::max)
+    };
+    let coverage = info.objectives.iter().position(|name| name == "coverage");
+    let novelty = feature(&next, "path_novelty", coverage.expect("an option"));
+    assert!(novelty > 0.9 * most("path_novelty"));
+    assert!(feature(&next, "path_probability", 0) > 0.9 * most("path_probability"));
+}
+
+#[test]
 fn the_same_seed_and_objectives_give_the_same_decisions() {
     let server = Server::start(BURNING);
-    let objectives = [2, 3, 0, 1, 2, 2, 3];
-    for planner in ["beam", "shooting"] {
-        let flags = format!("--planner {planner} --shooting-samples 64");
-        let (agent, learner) = start_with_learner(&server.instance, &flags);
-        assert_eq!(learner.hello().planner, planner);
-        let first = episode(&learner, 7, &objectives);
-        assert_eq!(first[0].step, 0);
-        assert_eq!((first[0].objective, first[0].reward), (None, 0.0));
-        episode(&learner, 8, &[3, 3]);
-        assert_eq!(episode(&learner, 7, &objectives), first);
-        assert_ne!(episode(&learner, 7, &[3; 7]), first);
-        agent.finish();
-    }
+    let objectives = [2, 3, 0, 7, 5, 6, 3];
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    let first = episode(&learner, 7, &objectives);
+    assert_eq!(first[0].step, 0);
+    assert_eq!((first[0].objective, first[0].reward), (None, 0.0));
+    episode(&learner, 8, &[3, 3]);
+    assert_eq!(episode(&learner, 7, &objectives), first);
+    assert_ne!(episode(&learner, 7, &[3; 7]), first);
+    agent.finish();
     let (_agent, learner) = start_with_learner(&server.instance, "--agent-seed 1");
     learner.reset(1);
     let worlds = vec![seed(0, None)];
@@ -171,22 +203,22 @@ fn what_some_worlds_cannot_do_is_refused_for_all() {
     assert!(before[2].truncated && !before[2].terminated);
     let malformed = "malformed control message: ";
     let count = format!("{malformed}objectives: expected 3, one a world, got");
-    let objective = "objective: expected 0 to 3, got";
+    let objective = "objective: expected 0 to 7, got";
     let no_world = "no such world: the agent has worlds 1 to 3, got";
     let twice = format!("{malformed}reset: expected each world once, got world 2 twice");
     let over = "world 3 was truncated: reset it first";
-    let high = decide(&[Some(2), Some(4), None]);
+    let high = decide(&[Some(2), Some(8), None]);
     let highest = decide(&[Some(2), None, Some(u64::MAX)]);
     let ended = decide(&[Some(2), None, Some(2)]);
     let [below, above] = [0, 4].map(|world| reset(&[(1, 5), (world, 5)]));
     for (request, status, detail, words) in [
         (decide(&[]), Malformed, 0, format!("{count} 0")),
         (decide(&[Some(2); 4]), Malformed, 0, format!("{count} 4")),
-        (high, BadObjective, 4, format!("{objective} 4 for world 2")),
+        (high, BadObjective, 8, format!("{objective} 8 for world 2")),
         (
             highest,
             BadObjective,
-            4,
+            8,
             format!("{objective} {} for world 3", u64::MAX),
         ),
         (decide(&[Some(2); 3]), EpisodeOver, 3, over.into()),

@@ -1,8 +1,8 @@
 //! What the next agent believes: what the last one left, or what the kept frames tell.
 
-use agent::estimation::belief::Belief;
-use agent::estimation::{BayesFilter, Estimator};
-use agent::server::left_belief::{leave_belief, left_belief};
+use agent::client::left_belief::{leave_belief, left_belief};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::{BayesFilter, Handover};
 use protocol::control::{LeftPart, Reply, Request};
 use protocol::message::{FrameHeader, Status};
 use protocol::observer::Observer;

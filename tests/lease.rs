@@ -105,7 +105,10 @@ fn a_seventeenth_client_is_told_the_limit_and_others_go_on() {
     let others: Vec<Wire> = (0..15).map(|_| Wire::open(&server.instance)).collect();
     let refused = Connection::open(&server.instance, "tests", PATIENCE);
     let problem = refused.err().expect("a seventeenth client").to_string();
-    assert!(problem.contains("more than 16 clients"), "{problem}");
+    assert!(
+        problem.contains("at most 16 clients at a time"),
+        "{problem}"
+    );
     fly(&mut holder, Paths::new(0).next(6));
     drop(others);
     server.connect();

@@ -11,7 +11,7 @@ use tests::harness::{SMALL, program_path};
 fn apart(script: &str) -> Option<Output> {
     let run = |script: &str| {
         let mut command = Command::new("unshare");
-        let script = format!("mount -t tmpfs tmpfs /dev/shm && {script}");
+        let script = format!("mount -t tmpfs -o size=256m tmpfs /dev/shm && {script}");
         let kind = if rustix::process::getuid().is_root() {
             "-m"
         } else {
@@ -81,4 +81,42 @@ fn what_cannot_be_read_of_a_living_server_stays() {
     let said = String::from_utf8_lossy(&output.stdout);
     let warned = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("it ended with 0"), "{said} {warned}");
+}
+
+#[test]
+fn a_server_in_another_pid_namespace_is_called_so_and_goes_on() {
+    let script = format!(
+        "$S {SMALL} & server=$!
+         until $S status >/dev/null 2>&1; do sleep 0.01; done
+         unshare -p -f --mount-proc sh -c '$S status; $S stop; $S {SMALL}'
+         $S status && kill $server; wait $server; echo it ended with $?"
+    );
+    let Some(output) = apart(&script) else { return };
+    let said = String::from_utf8_lossy(&output.stdout);
+    let warned = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("it ended with 0"), "{said} {warned}");
+    let refusal = "served from another PID namespace";
+    assert_eq!(warned.matches(refusal).count(), 3, "{warned}");
+}
+
+#[test]
+fn a_full_shared_memory_is_called_so_and_kills_nobody() {
+    let fill = "fallocate -l $(($(stat -f -c '%a * %S' /dev/shm) - LEFT)) /dev/shm/filler";
+    for left in [0, 8192, 65536] {
+        let fill = fill.replace("LEFT", &left.to_string());
+        let script = format!(
+            "$S {SMALL} & server=$!
+             until $S status >/dev/null 2>&1; do sleep 0.01; done
+             {fill}; $S status; echo status ended with $?; rm /dev/shm/filler
+             $S status && kill $server; wait $server; echo it ended with $?"
+        );
+        let Some(output) = apart(&script) else { return };
+        let said = String::from_utf8_lossy(&output.stdout);
+        let warned = String::from_utf8_lossy(&output.stderr);
+        let refusal = "expected 512 KiB free in /dev/shm, got";
+        assert!(warned.contains(refusal), "{left}: {warned}");
+        for expected in ["status ended with 1", "it ended with 0"] {
+            assert!(said.contains(expected), "{left}: {said} {warned}");
+        }
+    }
 }

@@ -2,7 +2,7 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::recording::{read, read_whole, start_recorder, start_replay, stop, truths};
-use agent::server::truth::TruthFeed;
+use agent::client::truth::TruthFeed;
 use ndarray::{Array3, ArrayView2, Axis};
 use ndarray_npy::WriteNpyExt;
 use protocol::channels::Instance;
@@ -301,6 +301,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     for policy in [
         "coverage",
         "oracle_beam",
+        "oracle_ahead",
         "random_walk",
         "learned_beam",
         "learned_spatial_beam",

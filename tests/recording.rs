@@ -106,6 +106,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         protocol: VERSION,
         build: "0.1.0".into(),
         pid: 1,
+        pid_namespace: None,
         height: 2,
         width: 3,
         n_moves: 1,

@@ -3,9 +3,9 @@
 use crate::commands::{agent, check, check_table};
 use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learner::KIND;
-use agent::learning::learner::Learner;
-use agent::learning::student::filter::SavedFilter;
+use agent::learning::learners::filter::SavedFilter;
+use agent::learning::learners::filter::fit::KIND;
+use agent::learning::learners::filter::fit::Learner;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
@@ -355,8 +355,9 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
 #[test]
 fn decisions_are_learned_and_enter_the_ladder() {
     let place = place();
-    let settings = "learner = \"decisions\"\nbeam_width = 4\nprior_worlds = 2\n\
-                    [decisions]\nbatch = 8\nreplay = 100\nupdates_per_step = 1.0\n";
+    let settings = "learner = \"decisions\"\nbeam_width = 4\nprior_worlds = 2\n[learning]\nwindow = 4\n\
+                    [decisions]\nfilter_steps = 40\nbatch = 8\nreplay = 100\nupdates_per_step = 1.0\n\
+                    episode_steps = 9\n";
     place.set(settings);
     place.train("out", &format!("{WORLDS} --steps 60"));
     place.train("out", &format!("{WORLDS} --steps 40 --resume"));
@@ -368,17 +369,35 @@ fn decisions_are_learned_and_enter_the_ladder() {
     let checkpoint = place.checkpoint("out");
     let worlds =
         "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 --beam-width 4";
-    let policies = "--policies dqn_beam,act_exploit --baseline act_exploit";
-    let compare = format!("compare {policies} {worlds}");
+    let compare = format!("compare --policies options --baseline learned_exploit {worlds}");
     let compared = agent(&format!("{compare} --checkpoint {}", checkpoint.display()));
-    compared.check_prints("dqn_beam");
-    check(AGENT, &compare, "dqn_beam | --checkpoint FILE");
-    let other = format!("{compare} --model config/models/road-ice.toml");
-    let other = format!("{other} --checkpoint {}", checkpoint.display());
-    let root = repository().display().to_string();
-    let other = other.replace("config/models", &format!("{root}/config/models"));
-    check(AGENT, &other, "states: expected");
+    for policy in [
+        "random_walk",
+        "learned_exploit_ahead_3",
+        "learned_rule",
+        "learned_policy",
+    ] {
+        compared.check_prints(policy);
+    }
+    check(AGENT, &compare, "options | --checkpoint FILE");
+    let one = format!("compare --policies known_policy --baseline coverage {worlds}");
+    let one = format!("{one} --checkpoint {}", checkpoint.display());
+    check(AGENT, &one, "known_policy | known_model");
     let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
     let flags = format!("--instance {} --worlds 2 --steps 4", server.instance.name());
-    check(AGENT, &place.words("hidden", &flags), "--reveal-model true");
+    let known = format!("{flags} --estimator known_model");
+    check(AGENT, &place.words("hidden", &known), "--reveal-model true");
+    check(
+        AGENT,
+        &place.words("hidden", &format!("{flags} --estimator filter")),
+        "--estimator | got",
+    );
+    // The filter of an earlier training, on worlds whose model nobody tells.
+    let filter = place.checkpoint("out/filter");
+    let given = format!(
+        "{flags} --estimator learned_spatial_filter --checkpoint {}",
+        filter.display()
+    );
+    place.train("given", &given);
+    assert!(!place.path("given/filter").exists());
 }

@@ -1,12 +1,12 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
-use agent::Belief;
 use agent::config::AgentConfig;
-use agent::estimation::parameters::{Dimensions, Parameters, Tables};
-use agent::estimation::{BayesFilter, Estimator};
-use agent::learning::filter::Trainer;
+use agent::learning::filter::Optimiser;
 use agent::learning::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::path::fly;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Move, Shape};
@@ -72,7 +72,7 @@ fn updates(c: &mut Criterion) {
         let pool = pool.expect("threads");
         let mut replay = replay(is_straight);
         let config = AgentConfig::default().learning;
-        let mut trainer = Trainer::new(parameters(sees_own_state), shape(), config, 0);
+        let mut optimiser = Optimiser::new(parameters(sees_own_state), shape(), config, 0);
         let paths = if is_straight {
             "straight flights"
         } else {
@@ -83,7 +83,7 @@ fn updates(c: &mut Criterion) {
             format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2){kernels}");
         c.bench_function(&name, |b| {
             b.iter(|| {
-                pool.install(|| trainer.update(&mut replay, Some(2)))
+                pool.install(|| optimiser.update(&mut replay, Some(2)))
                     .expect("finite")
             });
         });

@@ -16,8 +16,8 @@ pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use train::TrainCommand;
 
-use agent::planning::policy;
-use agent::server::errors::refusal;
+use agent::client::errors::refusal;
+use agent::policy;
 use protocol::Model;
 use protocol::message::Status;
 use std::process::ExitCode;

@@ -7,11 +7,13 @@ pub use sections::{
 };
 
 use self::sections::check;
-use crate::estimation::Prior;
-use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use crate::policy::{PlannerKind, Policy};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use emberwatch_belief::estimation::Prior;
+use emberwatch_belief::planning::{
+    Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -58,7 +60,7 @@ pub enum LearnerKind {
     OwnFilter,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
-    /// A DQN that chooses among actions of beam search on the known model's belief
+    /// A DQN that chooses among options on an estimator's belief; the filter is learned first, unless it is given
     Decisions,
 }
 
@@ -167,7 +169,7 @@ impl AgentConfig {
         let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
         let coverage_bonus = match policy.planner {
             _ if keeps => own.coverage_bonus,
-            PlannerKind::Beam => settings.beam_bonus,
+            PlannerKind::Beam | PlannerKind::BeamAhead => settings.beam_bonus,
             PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
         };
         Objective {
@@ -191,6 +193,7 @@ impl AgentConfig {
                 self.shooting_integration,
             )),
             PlannerKind::Beam => Box::new(BeamSearch::new(self.beam_width)),
+            PlannerKind::BeamAhead => Box::new(Ahead::new(self.beam_width)),
         }
     }
 }
@@ -294,8 +297,8 @@ mod tests {
                 "unknown variant `prior`, expected `predictor` or `estimate`",
             ),
             (
-                "[dqn]\ninput = \"h\"",
-                "unknown variant `h`, expected `after_frame` or `summary`",
+                "[decisions]\nestimator = \"filter\"",
+                "expected one of known_model, spatial_filter, learned_filter",
             ),
         ] {
             let error = AgentConfig::from_toml(text).expect_err("no such name");

@@ -1,31 +1,8 @@
-//! From frames to a belief about every cell (paper sections III.A to III.C).
-//!
-//! A new estimator is one file with an [`Estimator`], and a line where policies get theirs
-//! ([`crate::acting::registry`]).
+//! Estimators that need networks, and the first belief of the others.
 
 pub mod autoencoder;
-pub mod bayes;
-pub mod belief;
-pub mod correlations;
-pub mod dqn_input;
-pub mod estimator;
-pub mod filter;
 pub mod first_belief;
 pub mod follower;
-mod innovation;
-pub mod parameters;
-pub mod prior;
-pub mod scoring;
-pub mod spatial;
-mod spread;
-pub mod summary;
-pub mod truth;
 
 pub use autoencoder::AutoencoderEstimator;
-pub use bayes::ZeroEvidence;
-pub use correlations::Correlations;
-pub use estimator::{Estimator, EstimatorError};
-pub use filter::BayesFilter;
 pub use follower::Follower;
-pub use prior::Prior;
-pub use spatial::SpatialFilter;

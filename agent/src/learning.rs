@@ -3,10 +3,9 @@
 pub mod checkpoint;
 pub mod filter;
 pub mod learned;
-pub mod learner;
+pub mod learners;
 pub mod metrics;
 pub mod replay;
 pub mod reward;
-pub mod student;
 pub mod tensorboard;
 pub mod train;

@@ -7,23 +7,20 @@
 //! - [`acting`] -- one world of a running server, for a policy or for a learner outside
 //! - [`learning`] -- models that are learned while acting, and their checkpoints
 //! - [`rollout`] -- an agent, and the one step that all of these take
-//! - [`server`] -- the ends of the wire
+//! - [`client`] -- the ends of the wire
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files written whole or not at all
-//! - [`planning`] -- from a belief to a path
-//! - [`estimation`] -- from frames to a belief
+//! - [`policy`] -- policies by name
+//! - [`estimation`] -- estimators that need networks; the others are in the crate `emberwatch-belief`
 
 #![allow(missing_docs, reason = "a program: what names say is not said again")]
 
 pub mod acting;
 pub mod benchmark;
+pub mod client;
 pub mod config;
 pub mod estimation;
 pub mod file;
 pub mod learning;
-pub mod planning;
+pub mod policy;
 pub mod rollout;
-pub mod server;
-
-pub use estimation::belief::{Belief, EntropyKind};
-pub use planning::{Objective, Planner, PlanningProblem};

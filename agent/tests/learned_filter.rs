@@ -1,11 +1,11 @@
 //! The learned filter against the known-model filter, finite differences and itself.
 
-use agent::Belief;
 use agent::config::{AgentConfig, LearningConfig};
-use agent::estimation::parameters::{Dimensions, Parameters, Tables};
-use agent::estimation::{BayesFilter, Estimator};
-use agent::learning::filter::{Trainer, Update, Window};
+use agent::learning::filter::{Optimiser, Recursion, Update};
 use agent::learning::replay::{Replay, Sighting};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Model, Probabilities, Shape};
 
@@ -65,8 +65,8 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
             for number in 0..30 {
                 let frame = frame(shape, model.n_observations(), number);
-                known.correct(&frame, None).expect("possible");
-                learned.correct(&frame, None).expect("possible");
+                known.correct(&frame).expect("possible");
+                learned.correct(&frame).expect("possible");
                 known.predict();
                 learned.predict();
             }
@@ -167,7 +167,7 @@ fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bo
     let belief = belief(dimensions.n_states, shape, 4);
     let start = from_belief.then_some(belief.as_slice());
     let mut end = vec![0.0; belief.as_slice().len()];
-    let outcome = Window::new(tables.clone(), shape, 5).run(start, &frames, &mut end);
+    let outcome = Recursion::new(tables.clone(), shape, 5).run(start, &frames, &mut end);
     let numbers = [tables.kernel, tables.likelihood, tables.initial];
     let numbers = numbers.map(|table| table.into_iter().map(f64::from).collect::<Vec<f64>>());
     let expected = -loss(dimensions, &numbers, shape, start, &frames);
@@ -218,14 +218,12 @@ fn every_gradient_agrees_with_finite_differences() {
 fn check_window(tables: Tables) {
     let shape = Shape::new(7, 18).expect("test shape");
     let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
-    let mut window = Window::new(tables, shape, 8);
+    let mut window = Recursion::new(tables, shape, 8);
     let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
     let mut end = vec![0.0; 3 * shape.n_cells()];
     window.run(None, &frames, &mut end);
     for number in 0..8 {
-        filter
-            .correct(&frame(shape, 3, number), None)
-            .expect("possible");
+        filter.correct(&frame(shape, 3, number)).expect("possible");
         filter.predict();
     }
     let most = filter.belief().as_slice().iter().zip(&end);
@@ -288,25 +286,25 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
     }
 }
 
-fn trainer(shape: Shape, seed: u64) -> Trainer {
+fn optimiser(shape: Shape, seed: u64) -> Optimiser {
     trainer_of(false, shape, seed)
 }
 
-fn trainer_of(sees_own_state: bool, shape: Shape, seed: u64) -> Trainer {
+fn trainer_of(sees_own_state: bool, shape: Shape, seed: u64) -> Optimiser {
     let parameters = Parameters::first(dimensions(sees_own_state), seed);
-    Trainer::new(parameters, shape, config(), seed)
+    Optimiser::new(parameters, shape, config(), seed)
 }
 
 fn updates(n: usize, sees_own_state: bool, seed: u64) -> (Vec<Update>, Parameters) {
     let shape = Shape::new(10, 12).expect("test shape");
-    let mut trainer = trainer_of(sees_own_state, shape, seed);
+    let mut optimiser = trainer_of(sees_own_state, shape, seed);
     let mut replay = replay(shape, 40);
-    let update = |_| trainer.update(&mut replay, Some(2)).expect("finite");
+    let update = |_| optimiser.update(&mut replay, Some(2)).expect("finite");
     let updates: Vec<Update> = (0..n)
         .map(update)
         .map(|update| update.expect("full"))
         .collect();
-    (updates, trainer.parameters().clone())
+    (updates, optimiser.parameters().clone())
 }
 
 #[test]
@@ -340,24 +338,24 @@ fn training_lowers_the_loss() {
 fn training_waits_for_a_block_for_each_stream() {
     let shape = Shape::new(10, 12).expect("test shape");
     let mut replay = replay(shape, 16); // 4 blocks
-    let update = trainer(shape, 0).update(&mut replay, None);
+    let update = optimiser(shape, 0).update(&mut replay, None);
     assert_eq!(update.expect("finite"), None);
 }
 
 #[test]
 fn a_number_that_is_not_finite_stops_training_by_name() {
     let shape = Shape::new(10, 12).expect("test shape");
-    let mut parameters = trainer(shape, 0).parameters().clone();
+    let mut parameters = optimiser(shape, 0).parameters().clone();
     parameters.tensors[1][4] = f32::NAN;
     let before = format!("{parameters:?}");
-    let mut trainer = Trainer::new(parameters, shape, config(), 0);
-    let error = trainer
+    let mut optimiser = Optimiser::new(parameters, shape, config(), 0);
+    let error = optimiser
         .update(&mut replay(shape, 40), None)
         .expect_err("NaN");
     let words = "update 1: likelihood: expected finite numbers, got a parameter that is not";
     assert_eq!(error.to_string(), words);
     assert_eq!(
-        format!("{:?}", trainer.parameters()),
+        format!("{:?}", optimiser.parameters()),
         before,
         "changed nothing"
     );

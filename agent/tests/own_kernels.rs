@@ -1,10 +1,10 @@
 //! Kernels that see the cell's own state, learned from frames of worlds that have such kernels.
 
-use agent::Belief;
 use agent::config::AgentConfig;
-use agent::estimation::parameters::{Dimensions, Parameters, Tables};
-use agent::estimation::{BayesFilter, Estimator};
-use agent::learning::learner::{LearnedModel, Learner};
+use agent::learning::learners::filter::fit::{FilterFit, LearnedModel};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::path::fly;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
@@ -36,7 +36,7 @@ struct World {
 }
 
 impl World {
-    fn new(model: &Model, learner: &Learner, seed: u64) -> Self {
+    fn new(model: &Model, learner: &FilterFit, seed: u64) -> Self {
         let mut dynamics = Dynamics::new(model, shape()).expect("a valid model");
         let mut states = dynamics.initial(seed);
         (0..500).for_each(|n| dynamics.step(seed, n, &mut states));
@@ -79,7 +79,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     let mut config = AgentConfig::default();
     config.learning.steady_updates = 600;
     config.learning.falling_updates = 400;
-    let mut learner = Learner::new(dimensions(sees_own_state), shape(), &config);
+    let mut learner = FilterFit::new(dimensions(sees_own_state), shape(), &config);
     let worlds = 0..N_WORLDS;
     let mut worlds: Vec<World> = worlds
         .map(|world| World::new(model, &learner, 1000 + u64::from(world)))
@@ -90,7 +90,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
         for (number, world) in (0..N_WORLDS).zip(&mut worlds) {
             let (frame, visited) = world.fly(model, step);
             learner.see(number, &frame, Some(world.filter.belief()), &learned);
-            world.filter.correct(&frame, None).expect("possible");
+            world.filter.correct(&frame).expect("possible");
             let states = world.states.as_slice().expect("row-major");
             let burning = visited.iter().filter(|&&cell| states[cell] == 1).count();
             learner.reward(world.filter.belief(), &visited, burning as f64);

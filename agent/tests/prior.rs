@@ -1,6 +1,6 @@
 //! The subcommand `prior`: what it writes is what a filter of the same settings begins with.
 
-use agent::estimation::Prior;
+use emberwatch_belief::estimation::Prior;
 use ndarray_npy::read_npy;
 use protocol::{Model, Probabilities, Shape};
 use std::path::Path;

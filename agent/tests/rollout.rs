@@ -1,11 +1,11 @@
 //! The step of agents that plan for one robot or several.
 
-use agent::Belief;
 use agent::acting::registry::{Task, agent};
 use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
-use agent::rollout::{self, Robot, Seen};
+use agent::policy::Policy;
+use agent::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
+use emberwatch_belief::Belief;
 use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::path::fly;
@@ -46,7 +46,7 @@ fn seen(step: u64, flights: &[(Cell, &[Move])]) -> Seen {
 }
 
 /// An agent at the start of a made-up world, with robots at these cells.
-fn robot(policy: &str, cells: &[Cell]) -> Robot {
+fn robot(policy: &str, cells: &[Cell]) -> Rollout {
     let model = Model::wildfire();
     let task = Task {
         model: &model,
@@ -59,7 +59,7 @@ fn robot(policy: &str, cells: &[Cell]) -> Robot {
     let policy = Policy::named(policy, &model).expect("known");
     let agent = agent(&policy, &AgentConfig::default(), task).expect("an agent");
     let flights: Vec<(Cell, &[Move])> = cells.iter().map(|&cell| (cell, &[][..])).collect();
-    Robot::at(agent, seen(0, &flights)).expect("possible")
+    Rollout::begun(agent, seen(0, &flights)).expect("possible")
 }
 
 const CELLS: [Cell; 3] = [
@@ -74,28 +74,20 @@ fn paths_are_flown_by_robot_and_each_agent_sees_its_own() {
     let single = robot("beam_exploit", &CELLS[2..]);
     let mut agents = [team, single];
     for step in 1..5 {
-        let cells: Vec<Vec<Cell>> = agents.iter().map(cells).collect();
-        let mut turns = Vec::new();
-        rollout::step(
-            &mut agents,
-            |robot| robot,
-            Robot::plan,
-            |paths| {
-                assert_eq!(paths.len(), 3);
-                let flights = |agent: usize, first: usize| -> Vec<(Cell, &[Move])> {
-                    let own = cells[agent].iter().copied();
-                    own.zip(paths[first..].iter().map(|path| &**path)).collect()
-                };
-                Ok(vec![seen(step, &flights(0, 0)), seen(step, &flights(1, 2))])
-            },
-            |index, robot, turn| {
-                assert_eq!(robot.observation().world.step, step);
-                turns.push((index, turn.plans.len()));
-                Ok(())
-            },
-        )
-        .expect("possible");
-        assert_eq!(turns, [(0, 2), (1, 1)]);
+        let cells: Vec<Vec<Cell>> = agents.iter().map(Rollout::cells).collect();
+        let plans = plan_all(&mut agents);
+        let planned: Vec<usize> = plans.iter().map(Vec::len).collect();
+        assert_eq!(planned, [2, 1]);
+        let paths = paths_of(&plans);
+        assert_eq!(paths.len(), 3);
+        let flights = |agent: usize, first: usize| -> Vec<(Cell, &[Move])> {
+            let own = cells[agent].iter().copied();
+            own.zip(paths[first..].iter().map(|path| &**path)).collect()
+        };
+        let seen = vec![seen(step, &flights(0, 0)), seen(step, &flights(1, 2))];
+        see_all(&mut agents, seen).expect("possible");
+        assert!(agents.iter().all(|agent| agent.step() == step));
+        predict_all(&mut agents);
         // No two paths of a team meet where there is room for both.
         let n_visited: u32 = agents[0].results().map(|it| it.n_visited).sum();
         assert_eq!(
@@ -118,7 +110,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         let (own, of_team) = (alone.plan(), team.plan());
         assert_eq!((own.len(), of_team.len()), (1, 3), "{policy}");
         // The same beliefs: planned first and alone, unless a teammate's answer was better.
-        let first = team.plan_with(|agent, cells, step| agent.plan(&cells[..1], step));
+        let first = team.agent.plan(&CELLS[..1], team.step());
         assert_eq!(own, first, "{policy}");
     }
 }
@@ -128,29 +120,17 @@ fn who_missed_steps_believes_what_one_believes_who_saw_nothing_in_them() {
     let mut late = robot("beam_exploit", &CELLS[..1]);
     let mut hovering = robot("beam_exploit", &CELLS[..1]);
     for step in 1..4 {
-        let nothing = |_: &[Vec<Move>]| Ok(vec![seen(step, &[(CELLS[0], &[])])]);
-        let plan = |robot: &mut Robot| robot.plan();
-        let look = |_: usize, _: &mut Robot, _| Ok(());
-        rollout::step(
-            std::slice::from_mut(&mut hovering),
-            |robot| robot,
-            plan,
-            nothing,
-            look,
-        )
-        .expect("possible");
+        hovering.plan();
+        let nothing = seen(step, &[(CELLS[0], &[])]);
+        hovering.see(nothing).expect("possible");
+        hovering.agent.predict();
         if step < 3 {
             late.agent.predict();
         }
     }
-    late.catch_up(seen(3, &[(CELLS[0], &[])]))
-        .expect("possible");
+    late.see(seen(3, &[(CELLS[0], &[])])).expect("possible");
     late.agent.predict();
     assert_eq!(late.agent.belief(), hovering.agent.belief());
     assert_eq!(late.observation(), hovering.observation());
     assert_eq!(late.plan(), hovering.plan());
-}
-
-fn cells(robot: &Robot) -> Vec<Cell> {
-    robot.results().map(RobotResult::cell).collect()
 }

@@ -5,6 +5,7 @@ mod completions;
 mod descriptors;
 mod files;
 mod liveness;
+mod memory;
 mod pending;
 mod ports;
 mod publications;

@@ -25,7 +25,7 @@ pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
-    payload, recording, responder, turn, wait,
+    payload, recording, responder, shared_memory, turn, wait,
 };
 
 #[cfg(doctest)]

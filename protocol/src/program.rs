@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use tracing_subscriber::EnvFilter;
 
 /// The name that `agent` uses.
-pub use crate::wire::process::{NotRunning, WatchedProcess};
+pub use crate::wire::process::{NotRunning, WatchedProcess, node_pid, pid_namespace};
 
 /// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;

@@ -2,8 +2,8 @@
 //!
 //! [`message`], [`payload`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
 //! [`connection`] and [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
-//! [`node`], [`turn`] and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps
-//! samples in a file.
+//! [`node`], [`turn`] and [`cleanup`] create and remove channels, [`shared_memory`] gives them memory; [`wait`] is the
+//! bounded wait. [`recording`] keeps samples in a file.
 
 pub mod agent_belief;
 mod channel_files;
@@ -26,7 +26,9 @@ pub mod payload;
 mod poll;
 pub(crate) mod process;
 pub mod recording;
+mod resources;
 pub mod responder;
+pub mod shared_memory;
 mod spinning;
 pub mod turn;
 pub mod wait;

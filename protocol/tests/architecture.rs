@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 9] = [
+const SOURCES: [&str; 10] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+    "agent/belief/src",
     "agent/figures/src",
     "agent/network/src",
     "clients/dashboard/src",
@@ -19,10 +20,11 @@ const SOURCES: [&str; 9] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 8] = [
+const CRATES: [&str; 9] = [
     "protocol",
     "env-server",
     "agent",
+    "agent/belief",
     "agent/figures",
     "agent/network",
     "clients/dashboard",
@@ -135,7 +137,13 @@ fn the_index_of_documents_is_complete() {
 
 #[test]
 fn every_test_file_is_in_its_program() {
-    for name in ["agent", "clients/dashboard", "protocol", "tests"] {
+    for name in [
+        "agent",
+        "agent/belief",
+        "clients/dashboard",
+        "protocol",
+        "tests",
+    ] {
         let folder = root()
             .join(name)
             .join(if name == "tests" { "" } else { "tests" });
@@ -150,6 +158,16 @@ fn every_test_file_is_in_its_program() {
             .collect();
         assert!(missing.is_empty(), "{name}: not in main.rs: {missing:?}");
     }
+}
+
+#[test]
+fn the_readme_shows_the_example_of_the_crate() {
+    let example = |text: &'static str| {
+        let (_, rest) = text.split_once("```rust,no_run\n").expect("an example");
+        rest.split_once("```").expect("its end").0
+    };
+    let of_crate = example(include_str!("../README.md"));
+    assert_eq!(example(include_str!("../../README.md")), of_crate);
 }
 
 #[test]

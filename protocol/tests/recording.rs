@@ -18,6 +18,7 @@ fn server(height: usize, width: usize, n_moves: usize) -> Event {
         protocol: VERSION,
         build: "0.1.0".into(),
         pid: 7,
+        pid_namespace: None,
         height,
         width,
         n_moves,

@@ -313,7 +313,6 @@ fn every_message_of_decisions_has_an_example_that_round_trips() {
             }
             serde_json::to_string(&reply)
         };
-        // As text: JSON knows no 32-bit floats.
         let again: Value = serde_json::from_str(&again.expect("serialises")).expect("JSON");
         assert_eq!(again, value);
     }

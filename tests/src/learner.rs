@@ -4,6 +4,8 @@ use crate::harness::{AGENT, PATIENCE, Program, eventually, seed};
 use crate::wire::{
     ControlAnswer, Pending, Requests, answer, answer_by, client, control_header, send,
 };
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -202,6 +204,14 @@ pub fn decisions(reply: Reply) -> Vec<Decision> {
         Reply::Decisions { worlds } => worlds,
         other => panic!("expected decisions, got {other:?}"),
     }
+}
+
+/// The numbers that describe the plans after a decision.
+pub fn features(decision: &Decision) -> Vec<f32> {
+    let bytes = BASE64.decode(&decision.features).expect("base64");
+    let numbers = bytes.chunks_exact(4).map(|bytes| bytes.try_into());
+    let numbers = numbers.map(|bytes| f32::from_le_bytes(bytes.expect("four bytes")));
+    numbers.collect()
 }
 
 fn one(mut decisions: Vec<Decision>) -> Decision {

@@ -95,7 +95,7 @@ fn steps(c: &mut Criterion) {
 fn dqn(c: &mut Criterion) {
     let number = |index: u64| (split_mix(7, index) >> 40) as f32 / (1 << 24) as f32;
     let vector = |first: u64| (0..16).map(|i| number(first + i)).collect::<Vec<f32>>();
-    let mut dqn = Dqn::new(DqnSettings::paper(), 16, 4, 1);
+    let mut dqn = Dqn::new(DqnSettings::paper(), DqnShape::of_actions(16, 4), 1);
     for row in 0..1000 {
         dqn.remember(Transition {
             input: vector(row * 100),

@@ -1,13 +1,13 @@
-//! The DQN of paper section III.E (eqs. 16 to 21): which objective the next path is for.
+//! The DQN of paper section III.E (eqs. 16 to 21): what the next path is for.
 //!
-//! Its input is the autoencoder's hidden vector, or any other summary of the belief. A transition is
-//! never terminal: episodes are cut off, the world goes on. It stays on the CPU: its layers are so small
+//! It reads the autoencoder's hidden vector and gives the value of each objective, or it reads the numbers of each
+//! candidate path and gives that path's value ([`DqnShape`]). A transition is never terminal: episodes are cut off, the world goes on. It stays on the CPU: its layers are so small
 //! that a copy to a device and back takes longer.
 
 mod learner;
 mod state;
 mod track;
 
-pub use learner::{Dqn, DqnSettings};
+pub use learner::{Dqn, DqnSettings, DqnShape};
 pub use state::SavedDqn;
 pub use track::{Track, Transition};

@@ -1,27 +1,31 @@
-//! The agent's side of decisions: plan for the objectives asked, step, correct, predict.
+//! The agent's side of decisions: fly the options chosen, correct, predict, plan all options for the next choice.
 //!
-//! What [`crate::acting::run`] does with an objective of its own, one step at a time and in many worlds. Each has one
+//! What [`crate::acting::run`] does with a policy of its own, one step at a time and in many worlds. Each has one
 //! robot, so that worlds and robots have the same numbers.
 
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
+use crate::client::errors::refused;
+use crate::client::feed::{Feed, View};
+use crate::client::info::connect;
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
-use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
-use crate::planning::Objective;
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::rollout::{self, Robot, Seen, in_parallel};
-use crate::server::errors::refused;
-use crate::server::feed::Feed;
-use crate::server::info::connect;
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::rollout::agent::Agent;
+use crate::rollout::{Rollout, Seen, in_parallel, see_all};
 use anyhow::Result;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::options::feature_names;
+use emberwatch_belief::planning::{OPTIONS, Proposal, Target};
 use protocol::channels::Instance;
 use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::{ServerInfo, WorldSeed};
 use protocol::decisions::{AgentInfo, Decision};
 use protocol::message::{Status, VERSION};
+use protocol::program::pid_namespace;
 use protocol::{Client, Model, Move};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
@@ -36,30 +40,41 @@ pub struct Assignment {
     pub instance: Instance,
     pub worlds: Range<u32>,
     pub takeover: bool,
-    /// What keeps the beliefs: the known model's filter, or the spatial one.
+    /// What keeps the beliefs.
     pub estimator: EstimatorKind,
-    /// What plans: beam search or shooting.
-    pub planner: PlannerKind,
     pub config: AgentConfig,
+    /// What was learned, for estimators that it is for.
+    pub learned: Learned,
 }
 
-/// Worlds, the beliefs about them, and the objectives that a decision chooses among.
+/// Worlds, the beliefs about them, and the plans that a decision chooses among.
 pub struct Decider {
     client: Client,
-    model: Model,
-    prior: Belief,
-    config: AgentConfig,
-    choices: Vec<Policy>,
+    crew: Crew,
     worlds: Vec<World>,
     last_use: Instant,
     info: AgentInfo,
     feed: Feed,
 }
 
-/// A world with its robot, and where the belief about it stands.
+/// What robots are made of.
+struct Crew {
+    model: Model,
+    prior: Belief,
+    config: AgentConfig,
+    learned: Learned,
+    policy: Policy,
+    n_moves: usize,
+}
+
+/// A world with its agent, and what it can fly next.
 struct World {
     number: u32,
-    robot: Robot,
+    rollout: Rollout,
+    /// In the order of [`OPTIONS`].
+    proposals: Vec<Proposal>,
+    /// Time that they took.
+    planning: Duration,
     last: Decision,
 }
 
@@ -72,31 +87,34 @@ impl Decider {
         };
         let mut client = Client::acquire(connect(&task.instance)?, &claim)?;
         let observations = client.observe(client.robots())?;
-        let choices = Policy::choices(task.estimator, task.planner, &model.state_names());
-        let mut decider = Self {
-            last_use: Instant::now(),
-            info: agent_info(task, &model, &choices, client.info()),
-            feed: Feed::open(&task.instance, &prior),
-            client,
+        let target = Target::State(model.target_state());
+        let info = agent_info(task, &model, client.info());
+        let crew = Crew {
             model,
             prior,
             config: task.config.clone(),
-            choices,
-            worlds: Vec::new(),
+            learned: task.learned.clone(),
+            policy: Policy::new("decisions", task.estimator, PlannerKind::Beam, target),
+            n_moves: client.info().n_moves,
         };
+        let feed = Feed::open(&task.instance, crew.agent(0)?.belief());
+        let mut worlds = Vec::new();
         for (number, observation) in task.worlds.clone().zip(observations) {
-            let mut robot = decider.robot(observation)?;
-            if !resume(&mut decider.client, number, &mut robot)? {
-                robot.begin(None, |_| ())?;
+            let mut rollout = crew.rollout(observation)?;
+            if !resume(&mut client, number, &mut rollout)? {
+                rollout.correct()?;
+                rollout.agent.predict();
             }
-            let last = decision(&robot, decider.n_moves(), None);
-            decider.worlds.push(World {
-                number,
-                robot,
-                last,
-            });
+            worlds.push(World::new(number, rollout));
         }
-        Ok(decider)
+        Ok(Self {
+            client,
+            crew,
+            worlds,
+            last_use: Instant::now(),
+            info,
+            feed,
+        })
     }
 
     pub fn info(&self) -> &AgentInfo {
@@ -123,14 +141,14 @@ impl Decider {
         let shown = self.feed.turn(seeds.len());
         for (turn, &WorldSeed { world, .. }) in seeds.iter().enumerate() {
             let index = (world - worlds.start) as usize;
-            let mut robot = self.robot(observations[index].clone())?;
-            robot.begin(None, |robot| {
-                if shown.contains(&turn) {
-                    self.feed.show(&robot.view(world, world..world + 1));
-                }
-            })?;
-            let last = decision(&robot, self.n_moves(), None);
-            (self.worlds[index].robot, self.worlds[index].last) = (robot, last);
+            let mut rollout = self.crew.rollout(observations[index].clone())?;
+            rollout.correct()?;
+            if shown.contains(&turn) {
+                let view = View::of(&rollout, world, world..world + 1, Duration::ZERO);
+                self.feed.show(&view);
+            }
+            rollout.agent.predict();
+            self.worlds[index] = World::new(world, rollout);
         }
         Ok(self.last())
     }
@@ -140,40 +158,32 @@ impl Decider {
     /// # Errors
     /// After a refusal everything is as it was.
     pub fn decide(&mut self, objectives: &[Option<u64>]) -> Result<Vec<Decision>> {
-        let targets = self.targets(objectives)?;
-        let n_moves = self.n_moves();
-        let runs = self.worlds.iter_mut().zip(&targets);
-        let runs = runs.filter_map(|(world, target)| Some((world, (*target)?)));
-        let mut runs: Vec<(&mut World, (u64, Objective))> = runs.collect();
-        if runs.is_empty() {
+        let choices = self.choices(objectives)?;
+        let chosen = self.worlds.iter_mut().zip(&choices);
+        let chosen = chosen.filter_map(|(world, choice)| Some((world, (*choice)?)));
+        let mut chosen: Vec<(&mut World, usize)> = chosen.collect();
+        if chosen.is_empty() {
             return Ok(self.last());
         }
-        let worlds: Vec<u32> = runs.iter().map(|run| run.0.number).collect();
-        let shown = self.feed.turn(runs.len());
-        rollout::step(
-            &mut runs,
-            |(world, _)| &mut world.robot,
-            |(world, (_, objective))| {
-                let robot = &mut world.robot;
-                robot.plan_with(|agent, robots, step| agent.plan_for(*objective, robots, step))
-            },
-            |paths| {
-                let observations = step(&mut self.client, &worlds, paths)?;
-                self.last_use = Instant::now();
-                let seen = observations.into_iter();
-                Ok(seen.map(|observation| Seen::new([observation])).collect())
-            },
-            |turn, (world, _), _| {
-                if shown.contains(&turn) {
-                    let number = world.number;
-                    self.feed
-                        .show(&world.robot.view(number, number..number + 1));
-                }
-                Ok(())
-            },
-        )?;
-        in_parallel(runs.into_iter(), |(world, (asked, _))| {
-            world.last = decision(&world.robot, n_moves, Some(asked));
+        let worlds: Vec<u32> = chosen.iter().map(|(world, _)| world.number).collect();
+        let paths = chosen
+            .iter_mut()
+            .map(|(world, choice)| world.take_up(*choice));
+        let paths: Vec<Vec<Move>> = paths.collect();
+        let observations = step(&mut self.client, &worlds, &paths)?;
+        self.last_use = Instant::now();
+        let seen = observations.into_iter();
+        let seen = seen.map(|observation| Seen::new([observation])).collect();
+        see_all(chosen.iter_mut().map(|(world, _)| &mut world.rollout), seen)?;
+        for turn in self.feed.turn(worlds.len()) {
+            let (world, _) = &chosen[turn];
+            let robots = world.number..world.number + 1;
+            let view = View::of(&world.rollout, world.number, robots, world.planning);
+            self.feed.show(&view);
+        }
+        in_parallel(chosen, |(world, choice)| {
+            world.rollout.agent.predict();
+            world.look(Some(choice));
         });
         Ok(self.last())
     }
@@ -201,58 +211,89 @@ impl Decider {
 
     pub fn release(mut self) -> Result<()> {
         for world in &self.worlds {
-            leave(&mut self.client, world.number, &world.robot)?;
+            leave(&mut self.client, world.number, &world.rollout)?;
         }
         Ok(self.client.release()?)
     }
 
-    fn n_moves(&self) -> usize {
-        self.client.info().n_moves
-    }
-
-    /// A robot before it takes in what its world shows.
-    fn robot(&self, observation: Observation) -> Result<Robot> {
-        let task = Task {
-            model: &self.model,
-            shape: self.client.shape(),
-            n_moves: self.n_moves(),
-            prior: &self.prior,
-            seed: self.config.planner_seed(observation.world.seed),
-            learned: &Learned::default(),
-        };
-        // Any choice will do: each has the same estimator and planner.
-        let agent = registry::agent(&self.choices[0], &self.config, task)?;
-        Ok(Robot::new(agent, Seen::new([observation])))
-    }
-
-    /// What each world is to move for, if at all; all are checked before any moves.
-    fn targets(&self, asked: &[Option<u64>]) -> Result<Vec<Option<(u64, Objective)>>> {
+    /// What each world is to fly, if anything; all are checked before any moves.
+    fn choices(&self, asked: &[Option<u64>]) -> Result<Vec<Option<usize>>> {
         let (expected, got) = (self.worlds.len(), asked.len());
         if got != expected {
             let problem = format!("objectives: expected {expected}, one a world, got {got}");
             let message = format!("{}: {problem}", Status::Malformed.explain(0));
             return Err(refused(Status::Malformed, 0, message).into());
         }
-        let targets = self.worlds.iter().zip(asked).map(|(world, objective)| {
-            let target = |index| Ok((index, self.target(world, index)?));
-            objective.map(target).transpose()
-        });
-        targets.collect()
+        let choices = self.worlds.iter().zip(asked);
+        let choices = choices
+            .map(|(world, objective)| objective.map(|index| world.choice(index)).transpose());
+        Ok(choices.collect::<Result<_, _>>()?)
+    }
+}
+
+impl Crew {
+    fn agent(&self, world_seed: u64) -> Result<Agent> {
+        let task = Task {
+            model: &self.model,
+            shape: self.prior.shape(),
+            n_moves: self.n_moves,
+            prior: &self.prior,
+            seed: self.config.planner_seed(world_seed),
+            learned: &self.learned,
+        };
+        registry::agent(&self.policy, &self.config, task)
     }
 
-    fn target(&self, world: &World, index: u64) -> Result<Objective, ConnectionError> {
+    /// An agent before it takes in what its world shows.
+    fn rollout(&self, observation: Observation) -> Result<Rollout> {
+        let agent = self.agent(observation.world.seed)?;
+        Ok(Rollout::new(agent, Seen::new([observation])))
+    }
+}
+
+impl World {
+    /// Where an agent has taken in what its world shows.
+    fn new(number: u32, rollout: Rollout) -> Self {
+        let mut world = Self {
+            number,
+            proposals: Vec::new(),
+            planning: Duration::ZERO,
+            last: decision(&rollout, None, &[]),
+            rollout,
+        };
+        world.look(None);
+        world
+    }
+
+    /// The option of a number.
+    fn choice(&self, index: u64) -> Result<usize, ConnectionError> {
         let choice = usize::try_from(index).ok();
-        let Some(choice) = choice.and_then(|index| self.choices.get(index)) else {
-            let (status, detail) = (Status::BadObjective, self.choices.len() as u64);
+        let Some(choice) = choice.filter(|&choice| choice < OPTIONS.len()) else {
+            let (status, detail) = (Status::BadObjective, OPTIONS.len() as u64);
             let expected = status.explain(detail);
-            let message = format!("{expected}, got {index} for world {}", world.number);
+            let message = format!("{expected}, got {index} for world {}", self.number);
             return Err(refused(status, detail, message));
         };
-        if world.robot.observation().world.truncated != 0 {
-            let (status, detail) = (Status::EpisodeOver, world.number.into());
+        if self.rollout.observation().world.truncated != 0 {
+            let (status, detail) = (Status::EpisodeOver, self.number.into());
             return Err(refused(status, detail, status.explain(detail)));
         }
-        Ok(self.config.objective(choice))
+        Ok(choice)
+    }
+
+    /// The path of an option.
+    fn take_up(&mut self, choice: usize) -> Vec<Move> {
+        let proposal = self.proposals[choice].clone();
+        self.rollout.agent.take_up(choice, proposal).moves
+    }
+
+    /// Takes in what the robot saw after a choice, and plans for the next.
+    fn look(&mut self, choice: Option<usize>) {
+        let start = Instant::now();
+        let cell = self.rollout.observation().robot.cell();
+        self.proposals = self.rollout.agent.propose(cell);
+        self.planning = start.elapsed();
+        self.last = decision(&self.rollout, choice, &self.proposals);
     }
 }
 
@@ -277,9 +318,11 @@ fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
     refused(Status::NoSuchWorld, worlds.len() as u64, message)
 }
 
-fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
-    let observation = robot.observation();
+fn decision(rollout: &Rollout, choice: Option<usize>, proposals: &[Proposal]) -> Decision {
+    let observation = rollout.observation();
     let (result, cell) = (&observation.world, observation.robot.cell());
+    let features = proposals.iter().flat_map(|proposal| proposal.features);
+    let features: Vec<u8> = features.flat_map(f32::to_le_bytes).collect();
     Decision {
         step: result.step,
         reward: result.reward,
@@ -291,21 +334,17 @@ fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
         truncated: result.truncated != 0,
         seed: result.seed,
         episode: result.episode,
-        objective,
-        summary: summarise(robot.agent.belief(), cell, n_moves),
+        objective: choice.map(|choice| choice as u64),
+        features: BASE64.encode(features),
     }
 }
 
-fn agent_info(
-    task: &Assignment,
-    model: &Model,
-    choices: &[Policy],
-    server: &ServerInfo,
-) -> AgentInfo {
+fn agent_info(task: &Assignment, model: &Model, server: &ServerInfo) -> AgentInfo {
     AgentInfo {
         protocol: VERSION,
         build: env!("CARGO_PKG_VERSION").into(),
         pid: std::process::id(),
+        pid_namespace: pid_namespace(),
         instance: task.instance.name().into(),
         first_world: task.worlds.start,
         n_worlds: task.worlds.len() as u32,
@@ -314,9 +353,8 @@ fn agent_info(
         n_moves: server.n_moves,
         max_steps: server.max_steps,
         states: model.state_names(),
-        objectives: choices.iter().map(|choice| choice.name.clone()).collect(),
+        objectives: OPTIONS.iter().map(|option| option.name.into()).collect(),
         estimator: task.estimator.label().into(),
-        planner: task.planner.label().into(),
-        summary: summary_names(model),
+        features: feature_names(),
     }
 }

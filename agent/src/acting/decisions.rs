@@ -5,9 +5,10 @@
 
 use crate::acting::decider::{Assignment, Decider};
 use crate::acting::mission::prepare;
+use crate::client::errors::{is_outage, refusal};
 use crate::estimation::first_belief::first_belief;
-use crate::server::errors::{is_outage, refusal};
 use anyhow::{Result, ensure};
+use emberwatch_belief::estimation::Prior;
 use protocol::Model;
 use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::parse;
@@ -65,14 +66,19 @@ impl Service {
         exit_with: Option<WatchedProcess>,
     ) -> Result<Self> {
         // What takes long is done before anybody can ask and before the lease begins to run.
-        let (info, model) = prepare(&task.instance, &task.worlds, model)?;
+        let knows_model = task.estimator.knows_model();
+        let (info, model) = prepare(&task.instance, &task.worlds, model, knows_model)?;
         ensure!(
             info.n_robots == 1,
             "serve-decisions flies one robot a world: expected a server with --robots 1, got {}",
             info.n_robots
         );
         let shape = info.shape()?;
-        let prior = task.config.prior(info.burn_in);
+        let prior = if knows_model {
+            task.config.prior(info.burn_in)
+        } else {
+            Prior::Initial
+        };
         let prior = first_belief(prior, &model, shape, task.config.seed)?;
         let responder = Responder::open(&task.instance, task.worlds.start)?;
         let decider = Decider::attach(task, model, prior)?;

@@ -1,8 +1,8 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::rollout::{Robot, Seen};
-use crate::server::left_belief::{leave_belief, left_belief};
+use crate::client::left_belief::{leave_belief, left_belief};
+use crate::rollout::{Rollout, Seen};
 use anyhow::Result;
 use protocol::Client;
 use protocol::connection::ConnectionError;
@@ -13,12 +13,12 @@ const RENEW_AFTER: u64 = 500;
 
 /// Gives an agent what is known of its world before the present frame; returns whether that frame is in it already,
 /// and the belief about X_{k+1}. `number`: that of its first robot.
-pub fn resume(client: &mut Client, number: u32, robot: &mut Robot) -> Result<bool> {
-    if take_over_left(client, number, robot)? {
+pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result<bool> {
+    if take_over_left(client, number, rollout)? {
         return Ok(true);
     }
-    let step = robot.observation().world.step;
-    if !robot.agent.estimator().sees_frames() {
+    let step = rollout.step();
+    if !rollout.agent.policy().estimator.sees_frames() {
         return Ok(false);
     }
     let first = first_kept(client, number, step)?;
@@ -26,7 +26,7 @@ pub fn resume(client: &mut Client, number: u32, robot: &mut Robot) -> Result<boo
         if (past - first) % RENEW_AFTER == 0 {
             client.renew()?; // Recalling is no use of the lease.
         }
-        if !recall(client, number, robot, past)? {
+        if !recall(client, number, rollout, past)? {
             client.renew()?; // Says so if the robot is another's by now.
             break;
         }
@@ -43,25 +43,26 @@ pub fn resume(client: &mut Client, number: u32, robot: &mut Robot) -> Result<boo
 }
 
 /// Brings an agent that missed steps to what its world shows now; its belief is then the posterior.
-pub fn catch_up(client: &mut Client, number: u32, robot: &mut Robot, seen: Seen) -> Result<()> {
-    let missed = robot.observation().world.step + 1..seen.observation.world.step;
-    if robot.agent.estimator().sees_frames() {
+pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
+    let missed = rollout.step() + 1..seen.observation.world.step;
+    if rollout.agent.policy().estimator.sees_frames() {
         for past in missed {
-            if !recall(client, number, robot, past)? {
-                robot.agent.predict(); // Nothing is known of what it saw, if anything.
+            if !recall(client, number, rollout, past)? {
+                rollout.agent.predict(); // Nothing is known of what it saw, if anything.
             }
         }
     }
-    robot.catch_up(seen)
+    rollout.see(seen)?;
+    Ok(())
 }
 
 /// Gives an agent the frame of an earlier step; returns whether it is kept.
-fn recall(client: &mut Client, number: u32, robot: &mut Robot, step: u64) -> Result<bool> {
+fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) -> Result<bool> {
     let Ok(seen) = client.recall(number..number + 1, step) else {
         return Ok(false);
     };
-    robot.agent.correct(&seen[0].frame, None)?;
-    robot.agent.predict();
+    rollout.agent.correct(&seen[0].frame, None)?;
+    rollout.agent.predict();
     Ok(true)
 }
 
@@ -70,17 +71,16 @@ fn recall(client: &mut Client, number: u32, robot: &mut Robot, step: u64) -> Res
 pub fn take_over_left(
     client: &mut Client,
     number: u32,
-    robot: &mut Robot,
+    rollout: &mut Rollout,
 ) -> Result<bool, ConnectionError> {
-    let step = robot.observation().world.step;
-    let estimator = robot.agent.estimator_mut();
-    let Some(kind) = estimator.kind() else {
+    let step = rollout.step();
+    let Some(estimator) = rollout.agent.estimator_mut().handover_mut() else {
         return Ok(false);
     };
-    let Some(memory) = left_belief(client, number, &kind)? else {
+    let Some(left) = left_belief(client, number, &estimator.kind())? else {
         return Ok(false);
     };
-    let is_taken = estimator.remember(&memory);
+    let is_taken = estimator.restore(&left);
     if is_taken {
         tracing::info!(
             robot = number,
@@ -92,13 +92,13 @@ pub fn take_over_left(
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one of a robot.
-pub fn leave(client: &mut Client, number: u32, robot: &Robot) -> Result<(), ConnectionError> {
-    let (agent, present) = (&robot.agent, robot.observation());
-    let Some(kind) = agent.estimator().kind() else {
+pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
+    let present = rollout.observation().world;
+    let Some(estimator) = rollout.agent.estimator().handover() else {
         return Ok(());
     };
-    let memory = agent.estimator().memory();
-    match leave_belief(client, number, &present.world, &kind, &memory) {
+    let (kind, bytes) = (estimator.kind(), estimator.to_bytes());
+    match leave_belief(client, number, &present, &kind, &bytes) {
         // A server that keeps no beliefs, or none that is so long.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

@@ -1,9 +1,9 @@
 //! What an agent is told to do on one world of a running server, and whether that server can be acted on.
 
+use crate::client::errors::refused;
+use crate::client::info::connect;
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
-use crate::server::errors::refused;
-use crate::server::info::connect;
 use anyhow::{Result, bail, ensure};
 use protocol::Model;
 use protocol::channels::Instance;
@@ -76,14 +76,17 @@ impl Mission {
     }
 }
 
-/// What a server says of itself, and its model, or the one given; checks that it has the worlds.
+/// What a server says of itself, and its model, or the one given; checks that it has the worlds. Who needs no model gets
+/// the states of recorded worlds as one.
 pub fn prepare(
     instance: &Instance,
     worlds: &Range<u32>,
     model: Option<&Model>,
+    needs_model: bool,
 ) -> Result<(ServerInfo, Model)> {
     let info = info_of(instance, worlds)?;
-    let model = model_of(instance, &info, model)?;
+    let recorded = recorded_states(&info)?.filter(|_| model.is_none() && !needs_model);
+    let model = recorded.map_or_else(|| model_of(instance, &info, model), Ok)?;
     Ok((info, model))
 }
 

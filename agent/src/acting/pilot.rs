@@ -3,29 +3,26 @@
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
 use crate::acting::registry::{self, Task, needs_model};
-use crate::estimation::Prior;
-use crate::estimation::belief::Belief;
+use crate::client::errors::is_late;
+use crate::client::feed::{Feed, View};
+use crate::client::info::{connect, is_belief_left};
+use crate::client::truth::TruthFeed;
 use crate::estimation::first_belief::first_belief;
-use crate::planning::Plan;
-use crate::planning::policy::{EstimatorKind, Policy};
-use crate::planning::team::robot_seed;
+use crate::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Seen};
-use crate::server::errors::is_late;
-use crate::server::feed::Feed;
-use crate::server::info::{connect, is_belief_left};
-use crate::server::truth::TruthFeed;
+use crate::rollout::{Rollout, Seen};
 use anyhow::{Result, ensure};
+use emberwatch_belief::estimation::Prior;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::team::robot_seed;
 use protocol::client::Observation;
 use protocol::connection::ConnectionError;
 use protocol::control::{ServerInfo, WorldSeed};
 use protocol::message::WorldResult;
-use protocol::{Cell, Client, Grid, Model};
-use std::cell::RefCell;
+use protocol::{Cell, Client, Grid, Model, Move};
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Time between two warnings of steps that went on without the agent.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
@@ -35,7 +32,9 @@ pub struct Pilot {
     client: Client,
     truth: Option<TruthFeed>,
     /// Knows all robots that are planned for, those that others fly among them.
-    robot: Robot,
+    rollout: Rollout,
+    /// Time that its last plan took.
+    planning: Duration,
     model: Model,
     policy: Policy,
     /// The belief before an episode's first frame, once it was needed.
@@ -45,11 +44,6 @@ pub struct Pilot {
     feed: Feed,
     warned: Option<Instant>,
 }
-
-/// A path was not flown, as it was time to stop.
-#[derive(Debug, Error)]
-#[error("stopped")]
-struct NotFlown;
 
 impl Pilot {
     /// Acquires the robots where their world stands and takes in its last frame.
@@ -71,7 +65,7 @@ impl Pilot {
             policy.name
         );
         ensure!(
-            !policy.is_decided || mission.company != Company::Team,
+            !policy.is_decided() || mission.company != Company::Team,
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );
@@ -86,7 +80,7 @@ impl Pilot {
         let prior = prior(mission, &info, &model, &policy)?;
         let mut attached = Self::acquire(mission, &numbers, &model, &policy, &prior)?;
         attached.prior = Some(prior);
-        if !resume(&mut attached.client, numbers.start, &mut attached.robot)? {
+        if !resume(&mut attached.client, numbers.start, &mut attached.rollout)? {
             attached.begin()?;
         }
         Ok(attached)
@@ -109,14 +103,14 @@ impl Pilot {
             learned: &mission.learned,
         };
         let agent = registry::agent(policy, &mission.config, task)?;
-        let Some(kind) = agent.estimator().kind() else {
+        let Some(kind) = agent.estimator().handover().map(|it| it.kind()) else {
             return Ok(None);
         };
         if !is_belief_left(&mission.instance, numbers.start, &kind)? {
             return Ok(None);
         }
         let mut attached = Self::acquire(mission, numbers, model, policy, any)?;
-        if take_over_left(&mut attached.client, numbers.start, &mut attached.robot)? {
+        if take_over_left(&mut attached.client, numbers.start, &mut attached.rollout)? {
             return Ok(Some(attached));
         }
         // Another agent acted since.
@@ -140,7 +134,10 @@ impl Pilot {
             Company::Team => (mission.world * team..(mission.world + 1) * team, 0),
             _ => (numbers.clone(), mission.robots.start),
         };
-        let seen = Seen::new(client.observe(robots.clone())?);
+        let is_told = policy.estimator == EstimatorKind::Truth;
+        let truth = is_told.then(|| open_truth(mission, &client)).transpose()?;
+        let mut seen = Seen::new(client.observe(robots.clone())?);
+        seen.truth = truth_of(truth.as_ref(), &client, &seen.observation.world)?;
         let (seed, step) = (seen.observation.world.seed, seen.observation.world.step);
         tracing::info!(
             world = mission.world,
@@ -152,11 +149,11 @@ impl Pilot {
         );
         let parts = (model, policy, prior);
         let agent = agent(mission, &client, parts, (seed, first))?;
-        let is_told = policy.estimator == EstimatorKind::Truth;
         Ok(Self {
-            truth: is_told.then(|| open_truth(mission, &client)).transpose()?,
+            truth,
             feed: Feed::open(&mission.instance, agent.belief()),
-            robot: Robot::new(agent, seen),
+            rollout: Rollout::new(agent, seen),
+            planning: Duration::ZERO,
             model: model.clone(),
             policy: policy.clone(),
             prior: None,
@@ -167,11 +164,10 @@ impl Pilot {
     }
 
     fn begin(&mut self) -> Result<()> {
-        let world = &self.robot.observation().world;
-        let truth = truth_of(self.truth.as_ref(), &self.client, world)?;
-        let (client, feed) = (&self.client, &mut self.feed);
-        let look = |robot: &Robot| show(feed, client, robot, false);
-        self.robot.begin(truth.as_ref(), look)
+        self.rollout.correct()?;
+        self.show(false);
+        self.rollout.agent.predict();
+        Ok(())
     }
 
     fn begin_next(&mut self, mission: &Mission) -> Result<()> {
@@ -181,13 +177,13 @@ impl Pilot {
         };
         let (world, seed) = (mission.world, None);
         self.client.reset(&[WorldSeed { world, seed }])?;
-        let seen = Seen::new(self.client.observe(self.seen.clone())?);
+        let seen = self.observe()?;
         let seed = seen.observation.world.seed;
         tracing::info!(world, seed, "the episode was truncated: the next begins");
         let first = self.seen.start % self.client.info().n_robots;
         let parts = (&self.model, &self.policy, &prior);
         let agent = agent(mission, &self.client, parts, (seed, first))?;
-        self.robot = Robot::new(agent, seen);
+        self.rollout = Rollout::new(agent, seen);
         self.prior = Some(prior);
         self.begin()
     }
@@ -201,55 +197,81 @@ impl Pilot {
         is_last: bool,
         stop: &AtomicBool,
     ) -> Result<Option<f64>> {
-        if self.robot.observation().world.truncated != 0 {
+        if self.rollout.observation().world.truncated != 0 {
             self.begin_next(mission)?;
         }
-        let (own, is_planned) = (self.own(), self.is_planned());
+        let paths = self.plan();
+        let seen = match self.fly(&paths, stop) {
+            Ok(Some(seen)) => seen,
+            Ok(None) => return Ok(None),
+            Err(error) if is_late(&error) => return self.catch_up().map(|()| None),
+            Err(error) => return Err(error),
+        };
+        self.rollout.see(seen)?;
+        self.show(is_last);
+        self.rollout.agent.predict();
+        let own = self.rollout.results().skip(self.own().start);
+        let rewards = own.take(self.own().len()).map(|result| result.reward);
+        Ok(Some(rewards.sum()))
+    }
+
+    /// Plans for its own robots and for those of others that flew; returns the paths of its own.
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let is_planned = self.is_planned();
+        let cells = self.rollout.cells().into_iter().zip(&is_planned);
+        let cells: Vec<Cell> = cells.filter(|(_, is)| **is).map(|(cell, _)| cell).collect();
+        let step = self.rollout.step();
+        let plans = self.rollout.agent.plan(&cells, step);
+        self.planning = start.elapsed();
+        let own = self.own();
         let n_before = is_planned[..own.start].iter().filter(|it| **it).count();
-        let flown = n_before..n_before + own.len();
-        let Self {
-            client,
-            truth,
-            robot,
-            seen,
-            feed,
-            ..
-        } = self;
-        let (mut is_flown, client) = (true, RefCell::new(client));
-        let stepped = rollout::step(
-            std::slice::from_mut(robot),
-            |robot| robot,
-            |robot| plan(robot, &is_planned),
-            |paths| {
-                let mut client = client.borrow_mut();
-                let (robots, is_over) = (client.robots(), || stop.load(Ordering::Relaxed));
-                let answer = client.step_until(robots, &paths[flown], &is_over)?;
-                is_flown = answer.is_some();
-                let answer = answer.ok_or(NotFlown)?;
-                let mut seen = Seen::new(with_others(&mut client, seen, answer)?);
-                seen.truth = truth_of(truth.as_ref(), &client, &seen.observation.world)?;
-                Ok(vec![seen])
-            },
-            |_, robot, _| {
-                show(feed, &client.borrow(), robot, is_last);
-                Ok(())
-            },
-        );
-        match stepped {
-            Ok(()) => {
-                let results = self.robot.results().skip(own.start).take(own.len());
-                Ok(Some(results.map(|result| result.reward).sum()))
-            }
-            Err(_) if !is_flown => Ok(None),
-            Err(error) if is_late(&error) => self.catch_up().map(|()| None),
-            Err(error) => Err(error),
+        let own = plans.into_iter().skip(n_before).take(own.len());
+        own.map(|plan| plan.moves).collect()
+    }
+
+    /// Flies the paths; returns what the agent sees then, or `None` if it is time to stop.
+    fn fly(&mut self, paths: &[Vec<Move>], stop: &AtomicBool) -> Result<Option<Seen>> {
+        let is_over = || stop.load(Ordering::Relaxed);
+        let answer = self
+            .client
+            .step_until(self.client.robots(), paths, &is_over)?;
+        let Some(mut observations) = answer else {
+            return Ok(None);
+        };
+        if self.seen.len() > observations.len() {
+            let step = observations[0].world.step;
+            observations = self.client.recall(self.seen.clone(), step)?;
+        }
+        self.with_truth(observations).map(Some)
+    }
+
+    /// What the world shows now.
+    fn observe(&mut self) -> Result<Seen> {
+        let observations = self.client.observe(self.seen.clone())?;
+        self.with_truth(observations)
+    }
+
+    fn with_truth(&self, observations: Vec<Observation>) -> Result<Seen> {
+        let mut seen = Seen::new(observations);
+        seen.truth = truth_of(self.truth.as_ref(), &self.client, &seen.observation.world)?;
+        Ok(seen)
+    }
+
+    /// Shows the posterior to observers, if it is time or in any case.
+    fn show(&mut self, in_any_case: bool) {
+        if self.feed.is_due() || in_any_case {
+            let (robots, team) = (self.client.robots(), self.client.info().n_robots);
+            let world = robots.start / team;
+            let view = View::of(&self.rollout, world, robots, self.planning);
+            self.feed.show(&view);
         }
     }
 
     /// Leaves the belief to the next agent of each robot.
     pub fn leave(&mut self) -> Result<(), ConnectionError> {
         let mut numbers = self.client.robots();
-        numbers.try_for_each(|number| leave(&mut self.client, number, &self.robot))
+        numbers.try_for_each(|number| leave(&mut self.client, number, &self.rollout))
     }
 
     /// Gives the robots back, and ends when observers have had time to see the last belief.
@@ -261,18 +283,17 @@ impl Pilot {
 
     /// Takes in what the world did meanwhile.
     fn catch_up(&mut self) -> Result<()> {
-        let before = self.robot.observation().world.step;
-        let mut seen = Seen::new(self.client.observe(self.seen.clone())?);
+        let before = self.rollout.step();
+        let seen = self.observe()?;
         let step = seen.observation.world.step;
         if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
             self.warned = Some(Instant::now());
             tracing::warn!("late: the world went on from step {before} to {step}; catching up");
         }
-        seen.truth = truth_of(self.truth.as_ref(), &self.client, &seen.observation.world)?;
         let number = self.seen.start;
-        catch_up(&mut self.client, number, &mut self.robot, seen)?;
-        show(&mut self.feed, &self.client, &self.robot, false);
-        self.robot.agent.predict();
+        catch_up(&mut self.client, number, &mut self.rollout, seen)?;
+        self.show(false);
+        self.rollout.agent.predict();
         Ok(())
     }
 
@@ -286,7 +307,7 @@ impl Pilot {
     /// For which of the robots that it knows it plans: its own, and those of others that flew.
     fn is_planned(&self) -> Vec<bool> {
         let (own, team) = (self.own(), self.client.info().n_robots);
-        let hovered = self.robot.observation().world.hovered;
+        let hovered = self.rollout.observation().world.hovered;
         let is_planned = |(index, number): (usize, u32)| {
             own.contains(&index) || hovered >> (number % team) & 1 == 0
         };
@@ -326,27 +347,6 @@ fn agent(
     registry::agent(policy, config, task)
 }
 
-/// Plans for some of the robots that an agent knows.
-fn plan(robot: &mut Robot, is_planned: &[bool]) -> Vec<Plan> {
-    robot.plan_with(|agent, cells, step| {
-        let cells = cells.iter().zip(is_planned);
-        let cells: Vec<Cell> = cells.filter(|(_, is)| **is).map(|it| *it.0).collect();
-        agent.plan(&cells, step)
-    })
-}
-
-/// What all robots in `seen` show after the step of an answer.
-fn with_others(
-    client: &mut Client,
-    seen: &Range<u32>,
-    answer: Vec<Observation>,
-) -> Result<Vec<Observation>, ConnectionError> {
-    if seen.len() == answer.len() {
-        return Ok(answer);
-    }
-    client.recall(seen.clone(), answer[0].world.step)
-}
-
 /// The hidden states that a world's robots see part of, for policies that are told them.
 fn truth_of(
     feed: Option<&TruthFeed>,
@@ -359,14 +359,6 @@ fn truth_of(
     let worlds = client.worlds_of(&client.robots());
     let states = feed.states(worlds, &[world.seed], world.step)?;
     Ok(states.into_iter().next())
-}
-
-/// Shows an agent's posterior to observers, if it is time or in any case.
-fn show(feed: &mut Feed, client: &Client, robot: &Robot, in_any_case: bool) {
-    if feed.is_due() || in_any_case {
-        let (robots, team) = (client.robots(), client.info().n_robots);
-        feed.show(&robot.view(robots.start / team, robots));
-    }
 }
 
 fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {

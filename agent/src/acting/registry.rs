@@ -1,19 +1,17 @@
 //! Where a policy's agent is put together: estimator, planner, and what decides. A new estimator is a line here.
 
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
-use crate::estimation::truth::{Clairvoyant, Oracle};
-use crate::estimation::{
-    AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
-};
+use crate::estimation::AutoencoderEstimator;
 use crate::learning::learned::Learned;
-use crate::learning::learner::LearnedModel;
-use crate::learning::student::decisions::Decisions;
-use crate::planning::BasisKind;
-use crate::planning::action::Action;
-use crate::planning::policy::{EstimatorKind, Policy, numbered_states};
-use crate::rollout::agent::{Agent, Decider, Setup};
+use crate::learning::learners::decisions::LearnedDecisions;
+use crate::learning::learners::filter::fit::LearnedModel;
+use crate::policy::{Choice, EstimatorKind, Policy, numbered_states};
+use crate::rollout::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::planning::{BasisKind, Objective, Target};
 use protocol::{Model, Shape};
 
 /// What a misfit is told of.
@@ -39,16 +37,18 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
         kind if kind.is_learned() => numbered_states(estimator.belief().n_states()),
         _ => task.model.state_names(),
     };
+    let learned_target = task.learned.target(policy.estimator);
+    let mut objective = config.objective(policy);
+    if let (Target::State(state), Some(target)) = (&mut objective.target, learned_target) {
+        *state = target;
+    }
     let setup = Setup {
+        chooser: chooser(policy, &task, config, objective)?,
         basis: basis(policy, &task, config)?,
         state_names,
         n_moves: task.n_moves,
         seed: task.seed,
-        target: task.learned.target(policy.estimator),
-        decider: match policy.is_decided {
-            true => Some(decider(policy, &task, config)?),
-            false => None,
-        },
+        target: learned_target.unwrap_or(task.model.target_state()),
     };
     Ok(Agent::new(estimator, policy, config, setup))
 }
@@ -73,7 +73,8 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
-        EstimatorKind::None | EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::None => Box::new(Unchanging(prior)),
     })
 }
 
@@ -81,41 +82,54 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
 /// its values are of such paths. Who is told the state that a path will meet plans on that.
 fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<BasisKind> {
     let learned = task.learned;
-    Ok(match policy.estimator {
-        EstimatorKind::NextTruth => BasisKind::Predictor,
-        EstimatorKind::Autoencoder if policy.is_decided => {
-            present(policy, learned.network.as_ref())?.basis
-        }
-        _ if policy.is_decided => {
-            let contents = present(policy, learned.decisions.as_ref())?;
-            contents.settings().context(CHECKPOINT)?.objective.belief
-        }
+    Ok(match policy.choice {
+        Choice::Network => present(policy, learned.network.as_ref())?.basis,
+        Choice::Scorer => decisions(policy, learned)?.basis,
+        _ if policy.estimator == EstimatorKind::NextTruth => BasisKind::Predictor,
         _ => config.objective.belief,
     })
 }
 
-/// The DQN that chooses: the one learned beside the belief, or that of a known model's.
+/// What says what each path is for; `objective`: the policy's own.
+fn chooser(
+    policy: &Policy,
+    task: &Task<'_>,
+    config: &AgentConfig,
+    objective: Objective,
+) -> Result<Chooser> {
+    Ok(match policy.choice {
+        Choice::Objective => Chooser::Objective(objective),
+        Choice::Network => Chooser::Network(decider(policy, task, config)?),
+        Choice::Option(option) => Chooser::Options(OptionChooser::Always(option)),
+        Choice::Rule => Chooser::Options(OptionChooser::Rule),
+        Choice::Scorer => {
+            let scorer = decisions(policy, task.learned)?.scorer.clone();
+            Chooser::Options(OptionChooser::Scorer(scorer))
+        }
+    })
+}
+
+/// The DQN learned beside an autoencoder.
 fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Decider> {
-    if policy.estimator != EstimatorKind::Autoencoder {
-        let contents = present(policy, task.learned.decisions.as_ref())?;
-        let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
-        decisions.load(contents).context(CHECKPOINT)?;
-        return Ok(Box::new(move |estimator, robot, n_moves| {
-            decisions
-                .best_action(estimator.belief(), robot, n_moves)
-                .clone()
-        }));
-    }
     let network = present(policy, task.learned.network.as_ref())?.clone();
     let choices = Policy::network_choices(network.autoencoder.shape().n_states);
-    let action = |choice: &Policy| Action::plain(&choice.name, config.objective(choice));
-    let actions: Vec<Action> = choices.iter().map(action).collect();
-    Ok(Box::new(move |estimator, robot, n_moves| {
-        let follower = estimator.follower();
-        let follower = follower.expect("invariant: it decides for an autoencoder");
-        let input = network.input.of(follower, robot, n_moves);
-        actions[network.dqn.best(&input)].clone()
+    let objectives: Vec<Objective> = choices.iter().map(|it| config.objective(it)).collect();
+    Ok(Box::new(move |estimator| {
+        let hidden = estimator.hidden();
+        let hidden = hidden.expect("invariant: it decides for an autoencoder");
+        objectives[network.dqn.best(hidden)]
     }))
+}
+
+/// The decisions that were learned on a policy's belief.
+fn decisions<'a>(policy: &Policy, learned: &'a Learned) -> Result<&'a LearnedDecisions> {
+    let decisions = present(policy, learned.decisions.as_ref())?;
+    let [expected, got] = [policy.estimator, decisions.estimator].map(EstimatorKind::label);
+    ensure!(
+        got == expected,
+        "checkpoint: expected decisions on the belief of {expected}, got some on that of {got}"
+    );
+    Ok(decisions)
 }
 
 fn learned_model<'a>(policy: &Policy, task: &Task<'a>) -> Result<&'a LearnedModel> {
@@ -149,6 +163,9 @@ fn present<'a, T>(policy: &Policy, learned: Option<&'a T>) -> Result<&'a T> {
 /// The words for a policy that was not given what was learned.
 pub fn needs_checkpoint(policy: &Policy) -> String {
     let kind = match policy.estimator {
+        estimator if policy.choice == Choice::Scorer => {
+            &*format!("decisions on the belief of {}", estimator.label())
+        }
         EstimatorKind::Learned | EstimatorKind::LearnedSpatial => "a filter",
         EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
             "a filter by own state (--learner own_filter)"

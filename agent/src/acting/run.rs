@@ -2,8 +2,8 @@
 
 use crate::acting::mission::Mission;
 use crate::acting::pilot::Pilot;
-use crate::server::errors::{is_outage, refusal};
-use crate::server::info::RETRY_INTERVAL;
+use crate::client::errors::{is_outage, refusal};
+use crate::client::info::RETRY_INTERVAL;
 use anyhow::Result;
 use protocol::message::Status;
 use std::sync::atomic::{AtomicBool, Ordering};

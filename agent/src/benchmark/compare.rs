@@ -1,25 +1,26 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::benchmark::arena::Arena;
-use crate::benchmark::brier::brier_score;
-use crate::benchmark::merit::{Found, MeritTally};
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
+use crate::client::feed::{Feed, View};
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
-use crate::planning::policy::{EstimatorKind, Policy};
+use crate::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Turn};
-use crate::server::feed::Feed;
+use crate::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all};
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::brier::brier_score;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::merit::{Found, MeritTally};
+use emberwatch_belief::planning::Plan;
 use protocol::Model;
 use protocol::control::ServerInfo;
 use protocol::message::WorldResult;
 use protocol::path::{Flight, fly};
 use std::ops::Range;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// The policy of the team that is told the true states.
 const ORACLE: &str = "oracle_beam";
@@ -58,7 +59,7 @@ struct Contestant {
 
 struct Runs {
     /// The agents of each world, world by world.
-    robots: Vec<Robot>,
+    rollouts: Vec<Rollout>,
     worlds: Vec<World>,
 }
 
@@ -188,7 +189,7 @@ impl Match<'_> {
     fn check(&self, arena: &Arena) -> Result<()> {
         let Contestant { policy, team } = self.contestant;
         ensure!(
-            !(policy.is_decided && team.is_joint() && arena.n_robots() > 1),
+            !(policy.is_decided() && team.is_joint() && arena.n_robots() > 1),
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
         );
@@ -223,7 +224,7 @@ impl Match<'_> {
         let agents = self.seeds.iter();
         let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
         let seen = arena.reset(self.seeds)?;
-        let robot = |(agent, seen)| Robot::at(self.agent(arena, agent)?, seen);
+        let rollout = |(agent, seen)| Rollout::begun(self.agent(arena, agent)?, seen);
         let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
         let world = |&seed: &u64| World {
             seed,
@@ -233,45 +234,55 @@ impl Match<'_> {
             snapshot: None,
         };
         Ok(Runs {
-            robots: agents.zip(seen).map(robot).collect::<Result<_>>()?,
+            rollouts: agents.zip(seen).map(rollout).collect::<Result<_>>()?,
             worlds: self.seeds.iter().map(world).collect(),
         })
     }
 
     fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut Runs, step: u64) -> Result<()> {
-        let Runs { robots, worlds } = runs;
+        let Runs { rollouts, worlds } = runs;
         let n_agents = arena.n_agents();
         if self.contestant.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
-            for (robots, next) in robots.chunks_mut(n_agents).zip(&next) {
-                for robot in robots {
-                    robot.agent.foresee(next)?;
+            for (rollouts, next) in rollouts.chunks_mut(n_agents).zip(&next) {
+                for rollout in rollouts {
+                    rollout.agent.foresee(next)?;
                 }
             }
         }
+        let plans = in_parallel(&mut *rollouts, timed_plan);
+        let (plans, times): (Vec<_>, Vec<_>) = plans.into_iter().unzip();
+        let seen = arena.step(self.seeds, &paths_of(&plans), step + 1)?;
+        let turns = see_all(&mut *rollouts, seen)?;
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
-        let (first_world, shown) = (arena.worlds().start, feed.turn(robots.len()));
-        let n_robots = arena.n_robots();
-        let crew = (n_robots / n_agents) as u32;
-        let first_robot = first_world * n_robots as u32;
-        rollout::step(
-            robots,
-            |robot| robot,
-            Robot::plan,
-            |paths| arena.step(self.seeds, paths, step + 1),
-            |index, robot, turn| {
-                let world = &mut worlds[index / n_agents];
-                world.fly(robot, &turn, n_robots);
-                world.look(robot, turn, target, (index % n_agents == 0, is_last));
-                if shown.contains(&index) {
-                    let world = first_world + (index / n_agents) as u32;
-                    let first = first_robot + index as u32 * crew;
-                    feed.show(&robot.view(world, first..first + crew));
+        for (index, turn) in turns.into_iter().enumerate() {
+            let (world, rollout) = (&mut worlds[index / n_agents], &rollouts[index]);
+            let plans = &plans[index];
+            world.tally.planning += times[index];
+            world.fly(rollout, plans, arena.n_robots());
+            if index % n_agents == 0 {
+                world.look(rollout, target);
+                if is_last {
+                    world.snapshot = world.snapshot(rollout, turn, plans);
                 }
-                Ok(())
-            },
-        )
+            }
+        }
+        self.show(arena, feed, rollouts, &times);
+        predict_all(rollouts);
+        Ok(())
+    }
+
+    /// Shows the posteriors of the worlds whose turn it is.
+    fn show(&self, arena: &Arena, feed: &mut Feed, rollouts: &[Rollout], times: &[Duration]) {
+        let (n_agents, n_robots) = (arena.n_agents(), arena.n_robots() as u32);
+        let (first_world, crew) = (arena.worlds().start, n_robots / n_agents as u32);
+        for index in feed.turn(rollouts.len()) {
+            let world = first_world + (index / n_agents) as u32;
+            let robot = first_world * n_robots + index as u32 * crew;
+            let view = View::of(&rollouts[index], world, robot..robot + crew, times[index]);
+            feed.show(&view);
+        }
     }
 
     fn agent(&self, arena: &Arena, agent: (u64, usize)) -> Result<Agent> {
@@ -284,64 +295,57 @@ impl Match<'_> {
 
 impl World {
     /// Takes in what an agent's robots flew; with those of the last agent the step is complete.
-    fn fly(&mut self, robot: &Robot, turn: &Turn, n_robots: usize) {
-        let shape = robot.agent.belief().shape();
-        let flown = robot.results().zip(&turn.plans);
+    fn fly(&mut self, rollout: &Rollout, plans: &[Plan], n_robots: usize) {
+        let shape = rollout.agent.belief().shape();
+        let flown = rollout.results().zip(plans);
         let flown = flown.map(|(result, plan)| fly(shape, result.start(), &plan.moves));
         self.flights.extend(flown);
+        let n_visited = rollout.results().map(|it| u64::from(it.n_visited));
+        self.tally.n_visited_each += n_visited.sum::<u64>();
         if self.flights.len() == n_robots {
-            let result = &robot.observation().world;
+            let result = &rollout.observation().world;
             let found = Found {
                 n_hits: result.n_hits,
                 n_burning: result.n_target_cells,
             };
-            self.merit.update(&self.flights, found, turn.truth.as_ref());
+            self.merit.update(&self.flights, found, rollout.truth());
             self.flights.clear();
         }
     }
 
-    fn look(
-        &mut self,
-        robot: &Robot,
-        turn: Turn,
-        target: usize,
-        (is_first, is_last): (bool, bool),
-    ) {
-        self.tally.planning += robot.planning();
-        let n_visited = robot.results().map(|it| u64::from(it.n_visited));
-        self.tally.n_visited_each += n_visited.sum::<u64>();
-        if !is_first {
-            return;
-        }
-        let agent = &robot.agent;
-        let brier = turn.truth.as_ref().map(|truth| {
-            let own = agent.target(target);
-            brier_score(agent.belief(), truth, target, own)
-        });
-        self.tally.add(&robot.observation().world, brier);
-        if is_last {
-            self.snapshot = self.snapshot(robot, turn, target);
-        }
+    /// Takes in the posterior of the world's first agent.
+    fn look(&mut self, rollout: &Rollout, target: usize) {
+        let agent = &rollout.agent;
+        let brier = rollout
+            .truth()
+            .map(|truth| brier_score(agent.belief(), truth, target, agent.target()));
+        self.tally.add(&rollout.observation().world, brier);
     }
 
-    fn snapshot(&self, robot: &Robot, turn: Turn, target: usize) -> Option<Snapshot> {
-        let (agent, observation) = (&robot.agent, robot.observation());
+    fn snapshot(&self, rollout: &Rollout, turn: Turn, plans: &[Plan]) -> Option<Snapshot> {
+        let (agent, observation) = (&rollout.agent, rollout.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
         let is_own = estimator.knows_model() || estimator.is_learned();
-        let moves = &turn.plans[0].moves;
+        let moves = &plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
         Some(Snapshot {
             seed: self.seed,
             step: observation.world.step,
-            truth: turn.truth?,
+            truth: rollout.truth()?.clone(),
             frame: observation.frame.clone(),
             path_cells,
             belief: is_own.then(|| agent.belief().clone()),
-            learned_target: estimator.is_learned().then(|| agent.target(target)),
+            learned_target: estimator.is_learned().then(|| agent.target()),
         })
     }
+}
+
+/// An agent's plans, and the time that they took.
+fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
+    let start = Instant::now();
+    (rollout.plan(), start.elapsed())
 }
 
 impl Contestant {

@@ -5,19 +5,19 @@
 
 use crate::benchmark::arena::Arena;
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
-use crate::estimation::scoring::Score;
 use crate::learning::learned::Learned;
-use crate::planning::policy::Policy;
+use crate::policy::Policy;
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Seen};
+use crate::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::scoring::Score;
 use rayon::prelude::*;
 use std::ops::Range;
 
 #[derive(Debug, Clone)]
-pub struct Examination<'a> {
+pub struct Evaluation<'a> {
     pub guide: &'a str,
     pub seeds: Range<u64>,
     pub steps: u64,
@@ -28,7 +28,7 @@ pub struct Examination<'a> {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub struct Marks {
+pub struct Scores {
     pub seed: u64,
     pub scores: Vec<Score>,
     /// How often each value was seen.
@@ -36,36 +36,33 @@ pub struct Marks {
 }
 
 /// Flies the guide's paths and scores each estimator's prediction of every frame.
-pub fn examine(arena: &mut Arena, examination: &Examination<'_>) -> Result<Vec<Marks>> {
-    let config = examination.config;
+pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Scores>> {
+    let config = evaluation.config;
     let prior = config.prior(arena.info().burn_in);
     let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
-    let seeds: Vec<u64> = examination.seeds.clone().collect();
-    let mut marks = Vec::new();
+    let seeds: Vec<u64> = evaluation.seeds.clone().collect();
+    let mut scores = Vec::new();
     for batch in seeds.chunks(arena.batch_size()) {
-        let examinees = batch.iter().zip(arena.reset(batch)?);
-        let examinee =
-            |(&seed, seen): (&u64, Seen)| Examinee::new(arena, examination, &prior, seed, seen);
-        let mut examinees: Vec<Examinee> = examinees.map(examinee).collect::<Result<_, _>>()?;
-        for step in 1..=examination.steps {
-            rollout::step(
-                &mut examinees,
-                |examinee| &mut examinee.guide,
-                |examinee| examinee.guide.plan(),
-                |paths| arena.step(batch, paths, step),
-                |_, _, _| Ok(()),
-            )?;
-            examinees.par_iter_mut().try_for_each(Examinee::look)?;
+        let worlds = batch.iter().zip(arena.reset(batch)?);
+        let candidates =
+            |(&seed, seen): (&u64, Seen)| Candidates::new(arena, evaluation, &prior, seed, seen);
+        let mut worlds: Vec<Candidates> = worlds.map(candidates).collect::<Result<_, _>>()?;
+        for step in 1..=evaluation.steps {
+            let plans = plan_all(guides(&mut worlds));
+            let seen = arena.step(batch, &paths_of(&plans), step)?;
+            see_all(guides(&mut worlds), seen)?;
+            predict_all(guides(&mut worlds));
+            worlds.par_iter_mut().try_for_each(Candidates::look)?;
         }
-        marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
+        scores.extend(worlds.into_iter().map(|candidates| candidates.scores));
     }
-    Ok(marks)
+    Ok(scores)
 }
 
 /// Score of telling each cell alike the frequencies with which values were seen in all worlds, with
 /// hindsight.
-pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
-    let total = |value: usize| all.iter().map(|marks| marks.counts[value]).sum::<u64>();
+pub fn score_of_frequencies(all: &[Scores], counts: &[u64]) -> Score {
+    let total = |value: usize| all.iter().map(|scores| scores.counts[value]).sum::<u64>();
     let totals: Vec<u64> = (0..counts.len()).map(total).collect();
     let sum: u64 = totals.iter().sum();
     let mut score = Score::default();
@@ -77,47 +74,51 @@ pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
 }
 
 /// Estimators on one world, and who chooses the paths.
-struct Examinee {
-    guide: Robot,
+struct Candidates {
+    guide: Rollout,
     estimators: Vec<Agent>,
-    marks: Marks,
+    scores: Scores,
 }
 
-impl Examinee {
+fn guides(worlds: &mut [Candidates]) -> impl Iterator<Item = &mut Rollout> {
+    worlds.iter_mut().map(|candidates| &mut candidates.guide)
+}
+
+impl Candidates {
     fn new(
         arena: &Arena,
-        examination: &Examination<'_>,
+        evaluation: &Evaluation<'_>,
         prior: &Belief,
         seed: u64,
         seen: Seen,
     ) -> Result<Self> {
         let model = arena.model();
-        let (config, learned) = (examination.config, examination.learned);
+        let (config, learned) = (evaluation.config, evaluation.learned);
         let agent = |policy: &Policy| arena.agent(policy, config, prior, (seed, 0), learned);
-        let guide = Policy::named(examination.guide, model)?;
-        let estimators = examination.policies.iter().map(agent);
-        let mut examinee = Self {
-            guide: Robot::at(agent(&guide)?, seen)?,
+        let guide = Policy::named(evaluation.guide, model)?;
+        let estimators = evaluation.policies.iter().map(agent);
+        let mut candidates = Self {
+            guide: Rollout::begun(agent(&guide)?, seen)?,
             estimators: estimators.collect::<Result<_, _>>()?,
-            marks: Marks {
+            scores: Scores {
                 seed,
-                scores: vec![Score::default(); examination.policies.len()],
+                scores: vec![Score::default(); evaluation.policies.len()],
                 counts: vec![0; model.n_observations()],
             },
         };
-        examinee.filter()?;
-        Ok(examinee)
+        candidates.filter()?;
+        Ok(candidates)
     }
 
     /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
     fn look(&mut self) -> Result<()> {
         let frame = &self.guide.observation().frame;
-        let scores = self.marks.scores.iter_mut().zip(&self.estimators);
+        let scores = self.scores.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {
-            *sum += agent.score(frame)?.unwrap_or_default();
+            *sum += agent.score(frame).unwrap_or_default();
         }
         for (_, value) in frame.observed() {
-            self.marks.counts[usize::from(value)] += 1;
+            self.scores.counts[usize::from(value)] += 1;
         }
         self.filter()
     }
@@ -137,12 +138,12 @@ mod tests {
 
     #[test]
     fn frequencies_score_the_entropy_of_what_was_seen() {
-        let marks = |counts: [u64; 3]| Marks {
+        let scores = |counts: [u64; 3]| Scores {
             seed: 0,
             scores: Vec::new(),
             counts: counts.to_vec(),
         };
-        let all = [marks([3, 0, 1]), marks([1, 0, 3])];
+        let all = [scores([3, 0, 1]), scores([1, 0, 3])];
         let score = score_of_frequencies(&all, &all[0].counts);
         assert_eq!(score.n_seen, 4);
         assert!((score.mean() - 0.5_f64.ln()).abs() < 1e-12);

@@ -5,19 +5,19 @@ use super::worlds::WorldFlags;
 use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Results, compare};
-use agent::benchmark::merit::RECENT_STEPS;
 use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
 use agent::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
     render_table, write_csv, write_events,
 };
 use agent::benchmark::team::Team;
+use agent::client::launch::OwnDashboard;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, Policy};
-use agent::server::launch::OwnDashboard;
+use agent::policy::{EstimatorKind, Policy};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
+use emberwatch_belief::merit::RECENT_STEPS;
 use indicatif::{ProgressBar, ProgressStyle};
 use network::DeviceKind;
 use protocol::Model;
@@ -25,13 +25,17 @@ use protocol::channels::MAX_ROBOTS;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
+/// Stands for the policies of [`Policy::table_of_options`].
+const OPTIONS: &str = "options";
+
 /// The policy of teams, unless others are named.
 const OF_TEAMS: &str = "beam_exploit";
 
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
-    /// The policies, separated by commas [default: the ladder; of teams: beam_exploit]
+    /// The policies, separated by commas; `options`: each option on the belief of the decisions that were learned, the
+    /// rule and the learned choice [default: the ladder; of teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
     /// The policy that others are paired against [default: shooting_exploit; of teams: the first policy; of
@@ -45,7 +49,8 @@ pub struct CompareCommand {
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
     /// What `train` learned: a filter adds `learned_*` to the ladder, one by own state `learned_own_*`, an
-    /// autoencoder `autoencoder_*`, decisions `dqn_beam`; may be given for each
+    /// autoencoder `autoencoder_*`, decisions `learned_policy` or that on their belief; may be
+    /// given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
     /// Where networks compute: cpu, cuda or metal
@@ -175,7 +180,7 @@ impl CompareCommand {
 
     /// Refuses what no server can fly before one is waited for.
     fn check_names(&self) -> Result<()> {
-        let mut policies = self.policies.iter();
+        let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
         policies.try_for_each(|name| Policy::check_name(name))?;
         let mut baseline = self.baseline.iter();
         let checked = baseline.try_for_each(|name| Policy::check_name(name));
@@ -184,10 +189,20 @@ impl CompareCommand {
 
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
+        let with_options = |name: &String| {
+            if name == OPTIONS {
+                options(model, learned)
+            } else {
+                Ok(vec![named(name)?])
+            }
+        };
         let policies = match self.policies.as_slice() {
             [] if self.has_teams() => vec![named(&OF_TEAMS.to_owned())?],
             [] => ladder(model, learned),
-            names => names.iter().map(named).collect::<Result<_, _>>()?,
+            names => {
+                let policies = names.iter().map(with_options);
+                policies.collect::<Result<Vec<_>>>()?.concat()
+            }
         };
         let twice = policies
             .iter()
@@ -269,6 +284,14 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
     std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
+}
+
+/// Each option, the rule and the learned choice, on the belief of the decisions that were learned.
+fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
+    let decisions = learned.decisions.as_ref();
+    let decisions =
+        decisions.context("--policies options: expected --checkpoint FILE of decisions")?;
+    Ok(Policy::table_of_options(model, decisions.estimator))
 }
 
 /// The ladder, with the policies on what was learned beside those on the known model, the autoencoder's below them.

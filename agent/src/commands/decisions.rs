@@ -4,11 +4,14 @@ use super::shared::{WaitFlag, model_named};
 use agent::acting::decider::Assignment;
 use agent::acting::decisions::serve_decisions;
 use agent::config::AgentFlags;
-use agent::planning::policy::{EstimatorKind, PlannerKind};
-use anyhow::{Context, Result};
-use clap::{Args, ValueEnum};
+use agent::learning::learned::Learned;
+use agent::policy::EstimatorKind;
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use network::Device;
 use protocol::channels::Instance;
 use protocol::program::{WatchedProcess, stop_on_signals};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
 /// Take decisions for worlds from a learner outside.
@@ -28,12 +31,12 @@ pub struct ServeDecisionsCommand {
     /// Take the worlds from their holders
     #[arg(long)]
     takeover: bool,
-    /// What keeps the beliefs
-    #[arg(long, default_value = "known_model")]
-    estimator: EstimatorName,
-    /// What plans a path for the objective decided
-    #[arg(long, default_value = "beam")]
-    planner: PlannerName,
+    /// What keeps the beliefs [default: the checkpoint's filter; without one the known model's]
+    #[arg(long, value_name = "NAME")]
+    estimator: Option<EstimatorKind>,
+    /// What `train` learned, for learned estimators; may be given for each
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Vec<PathBuf>,
     /// `wildfire` or the path of a model file, where the server does not reveal its model
     #[arg(long)]
     model: Option<String>,
@@ -44,40 +47,18 @@ pub struct ServeDecisionsCommand {
     settings: AgentFlags,
 }
 
-/// The estimators that know the model.
-#[derive(Clone, Copy, ValueEnum)]
-#[value(rename_all = "snake_case")]
-enum EstimatorName {
-    /// The paper's Bayes filter: cells are independent
-    KnownModel,
-    /// One whose corrections reach neighbouring cells, by correlations that it learns
-    SpatialFilter,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum PlannerName {
-    /// Beam search
-    Beam,
-    /// The best of many random paths
-    Shooting,
-}
-
 impl ServeDecisionsCommand {
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
+        let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
+        let learned = Learned::read(checkpoints, &Device::Cpu)?;
         let task = Assignment {
             instance: Instance::new(&self.instance)?,
             worlds: self.world..self.world.saturating_add(self.worlds),
             takeover: self.takeover,
-            estimator: match self.estimator {
-                EstimatorName::KnownModel => EstimatorKind::KnownModel,
-                EstimatorName::SpatialFilter => EstimatorKind::Spatial,
-            },
-            planner: match self.planner {
-                PlannerName::Beam => PlannerKind::Beam,
-                PlannerName::Shooting => PlannerKind::Shooting,
-            },
+            estimator: self.estimator(&learned)?,
             config: self.settings.effective()?,
+            learned,
         };
         let exit_with = self.exit_with.map(WatchedProcess::watch).transpose()?;
         let stop = stop_on_signals().context("handle signals")?;
@@ -89,5 +70,21 @@ impl ServeDecisionsCommand {
         serve_decisions(&task, model.as_ref(), exit_with, &stop)?;
         tracing::info!("done");
         Ok(())
+    }
+
+    fn estimator(&self, learned: &Learned) -> Result<EstimatorKind> {
+        let kind = match (self.estimator, &learned.decisions) {
+            (Some(kind), _) => kind,
+            (None, Some(decisions)) => decisions.estimator,
+            (None, None) if learned.filter.is_some() => EstimatorKind::Learned,
+            (None, None) if learned.own_filter.is_some() => EstimatorKind::LearnedOwn,
+            (None, None) => EstimatorKind::KnownModel,
+        };
+        ensure!(
+            !kind.is_learned() || learned.filter(kind).is_some(),
+            "--estimator {}: expected --checkpoint FILE of such a filter",
+            kind.label()
+        );
+        Ok(kind)
     }
 }

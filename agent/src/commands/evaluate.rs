@@ -5,16 +5,16 @@ use super::shared::{make_folder_of, write};
 use super::worlds::WorldFlags;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::Comparison;
-use agent::benchmark::evaluate::{Examination, Marks, examine, score_of_frequencies};
-use agent::benchmark::merit::RECENT_STEPS;
+use agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
 use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
-use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
+use agent::policy::Policy;
 use anyhow::Result;
 use clap::Args;
+use emberwatch_belief::estimation::scoring::Score;
+use emberwatch_belief::merit::RECENT_STEPS;
 use network::DeviceKind;
 use std::path::PathBuf;
 
@@ -68,7 +68,7 @@ impl EvaluateCommand {
         let policies = policies.map(|name| Policy::named(name, arena.model()));
         let policies = policies.collect::<Result<Vec<_>>>()?;
         for guide in GUIDES {
-            let examination = Examination {
+            let evaluation = Evaluation {
                 guide,
                 seeds: self.worlds.seeds.clone(),
                 steps,
@@ -76,8 +76,8 @@ impl EvaluateCommand {
                 policies: &policies,
                 learned: &learned,
             };
-            let marks = examine(arena, &examination)?;
-            write(&predictions(guide, &policies, &marks))?;
+            let scores = evaluate(arena, &evaluation)?;
+            write(&predictions(guide, &policies, &scores))?;
         }
         if !self.predictions_only {
             self.policies(arena, config, learned)?;
@@ -126,13 +126,13 @@ fn examined(learned: &Learned) -> Vec<&'static str> {
 }
 
 /// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
-fn predictions(guide: &str, policies: &[Policy], marks: &[Marks]) -> String {
-    let column = |of: &dyn Fn(&Marks) -> Score| -> Vec<f64> {
-        marks.iter().map(|marks| of(marks).mean()).collect()
+fn predictions(guide: &str, policies: &[Policy], scores: &[Scores]) -> String {
+    let column = |of: &dyn Fn(&Scores) -> Score| -> Vec<f64> {
+        scores.iter().map(|scores| of(scores).mean()).collect()
     };
     let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect();
-    let frequencies = column(&|one| score_of_frequencies(marks, &one.counts));
-    let scores = |index: usize| column(&|marks| marks.scores[index]);
+    let frequencies = column(&|one| score_of_frequencies(scores, &one.counts));
+    let scores = |index: usize| column(&|scores| scores.scores[index]);
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];
     for (index, policy) in policies.iter().enumerate() {

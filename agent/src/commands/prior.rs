@@ -1,11 +1,11 @@
 //! `prior`: a filter's first belief as a file, for filters in other languages.
 
 use super::shared::model_named;
-use agent::estimation::Prior;
 use agent::estimation::first_belief::first_belief;
 use agent::file::{Readers, replace_file};
 use anyhow::{Result, ensure};
 use clap::Args;
+use emberwatch_belief::estimation::Prior;
 use ndarray_npy::WriteNpyExt;
 use protocol::Shape;
 use rustix::fs::{Access, access};

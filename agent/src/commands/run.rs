@@ -5,7 +5,7 @@ use agent::acting::mission::{Company, Mission};
 use agent::acting::run::run;
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
+use agent::policy::Policy;
 use anyhow::{Context, Result};
 use clap::Args;
 use network::DeviceKind;
@@ -55,7 +55,7 @@ pub struct RunCommand {
     /// A built-in model or a model file, where the server does not reveal its model
     #[arg(long, value_name = "MODEL")]
     model: Option<String>,
-    /// What `train` learned, for policies `learned_*`, `autoencoder_*` and `dqn_beam`
+    /// What `train` learned, for policies `learned_*` and `autoencoder_*`, and others that a DQN decides for
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     /// Where networks compute: cpu, cuda or metal

@@ -1,6 +1,6 @@
 //! What several subcommands need: a server that may come, models by name, files and output.
 
-use agent::server::info::wait_for_server;
+use agent::client::info::wait_for_server;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use protocol::Model;

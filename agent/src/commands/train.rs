@@ -3,15 +3,19 @@
 use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
 use agent::benchmark::report::training::draw_training;
+use agent::client::launch::OwnServer;
 use agent::config::{AgentFlags, LearnerKind, Preset};
-use agent::learning::train::{Training, train};
-use agent::server::launch::OwnServer;
+use agent::learning::checkpoint::Contents;
+use agent::learning::learned::Learned;
+use agent::learning::train::{CHECKPOINT, TrainingSpec, train};
+use agent::policy::EstimatorKind;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
@@ -35,17 +39,23 @@ pub struct TrainCommand {
     /// What to learn [default: filter; of preset paper: autoencoder]
     #[arg(long)]
     learner: Option<LearnerKind>,
-    /// World steps to act for, of all worlds together; 0: until stopped
-    #[arg(long, default_value_t = 0)]
-    steps: u64,
+    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of decisions: those of the
+    /// settings]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Whose belief decisions are learned on [default: learned_filter]
+    #[arg(long, value_name = "NAME")]
+    estimator: Option<EstimatorKind>,
+    /// The filter for that, of an earlier training; without it, one is learned first
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
     /// Seconds to act for
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors, metrics.csv and training.png
+    /// Folder for checkpoint.safetensors, metrics.csv and training.png; a filter that is learned first has a folder in it
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Go on from the folder's checkpoint; a filter or an autoencoder bit for bit in worlds that stand where
-    /// it left them
+    /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
     #[arg(long)]
     resume: bool,
     /// Act on the checkpoint's parameters without learning
@@ -74,8 +84,38 @@ pub struct TrainCommand {
 
 impl TrainCommand {
     pub fn run(&self) -> Result<()> {
+        let stop = stop_on_signals().context("handle signals")?;
+        let mut training = self.training()?;
+        let contents = if self.resume && self.goes_on_with_filter(&training) {
+            None
+        } else {
+            training.check()?
+        };
+        let (instance, own) = self.server(&training)?;
+        if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
+            return Ok(());
+        }
+        if contents.is_none() && needs_filter(&training) {
+            if let Some(filter) = training.of_filter()? {
+                make_folder(&filter.out)?;
+                let contents = filter.check()?;
+                learn(&instance, &filter, contents, &stop)?;
+            }
+            if stop.load(Relaxed) {
+                return Ok(());
+            }
+            let filter = training.filter_folder().join(CHECKPOINT);
+            training.learned = Learned::read([&*filter], &training.device)?;
+            training.resume = false;
+        }
+        learn(&instance, &training, contents, &stop)
+    }
+
+    fn training(&self) -> Result<TrainingSpec> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
+        let decisions = &mut config.decisions;
+        decisions.estimator = self.estimator.unwrap_or(decisions.estimator);
         let n_worlds = self.worlds.unwrap_or(match config.learner {
             LearnerKind::Autoencoder => 1,
             _ => 16,
@@ -83,43 +123,34 @@ impl TrainCommand {
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
         make_folder(&self.out)?;
-        let stop = stop_on_signals().context("handle signals")?;
-        let learner = config.learner;
-        let training = Training {
+        let steps = match config.learner {
+            LearnerKind::Decisions => config.decisions.steps,
+            _ => 0,
+        };
+        let device = self.device.open()?;
+        Ok(TrainingSpec {
             worlds: self.world..last,
             takeover: self.takeover,
-            steps: self.steps,
+            steps: self.steps.unwrap_or(steps),
             time_limit: self.time_limit,
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
-            device: self.device.open()?,
+            learned: Learned::read(self.checkpoint.as_deref(), &device)?,
+            device,
             config,
-        };
-        let contents = training.check()?;
-        let (instance, own) = self.server(n_worlds, learner)?;
-        if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
-            return Ok(());
-        }
-        let summary = train(&instance, &training, contents, &stop)?;
-        let mean_reward = summary.reward / summary.steps.max(1) as f64;
-        tracing::info!(
-            steps = summary.steps,
-            updates = summary.updates,
-            mean_reward,
-            "done"
-        );
-        for (part, time) in summary.times {
-            tracing::info!(part, seconds = time.as_secs_f64(), "time");
-        }
-        if summary.steps > 0 && !self.freeze {
-            draw_training(&self.out)?;
-        }
-        Ok(())
+        })
+    }
+
+    /// Whether a training of decisions was left while its filter was learned.
+    fn goes_on_with_filter(&self, training: &TrainingSpec) -> bool {
+        needs_filter(training)
+            && training.filter_folder().join(CHECKPOINT).exists()
+            && !training.out.join(CHECKPOINT).exists()
     }
 
     /// The server, and itself if it was started: dropped, it stops.
-    fn server(&self, n_worlds: u32, learner: LearnerKind) -> Result<(Instance, Option<OwnServer>)> {
+    fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
         }
@@ -133,12 +164,53 @@ impl TrainCommand {
             Preset::Default => 25_000,
             Preset::Paper => 0,
         });
+        let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
+        let (learner, decisions) = (training.config.learner, &training.config.decisions);
+        let decides = learner == LearnerKind::Decisions;
         // Who learns a model does not look at it, and could not.
-        let reveals = (learner == LearnerKind::Decisions).to_string();
+        let reveals = (decides && decisions.estimator.knows_model()).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
         arguments.extend(rest.map(String::from));
+        if decides {
+            let episode = decisions.episode_steps.to_string();
+            arguments.extend(["--max-steps".into(), episode]);
+        }
         let server = OwnServer::start(self.server.clone(), &arguments)?;
         Ok((server.instance().clone(), Some(server)))
     }
+}
+
+/// Whether decisions are to be learned on the belief of a filter that is yet to be learned.
+fn needs_filter(training: &TrainingSpec) -> bool {
+    let estimator = training.config.decisions.estimator;
+    training.config.learner == LearnerKind::Decisions
+        && estimator.is_learned()
+        && training.learned.filter(estimator).is_none()
+}
+
+/// Trains, and says what that gave.
+fn learn(
+    instance: &Instance,
+    training: &TrainingSpec,
+    contents: Option<Contents>,
+    stop: &AtomicBool,
+) -> Result<()> {
+    let kind = training.config.learner;
+    tracing::info!(learner = ?kind, steps = training.steps, out = %training.out.display(), "learning");
+    let summary = train(instance, training, contents, stop)?;
+    let mean_reward = summary.reward / summary.steps.max(1) as f64;
+    tracing::info!(
+        steps = summary.steps,
+        updates = summary.updates,
+        mean_reward,
+        "done"
+    );
+    for (part, time) in summary.times {
+        tracing::info!(part, seconds = time.as_secs_f64(), "time");
+    }
+    if summary.steps > 0 && !training.freeze {
+        draw_training(&training.out)?;
+    }
+    Ok(())
 }

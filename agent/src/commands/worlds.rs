@@ -2,7 +2,7 @@
 
 use super::shared::{WaitFlag, model_named, parse_range};
 use agent::benchmark::arena::{Arena, MAX_BATCH};
-use agent::server::launch::OwnServer;
+use agent::client::launch::OwnServer;
 use anyhow::{Result, ensure};
 use clap::Args;
 use protocol::channels::Instance;

@@ -1,10 +1,10 @@
 //! The sections of `config/agent.toml`, which says what each setting means.
 
-use crate::estimation::belief::EntropyKind;
-use crate::estimation::dqn_input::DqnInput;
-use crate::planning::BasisKind;
+use crate::policy::EstimatorKind;
 use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use anyhow::{Result, bail};
+use emberwatch_belief::estimation::belief::EntropyKind;
+use emberwatch_belief::planning::BasisKind;
 use serde::{Deserialize, Serialize};
 
 /// Below 1, so that Adam's means move.
@@ -57,20 +57,26 @@ pub struct AutoencoderConfig {
 /// How the DQN of Algorithm 1 learns (paper section III.E).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NetworkDqnConfig {
-    pub input: DqnInput,
     #[serde(flatten)]
     pub learning: DqnSettings,
     pub step_size: StepSize,
 }
 
-/// How the DQN of `train --learner decisions` learns.
+/// What `train --learner decisions` learns on, and how.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DecisionsConfig {
+    pub estimator: EstimatorKind,
+    pub filter_steps: u64,
+    pub beam_width: usize,
+    pub steps: u64,
+    pub episode_steps: u64,
     #[serde(flatten)]
     pub learning: DqnSettings,
+    pub longest_hold: u64,
     pub reward_scale: f32,
     pub updates_per_step: f64,
     pub rate: f32,
+    pub final_rate: f32,
 }
 
 /// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
@@ -173,6 +179,7 @@ fn check_dqn(section: &str, dqn: &DqnSettings, most_kept: f64) -> Result<()> {
     let ranges = [
         ("batch", batch, 1.0, 65_536.0),
         ("n_step", dqn.n_step as f64, 1.0, 1e3),
+        ("width", dqn.width as f64, 1.0, 1024.0),
         ("replay", dqn.replay as f64, batch, most_kept),
         ("gamma", dqn.gamma.into(), 0.0, 1.0),
         ("tau", dqn.tau.into(), 0.0, 1.0),
@@ -198,6 +205,10 @@ impl DecisionsConfig {
     pub(super) fn check(&self) -> Result<()> {
         check_dqn("decisions.", &self.learning, 2e5)?;
         let ranges = [
+            ("beam_width", self.beam_width as f64, 1.0, 1e4),
+            ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
+            ("longest_hold", self.longest_hold as f64, 1.0, 1e3),
+            ("final_rate", self.final_rate.into(), 0.0, 1.0),
             ("reward_scale", self.reward_scale.into(), 0.0, 1e3),
             ("updates_per_step", self.updates_per_step, 0.0, 16.0),
             ("rate", self.rate.into(), 0.0, 1.0),
@@ -281,7 +292,8 @@ mod tests {
             ("autoencoder.step_size.rate = 2.0", "0 to 1, got 2"),
             ("dqn.epsilon = 2.0", "0 to 1, got 2"),
             ("decisions.n_step = 0", "1 to 1000, got 0"),
-            ("decisions.replay = 8", "64 to 200000, got 8"),
+            ("decisions.replay = 8", "256 to 200000, got 8"),
+            ("decisions.beam_width = 0", "1 to 10000, got 0"),
             ("decisions.gamma = 1.5", "0 to 1, got 1.5"),
             ("decisions.rate = nan", "0 to 1, got NaN"),
         ] {

@@ -1,14 +1,14 @@
 //! The autoencoder as an estimator: a hidden vector that reads frames (paper eq. 9), and Bayes' rule at
 //! visited cells (eq. 10).
 
-use crate::estimation::bayes::correct;
-use crate::estimation::belief::Belief;
-use crate::estimation::estimator::{Estimator, EstimatorError};
-use crate::estimation::follower::{Follower, accepted};
-use crate::estimation::scoring::{Score, score};
-use ::network::{Autoencoder, NetworkError, Window};
+use crate::estimation::follower::Follower;
+use ::network::{Autoencoder, NetworkError};
+use emberwatch_belief::estimation::bayes::correct;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use ndarray::Array2;
-use protocol::{Frame, Grid};
+use protocol::Frame;
+use std::borrow::Cow;
 
 pub struct AutoencoderEstimator {
     network: Autoencoder,
@@ -23,6 +23,7 @@ impl AutoencoderEstimator {
         Ok(Self::at(network, Follower::new(network)?))
     }
 
+    /// Where a follower of the network stands.
     pub fn at(network: &Autoencoder, follower: Follower) -> Self {
         Self {
             network: network.clone(),
@@ -33,12 +34,12 @@ impl AutoencoderEstimator {
 }
 
 impl Estimator for AutoencoderEstimator {
-    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
-        let estimate = estimate(&self.network, self.follower.prediction(), frame)?;
-        let window = Window::new([frame]);
-        let hidden = self.network.advance(&window, self.follower.hidden())?;
-        let prediction = accepted(self.network.predict(&hidden)?);
-        self.follower = Follower::at(hidden, prediction);
+    /// Bayes' rule with the learned `O` at visited cells (eq. 10); the predictor elsewhere.
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        let mut estimate = self.follower.prediction().clone();
+        let likelihood = likelihood(&self.network).map_err(failed)?;
+        correct(&mut estimate, &likelihood, frame)?;
+        self.follower = self.follower.after(&self.network, frame).map_err(failed)?;
         self.belief = estimate;
         Ok(())
     }
@@ -51,25 +52,17 @@ impl Estimator for AutoencoderEstimator {
         &self.belief
     }
 
-    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
-        let likelihood = likelihood(&self.network)?;
-        Ok(Some(score(&self.belief, &likelihood, frame)))
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        likelihood(&self.network).ok().map(Cow::Owned)
     }
 
-    fn follower(&self) -> Option<&Follower> {
-        Some(&self.follower)
+    fn hidden(&self) -> Option<&[f32]> {
+        Some(self.follower.hidden())
     }
 }
 
-/// Bayes' rule with the learned `O` at visited cells (eq. 10); the predictor elsewhere.
-fn estimate(
-    network: &Autoencoder,
-    prediction: &Belief,
-    frame: &Frame,
-) -> Result<Belief, EstimatorError> {
-    let mut estimate = prediction.clone();
-    correct(&mut estimate, &likelihood(network)?, frame)?;
-    Ok(estimate)
+fn failed(error: NetworkError) -> EstimatorError {
+    EstimatorError::Network(error.into())
 }
 
 /// `P(y | x)` of a network, shape `[S, O]`.

@@ -1,7 +1,7 @@
 //! A filter's first belief, announced, as simulating it may take long.
 
-use crate::estimation::belief::Belief;
-use crate::estimation::prior::Prior;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::prior::Prior;
 use protocol::model::ModelError;
 use protocol::{Model, Shape};
 

@@ -1,16 +1,16 @@
 //! What the autoencoder knows of one world: its hidden vector and its predictor (paper eq. 9).
 
-use crate::estimation::belief::Belief;
-use ::network::{Autoencoder, NetworkError};
-use protocol::Probabilities;
+use ::network::{Autoencoder, NetworkError, Window};
+use emberwatch_belief::estimation::belief::Belief;
+use protocol::{Frame, Probabilities};
 use serde::{Deserialize, Serialize};
 
 /// What a network knows of one world. Every method takes the same network.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Follower {
     /// `h_k`.
-    hidden: Vec<f32>,
-    prediction: Belief,
+    pub hidden: Vec<f32>,
+    pub prediction: Belief,
 }
 
 impl Follower {
@@ -25,6 +25,13 @@ impl Follower {
         Self { hidden, prediction }
     }
 
+    /// After a frame (eq. 9).
+    pub fn after(&self, network: &Autoencoder, frame: &Frame) -> Result<Self, NetworkError> {
+        let hidden = network.advance(&Window::new([frame]), &self.hidden)?;
+        let prediction = accepted(network.predict(&hidden)?);
+        Ok(Self { hidden, prediction })
+    }
+
     pub fn hidden(&self) -> &[f32] {
         &self.hidden
     }
@@ -34,6 +41,6 @@ impl Follower {
     }
 }
 
-pub(super) fn accepted(probabilities: Probabilities) -> Belief {
+fn accepted(probabilities: Probabilities) -> Belief {
     Belief::from_probabilities(probabilities).expect("invariant: a softmax is on the simplex")
 }

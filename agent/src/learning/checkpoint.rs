@@ -5,11 +5,11 @@
 //! which learner and which format it is of, and a digest tells damage that keeps its form.
 
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
 use crate::file::{Readers, replace_file};
 use ::network::NamedTensor;
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
+use emberwatch_belief::estimation::belief::Belief;
 use protocol::Shape;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensorError, SafeTensors};

@@ -1,6 +1,6 @@
-//! Parameters for a [`BayesFilter`](crate::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
-//! and first belief that maximise the likelihood of what was seen ([`Trainer`]; no bias). Read `parameters`, then
-//! `window` for one pass and its derivatives, then `trainer`.
+//! Parameters for a [`BayesFilter`](emberwatch_belief::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
+//! and first belief that maximise the likelihood of what was seen ([`Optimiser`]; no bias). Read `parameters`, then
+//! `recursion` for one pass and its derivatives, then `optimiser`.
 //!
 //! What the data do not tell: the scale of `w` (eq. 3 divides it out), and the order and, in part, the
 //! meaning of the states. Two parameter sets that predict every observation alike cannot be told
@@ -9,12 +9,12 @@
 //! by a prior on the state that pays most: it is seen almost surely.
 
 mod adam;
-mod correlation;
+mod convolution;
 mod layout;
 mod operator;
-mod trainer;
-mod window;
+mod optimiser;
+mod recursion;
 
 pub use adam::Adam;
-pub use trainer::{Trainer, Update};
-pub use window::Window;
+pub use optimiser::{Optimiser, Update};
+pub use recursion::Recursion;

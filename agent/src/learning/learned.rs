@@ -1,24 +1,20 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::estimation::parameters::Dimensions;
 use crate::learning::checkpoint::{self, Contents, wrong};
-use crate::learning::learner::{self, LearnedModel};
-use crate::learning::student::filter::SavedFilter;
-use crate::learning::student::{decisions, network};
-use crate::planning::policy::{EstimatorKind, Policy};
+use crate::learning::learners::decisions::{self, LearnedDecisions};
+use crate::learning::learners::filter::SavedFilter;
+use crate::learning::learners::filter::fit::{self, LearnedModel};
+use crate::learning::learners::network;
+use crate::policy::{Choice, EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::parameters::Dimensions;
 use protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 
 /// Kinds of checkpoints that policies act on.
-const KINDS: [&str; 4] = [
-    learner::KIND,
-    learner::OWN_KIND,
-    network::KIND,
-    decisions::KIND,
-];
+const KINDS: [&str; 4] = [fit::KIND, fit::OWN_KIND, network::KIND, decisions::KIND];
 
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
@@ -28,8 +24,8 @@ pub struct Learned {
     pub own_filter: Option<LearnedModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
     pub network: Option<Arc<network::Progress>>,
-    /// Decisions, for `dqn_beam`; they fit a model or not.
-    pub decisions: Option<Arc<Contents>>,
+    /// Decisions, for `learned_policy` and others on the belief that they were learned on.
+    pub decisions: Option<LearnedDecisions>,
 }
 
 impl Learned {
@@ -54,9 +50,9 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            learner::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
-            learner::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
-            decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
+            fit::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
+            fit::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
+            decisions::KIND => self.add_decisions(&contents)?,
             _ => {
                 let network = network::Progress::read(&contents, device)?;
                 self.network.replace(Arc::new(network)).is_some()
@@ -64,6 +60,26 @@ impl Learned {
         };
         ensure!(!twice, "expected one checkpoint of {kind}, got two");
         Ok(())
+    }
+
+    /// Decisions, with what their belief's filter learned; returns whether there were some before.
+    fn add_decisions(&mut self, contents: &Contents) -> Result<bool> {
+        let (decisions, model) = LearnedDecisions::read(contents)?;
+        if let Some(model) = model {
+            let (filter, kind) = if decisions.estimator.sees_own_state() {
+                (&mut self.own_filter, fit::OWN_KIND)
+            } else {
+                (&mut self.filter, fit::KIND)
+            };
+            let is_other = filter
+                .replace(model.clone())
+                .is_some_and(|filter| filter != model);
+            ensure!(
+                !is_other,
+                "expected one {kind}, got two: that of the decisions, and another"
+            );
+        }
+        Ok(self.decisions.replace(decisions).is_some())
     }
 }
 
@@ -81,18 +97,24 @@ impl Learned {
     /// The policies that act on it: those of filters, of the autoencoder, and of decisions.
     pub fn policies(&self, model: &Model) -> Vec<Policy> {
         let mut policies = Policy::all(model);
-        policies.retain(|policy| policy.needs_checkpoint() && self.suits(policy));
+        policies.retain(|policy| {
+            policy.needs_checkpoint() && !policy.is_option() && self.suits(policy)
+        });
         policies.sort_by_key(|policy| policy.estimator.knows_model());
         policies
     }
 
     /// Whether what a policy acts on was learned, if anything has to be.
     pub fn suits(&self, policy: &Policy) -> bool {
-        match policy.estimator {
-            EstimatorKind::Autoencoder => self.network.is_some(),
-            kind if kind.is_learned() => self.filter(kind).is_some(),
-            _ => !policy.is_decided || self.decisions.is_some(),
-        }
+        let mut decisions = self.decisions.iter();
+        let is_decided = policy.choice != Choice::Scorer
+            || decisions.any(|decisions| decisions.estimator == policy.estimator);
+        is_decided
+            && match policy.estimator {
+                EstimatorKind::Autoencoder => self.network.is_some(),
+                kind if kind.is_learned() => self.filter(kind).is_some(),
+                _ => true,
+            }
     }
 
     /// The state that pays most, as the one who learned an estimator's model found it.
@@ -105,10 +127,10 @@ impl Learned {
 }
 
 fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
-    let mut saved = contents.state::<SavedFilter>()?.learner;
+    let mut saved = contents.state::<SavedFilter>()?.fit;
     let dimensions = Dimensions {
         sees_own_state,
-        ..saved.trainer.dimensions()
+        ..saved.optimiser.dimensions()
     };
     let dimensions = dimensions.check();
     let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;

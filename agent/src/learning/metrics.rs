@@ -1,8 +1,8 @@
 //! Metrics of a training as CSV: one row per update, and one per step without any.
 
-use crate::estimation::scoring::Score;
 use anyhow::{Context, Result, ensure};
 use csv::StringRecord;
+use emberwatch_belief::estimation::scoring::Score;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -40,12 +40,12 @@ pub struct ModelUpdate {
     pub loss: Option<f64>,
     /// The model's step size, if it was updated.
     pub rate: Option<f64>,
-    /// What [`crate::learning::student::Student::columns`] names.
+    /// What [`crate::learning::learners::Learner::columns`] names.
     pub more: Vec<Option<f64>>,
 }
 
 impl ModelUpdate {
-    /// No update, after so many; `n_more`: length of [`crate::learning::student::Student::columns`].
+    /// No update, after so many; `n_more`: length of [`crate::learning::learners::Learner::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

@@ -5,9 +5,9 @@
 //! runs through the block before it renews. Frames of a block that is not full yet are not replayed while their
 //! track goes on. The oldest blocks go when there is no room.
 
-use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::{check, check_counts, check_numbers, wrong};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
 use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

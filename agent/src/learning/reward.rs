@@ -5,9 +5,9 @@
 //! found by least squares with forgetting, as early posteriors are poor. A learned filter has no
 //! other way to know which of its states is the fire.
 
-use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::check_numbers;
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
 use serde::{Deserialize, Serialize};
 
 /// Share of what was known that is kept at each path: a memory of 2,000 paths.

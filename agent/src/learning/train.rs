@@ -2,29 +2,28 @@
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
 //! model that a server may reveal is read only where decisions are learned. One message steps all robots.
-//! What is learned, and how it acts meanwhile, is a [`Student`]'s.
+//! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
 
 mod events;
-mod students;
-mod training;
+mod learners;
+mod spec;
 
-pub use self::training::{CHECKPOINT, Training};
+pub use self::spec::{CHECKPOINT, TrainingSpec};
 
 use self::events::Events;
-use self::students::student;
-use crate::estimation::scoring::Score;
+use self::learners::learner;
+use crate::client::feed::{Feed, View};
+use crate::client::info::connect;
 use crate::learning::checkpoint::{self, Contents};
+use crate::learning::learners::Learner;
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, ModelUpdate, Tick};
-use crate::learning::student::Student;
-use crate::rollout::Robot;
-use crate::server::feed::Feed;
-use crate::server::info::connect;
 use anyhow::{Result, bail};
+use emberwatch_belief::estimation::scoring::Score;
+use protocol::Client;
 use protocol::channels::Instance;
 use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
-use protocol::{Client, Move};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -50,18 +49,18 @@ pub struct TrainSummary {
 }
 
 /// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
-/// `contents`: what [`Training::check`] gave.
+/// `contents`: what [`TrainingSpec::check`] gave.
 pub fn train(
     instance: &Instance,
-    training: &Training,
+    spec: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<TrainSummary> {
-    let mut trainer = Trainer::attach(instance, training, contents)?;
-    let deadline = training.time_limit.map(|limit| Instant::now() + limit);
-    let outcome = trainer.act(training, stop, deadline);
-    let saved = trainer.save(training);
-    trainer.summary.times = trainer.student.times();
+    let mut training_loop = TrainingLoop::attach(instance, spec, contents)?;
+    let deadline = spec.time_limit.map(|limit| Instant::now() + limit);
+    let outcome = training_loop.act(spec, stop, deadline);
+    let saved = training_loop.save(spec);
+    training_loop.summary.times = training_loop.learner.times();
     match (outcome, saved) {
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
@@ -69,16 +68,16 @@ pub fn train(
             bail!("{problem:#}; what was learned is lost: {also:#}");
         }
     }
-    trainer.client.release()?;
-    if let Some(feed) = trainer.feed {
+    training_loop.client.release()?;
+    if let Some(feed) = training_loop.feed {
         feed.end();
     }
-    Ok(trainer.summary)
+    Ok(training_loop.summary)
 }
 
-struct Trainer {
+struct TrainingLoop {
     client: Client,
-    student: Box<dyn Student>,
+    learner: Box<dyn Learner>,
     metrics: Metrics,
     events: Events,
     feed: Option<Feed>,
@@ -95,48 +94,47 @@ struct Told {
     score: Score,
 }
 
-impl Trainer {
+impl TrainingLoop {
     fn attach(
         instance: &Instance,
-        training: &Training,
+        spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
-        let place = training.out.join(CHECKPOINT);
+        let place = spec.out.join(CHECKPOINT);
         let connection = connect(instance)?;
         let claim = Claim {
-            robots: training.robots(connection.info())?,
-            takeover: training.takeover,
+            robots: spec.robots(connection.info())?,
+            takeover: spec.takeover,
             time_to_live: Some(LEASE),
         };
         let mut client = Client::acquire(connection, &claim)?;
-        let mut student = student(training, &client, contents.as_ref(), &place)?;
-        let metrics = metrics(training, &*student)?;
-        let events = events(training, &*student)?;
-        if training.freeze {
-            student.freeze();
+        let mut learner = learner(spec, &client, contents.as_ref(), &place)?;
+        let metrics = metrics(spec, &*learner)?;
+        let events = events(spec, &*learner)?;
+        if spec.freeze {
+            learner.freeze();
         }
         let mut observations = client.observe(client.robots())?;
-        for world in ended(&client, &observations) {
-            for (robot, seen) in reset(&mut client, world)? {
-                observations[(robot - client.robots().start) as usize] = seen;
-            }
+        let over = ended(&client, &observations);
+        for (robot, seen) in reset(&mut client, &over)? {
+            observations[(robot - client.robots().start) as usize] = seen;
         }
-        let attached = student.attach(observations);
-        let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
+        let attached = learner.attach(observations);
+        let n_gone_on = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
         let n_new = client.robots().len() - n_gone_on;
-        if training.resume && n_new > 0 {
+        if spec.resume && n_new > 0 {
             let robots = n_new;
             tracing::info!(
                 robots,
                 "not where the checkpoint left them: beliefs begin again"
             );
         }
-        let belief = student.belief();
+        let belief = learner.belief();
         let feed = belief.map(|(belief, _)| Feed::open(instance, belief));
         let now = Instant::now();
         Ok(Self {
             client,
-            student,
+            learner,
             metrics,
             events,
             feed,
@@ -148,31 +146,30 @@ impl Trainer {
 
     fn act(
         &mut self,
-        training: &Training,
+        spec: &TrainingSpec,
         stop: &AtomicBool,
         deadline: Option<Instant>,
     ) -> Result<()> {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
-        let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
+        let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();
-            let tick = tick.map_err(|problem| training.stopped(problem, &*self.student))?;
-            let updates = match training.freeze {
+            let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
+            let updates = match spec.freeze {
                 true => Ok(Vec::new()),
-                false => self.student.learn(),
+                false => self.learner.learn(),
             };
-            let mut updates =
-                updates.map_err(|problem| training.stopped(problem, &*self.student))?;
-            self.summary.updates = self.student.n_updates();
+            let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
+            self.summary.updates = self.learner.n_updates();
             if updates.is_empty() {
-                let n_more = self.student.columns().len();
+                let n_more = self.learner.columns().len();
                 updates.push(ModelUpdate::nothing(self.summary.updates, n_more));
             }
             self.metrics.add(&tick, &updates)?;
-            self.events.add(&tick, &updates, &*self.student)?;
-            self.report(&tick);
+            self.events.add(&tick, &updates, &*self.learner)?;
+            self.report(&tick, spec.steps);
             if self.saved.elapsed() > SAVE_INTERVAL {
-                self.save(training)?;
+                self.save(spec)?;
             }
         }
         Ok(())
@@ -180,69 +177,68 @@ impl Trainer {
 
     /// One step of each robot; worlds at the end of their episodes begin again.
     fn step(&mut self) -> Result<Tick> {
-        let Self {
-            client,
-            student,
-            feed,
-            ..
-        } = self;
-        let (robots, wants_full) = (client.robots(), student.wants_full_frames());
-        let shown = feed
-            .as_ref()
-            .map_or_else(Vec::new, |feed| feed.turn(robots.len()));
-        let policy = format!("train {}", student.kind());
-        let (team, mut over) = (client.info().n_robots, Vec::new());
-        let mut fly = |paths: &[Vec<Move>]| {
-            let observations = match wants_full {
-                true => client.step_full(robots.clone(), paths)?,
-                false => client.step(robots.clone(), paths)?,
-            };
-            over = ended(client, &observations);
-            Ok(observations)
+        let start = Instant::now();
+        let paths = self.learner.plan();
+        let planning = start.elapsed() / paths.len().max(1) as u32;
+        let robots = self.client.robots();
+        let observations = if self.learner.wants_full_frames() {
+            self.client.step_full(robots, &paths)?
+        } else {
+            self.client.step(robots, &paths)?
         };
-        let mut look = |index: usize, robot: &Robot| {
-            if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
-                let number = robots.start + index as u32;
-                let mut view = robot.view(number / team, number..number + 1);
-                view.intent.policy.clone_from(&policy);
-                feed.show(&view);
-            }
-        };
-        let tick = student.step(&mut fly, &mut look)?;
-        for world in over {
-            for (robot, observation) in reset(client, world)? {
-                student.begin(robot, observation)?;
-            }
+        let over = ended(&self.client, &observations);
+        let tick = self.learner.see(observations)?;
+        self.show(planning);
+        self.learner.predict();
+        for (robot, observation) in reset(&mut self.client, &over)? {
+            self.learner.begin(robot, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(tick)
     }
 
+    /// Shows the posteriors of the robots whose turn it is; `planning`: time that a plan took.
+    fn show(&mut self, planning: Duration) {
+        let (robots, team) = (self.client.robots(), self.client.info().n_robots);
+        let Some(feed) = &mut self.feed else {
+            return;
+        };
+        for index in feed.turn(robots.len()) {
+            let (number, rollout) = (robots.start + index as u32, self.learner.rollout(index));
+            let mut view = View::of(rollout, number / team, number..number + 1, planning);
+            view.intent.policy = format!("train {}", self.learner.kind());
+            feed.show(&view);
+        }
+    }
+
     /// Writes the checkpoint, unless nothing is learned, and the metrics.
-    fn save(&mut self, training: &Training) -> Result<()> {
+    fn save(&mut self, spec: &TrainingSpec) -> Result<()> {
         self.saved = Instant::now();
-        if !training.freeze {
-            let contents = self.student.contents();
-            let mut contents = contents.map_err(|error| training.stopped(error, &*self.student))?;
-            contents.settings = toml::to_string(&training.config)?;
-            let place = training.out.join(CHECKPOINT);
-            checkpoint::write(&place, self.student.kind(), &contents)?;
+        if !spec.freeze {
+            let contents = self.learner.contents();
+            let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
+            contents.settings = toml::to_string(&spec.config)?;
+            let place = spec.out.join(CHECKPOINT);
+            checkpoint::write(&place, self.learner.kind(), &contents)?;
         }
         self.metrics.flush()?;
         self.events.flush()
     }
 
-    fn report(&mut self, tick: &Tick) {
+    fn report(&mut self, tick: &Tick, all_steps: u64) {
         let told = &mut self.told;
         told.score += tick.score;
         if told.at.elapsed() < REPORT_INTERVAL {
             return;
         }
         let steps = self.summary.steps - told.steps;
+        let before = tick.world_steps - self.summary.steps;
+        let of = (all_steps > 0).then_some(before + all_steps);
         tracing::info!(
             world_steps = tick.world_steps,
-            updates = self.student.n_updates(),
+            of = of,
+            updates = self.learner.n_updates(),
             log_likelihood = told.score.mean(),
             mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
             "training"
@@ -277,32 +273,36 @@ fn ended(client: &Client, observations: &[Observation]) -> Vec<u32> {
     worlds
 }
 
-/// Starts a world's next episode; returns what each of its robots shows.
-fn reset(
-    client: &mut Client,
-    world: u32,
-) -> Result<impl Iterator<Item = (u32, Observation)> + use<>, ConnectionError> {
-    client.reset(&[WorldSeed { world, seed: None }])?;
-    let team = client.info().n_robots;
-    let robots = world * team..(world + 1) * team;
-    Ok(robots.clone().zip(client.observe(robots)?))
+/// Starts the next episode of some worlds; returns what each of their robots shows.
+fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>, ConnectionError> {
+    if worlds.is_empty() {
+        return Ok(Vec::new());
+    }
+    let seeds = worlds.iter().map(|&world| WorldSeed { world, seed: None });
+    client.reset(&seeds.collect::<Vec<_>>())?;
+    let (team, mut seen) = (client.info().n_robots, Vec::new());
+    for world in worlds {
+        let robots = world * team..(world + 1) * team;
+        seen.extend(robots.clone().zip(client.observe(robots)?));
+    }
+    Ok(seen)
 }
 
 /// The file of metrics: a run without learning has one of its own.
-fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics> {
-    let (columns, world_steps) = (student.columns(), student.world_steps());
-    match (training.freeze, training.resume) {
-        (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
-        (false, true) => Metrics::go_on(&training.out.join(METRICS), columns, world_steps),
-        (false, false) => Metrics::begin(&training.out.join(METRICS), columns),
+fn metrics(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Metrics> {
+    let (columns, world_steps) = (learner.columns(), learner.world_steps());
+    match (spec.freeze, spec.resume) {
+        (true, _) => Metrics::begin(&spec.out.join(FROZEN), columns),
+        (false, true) => Metrics::go_on(&spec.out.join(METRICS), columns, world_steps),
+        (false, false) => Metrics::begin(&spec.out.join(METRICS), columns),
     }
 }
 
 /// The file of TensorBoard's events: a run without learning has a folder of its own, and begins again.
-fn events(training: &Training, student: &dyn Student) -> Result<Events> {
-    match (training.freeze, training.resume) {
-        (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),
-        (false, true) => Events::begin(&training.out, student.world_steps()),
-        (false, false) => Events::begin(&training.out, 0),
+fn events(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Events> {
+    match (spec.freeze, spec.resume) {
+        (true, _) => Events::begin(&spec.out.join(FROZEN_EVENTS), 0),
+        (false, true) => Events::begin(&spec.out, learner.world_steps()),
+        (false, false) => Events::begin(&spec.out, 0),
     }
 }

@@ -1,34 +1,42 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 use crate::config::AgentConfig;
-use crate::estimation::Estimator;
-use crate::estimation::belief::{Belief, BeliefError};
-use crate::estimation::scoring::Score;
-use crate::planning::action::Action;
-use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::team::{ROUNDS, plan_team};
-use crate::planning::{BasisKind, Objective, Plan, Planner, RandomWalk, Target};
-use anyhow::Result;
+use crate::policy::{PlannerKind, Policy};
+use ::network::Dqn;
+use anyhow::{Context, Result};
+use emberwatch_belief::estimation::Estimator;
+use emberwatch_belief::estimation::belief::{Belief, BeliefError};
+use emberwatch_belief::estimation::scoring::{Score, score};
+use emberwatch_belief::planning::options::choose_by_rule;
+use emberwatch_belief::planning::team::{ROUNDS, plan_team};
+use emberwatch_belief::planning::{
+    BasisKind, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan, Planner,
+    Proposal, RandomWalk,
+};
 use protocol::agent_belief::Intent;
+use protocol::path::fly;
 use protocol::{Cell, Frame, Grid};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// What a path that was not planned was for.
 const RANDOM_MOVES: &str = "random moves";
 
+const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
+
 /// A policy at work on one world.
 pub struct Agent {
     policy: Policy,
-    /// What each path is for, unless that is decided.
-    action: Action,
-    decider: Option<Decider>,
+    chooser: Chooser,
     estimator: Box<dyn Estimator>,
     pub(crate) basis: BasisKind,
     /// The last estimate p_k, where paths are planned on it.
     estimate: Option<Belief>,
     planner: Box<dyn Planner + Send>,
-    /// The state that pays most, where that is learned.
-    target: Option<usize>,
+    options: OptionPlanner,
+    pub memory: Memory,
+    /// What the belief calls the state that pays most.
+    target: usize,
     /// What the last path was for, in a word or two.
     aim: String,
     state_names: Vec<String>,
@@ -36,20 +44,35 @@ pub struct Agent {
     seed: u64,
 }
 
-/// Chooses what the next path is for (paper eq. 17), given the estimator after its prediction, a robot's cell and the
-/// number of moves.
-pub type Decider = Box<dyn Fn(&dyn Estimator, Cell, usize) -> Action + Send>;
+/// What says what each path is for.
+pub enum Chooser {
+    /// Always this.
+    Objective(Objective),
+    /// A DQN, given the estimator after its prediction (paper eq. 17).
+    Network(Decider),
+    Options(OptionChooser),
+}
+
+pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
+
+/// What chooses among options.
+pub enum OptionChooser {
+    Always(&'static PathOption),
+    Rule,
+    /// The option whose features are worth most to a DQN.
+    Scorer(Arc<Dqn>),
+}
 
 /// What an agent has beside its estimator and its policy.
 pub struct Setup {
+    pub chooser: Chooser,
     pub basis: BasisKind,
     pub state_names: Vec<String>,
     pub n_moves: usize,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
-    /// What the belief calls the state that pays most, where its states were learned.
-    pub target: Option<usize>,
-    pub decider: Option<Decider>,
+    /// What the belief calls the state that pays most.
+    pub target: usize,
 }
 
 impl Agent {
@@ -60,11 +83,6 @@ impl Agent {
         config: &AgentConfig,
         setup: Setup,
     ) -> Self {
-        let mut objective = config.objective(policy);
-        if let (Target::State(state), Some(target)) = (&mut objective.target, setup.target) {
-            *state = target;
-        }
-        let plain = || Action::plain(&objective.target.label(&setup.state_names), objective);
         let is_random = policy.planner == PlannerKind::RandomWalk;
         let aim = if is_random {
             RANDOM_MOVES
@@ -73,12 +91,13 @@ impl Agent {
         };
         Self {
             policy: policy.clone(),
-            action: policy.action.clone().unwrap_or_else(plain),
-            decider: setup.decider,
+            chooser: setup.chooser,
+            memory: Memory::new(estimator.belief().shape()),
             estimator,
             basis: setup.basis,
             estimate: None,
             planner: config.planner(policy),
+            options: OptionPlanner::new(config.decisions.beam_width),
             target: setup.target,
             aim: aim.into(),
             state_names: setup.state_names,
@@ -87,59 +106,121 @@ impl Agent {
         }
     }
 
-    /// The state that the belief calls what pays most; `otherwise` unless that is learned.
-    pub fn target(&self, otherwise: usize) -> usize {
-        self.target.unwrap_or(otherwise)
+    /// What the belief calls the state that pays most.
+    pub fn target(&self) -> usize {
+        self.target
     }
 
-    /// What the next path of a robot is for.
-    pub(crate) fn choose(&self, robot: Cell) -> Action {
-        match &self.decider {
-            Some(decide) => decide(&*self.estimator, robot, self.n_moves),
-            None => self.action.clone(),
-        }
-    }
-
-    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15). Decisions are made for the first robot.
+    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15).
     pub fn plan(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
-        self.plan_action(&self.choose(robots[0]), robots, step)
-    }
-
-    /// As [`Self::plan`], for an action other than the policy's.
-    pub fn plan_action(&mut self, action: &Action, robots: &[Cell], step: u64) -> Vec<Plan> {
-        if self.policy.planner != PlannerKind::RandomWalk {
-            self.aim.clone_from(&action.name);
-        }
-        let belief = self.estimate.as_ref().unwrap_or(self.estimator.belief());
-        let random = (self.seed, step);
-        action.plan(&mut *self.planner, belief, robots, self.n_moves, random)
+        let objective = match &self.chooser {
+            Chooser::Objective(objective) => *objective,
+            Chooser::Network(decide) => decide(&*self.estimator),
+            Chooser::Options(_) => return self.plan_options(robots),
+        };
+        self.plan_for(objective, robots, step)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
-        let name = objective.target.label(&self.state_names);
-        self.plan_action(&Action::plain(&name, objective), robots, step)
+        if self.policy.planner != PlannerKind::RandomWalk {
+            self.aim = objective.target.label(&self.state_names);
+        }
+        let values = objective.values(self.basis_belief());
+        let (planner, random) = (&mut *self.planner, (self.seed, step));
+        plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
+    }
+
+    /// As [`Self::plan`], on a belief other than the agent's.
+    #[cfg(test)]
+    pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
+        let own = self.estimate.replace(belief.clone());
+        let plans = self.plan(robots, step);
+        self.estimate = own;
+        plans
+    }
+
+    /// All options from a robot's cell, with what they promise.
+    pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
+        self.options.propose(&self.outlook(), robot)
+    }
+
+    /// The path of an option that was proposed and is flown now.
+    pub fn take_up(&mut self, option: usize, proposal: Proposal) -> Plan {
+        OPTIONS[option].name.clone_into(&mut self.aim);
+        proposal.plan
+    }
+
+    /// What the grid promises a robot now.
+    fn outlook(&self) -> Outlook {
+        Outlook::new(self.basis_belief(), self.target, &self.memory, self.n_moves)
+    }
+
+    /// The belief that paths are planned on.
+    fn basis_belief(&self) -> &Belief {
+        self.estimate.as_ref().unwrap_or(self.estimator.belief())
+    }
+
+    /// Each robot's choice, one after the other: what one of them visits is worth nothing to the next.
+    fn plan_options(&mut self, robots: &[Cell]) -> Vec<Plan> {
+        let mut outlook = self.outlook();
+        let mut plans: Vec<Plan> = Vec::with_capacity(robots.len());
+        for (index, &robot) in robots.iter().enumerate() {
+            if let Some(last) = plans.last() {
+                let visited = fly(outlook.shape(), robots[index - 1], &last.moves).visited;
+                outlook = outlook.without(&visited);
+            }
+            plans.push(self.plan_option(&outlook, robot));
+        }
+        plans
+    }
+
+    fn plan_option(&mut self, outlook: &Outlook, robot: Cell) -> Plan {
+        let option = match &self.chooser {
+            Chooser::Options(OptionChooser::Always(option)) => option,
+            Chooser::Options(OptionChooser::Scorer(scorer)) => {
+                let mut proposals = self.options.propose(outlook, robot);
+                let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
+                let best = scorer.best(&features);
+                OPTIONS[best].name.clone_into(&mut self.aim);
+                return proposals.swap_remove(best).plan;
+            }
+            _ => choose_by_rule(outlook, robot),
+        };
+        option.name.clone_into(&mut self.aim);
+        self.options.plan(option, outlook, robot)
     }
 
     /// As [`Self::plan`], paths of random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();
-        let values = self.action.values(self.estimator.belief());
+        let values = self.policy.objective.values(self.estimator.belief());
         let (planner, random) = (&mut RandomWalk, (self.seed, step));
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
     /// How well the belief predicts a frame; `None` of an estimator that predicts none.
-    pub fn score(&self, frame: &Frame) -> Result<Option<Score>> {
-        Ok(self.estimator.score(frame)?)
+    pub fn score(&self, frame: &Frame) -> Option<Score> {
+        let likelihood = self.estimator.likelihood()?;
+        Some(score(self.estimator.belief(), &likelihood, frame))
     }
 
-    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for policies that are fed with it.
+    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for upper bounds that must be told it.
     ///
     /// # Errors
-    /// The belief is then as it was.
+    /// Also if an upper bound is not told. The belief is then as it was.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
-        Ok(self.estimator.correct(frame, truth)?)
+        self.estimator.correct(frame)?;
+        if let Some(told) = self.estimator.told() {
+            told.tell(truth.context(NO_TRUTH)?)?;
+        }
+        self.memory.see(frame);
+        Ok(())
+    }
+
+    /// Takes in what the last path brought.
+    pub fn earn(&mut self, reward: f64) {
+        self.memory.earn(reward, self.n_moves);
     }
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
@@ -157,9 +238,9 @@ impl Agent {
         }
     }
 
-    /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
+    /// Tells an upper bound the state X_{k+1} that its next path will meet; others ignore it.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
-        self.estimator.foresee(next)
+        self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }
 
     /// The belief: about X_k after `correct`, about X_{k+1} after `predict`.
@@ -173,6 +254,11 @@ impl Agent {
 
     pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
         &mut *self.estimator
+    }
+
+    /// Goes on with another estimator, such as one with newer parameters.
+    pub fn set_estimator(&mut self, estimator: Box<dyn Estimator>) {
+        self.estimator = estimator;
     }
 
     /// The estimate p_k, where paths are planned on it.

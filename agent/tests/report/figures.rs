@@ -1,12 +1,12 @@
 //! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
 
 use super::synthetic::{ladder, noise, run, teams};
-use agent::Belief;
 use agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
 use agent::benchmark::report::training::{FIGURES, draw_training};
 use agent::benchmark::report::{
     PolicyRun, Snapshot, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
 };
+use emberwatch_belief::Belief;
 use protocol::randomness::split_mix;
 use protocol::{Frame, Grid, Model, Move, Shape};
 use std::path::{Path, PathBuf};

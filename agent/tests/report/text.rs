@@ -65,6 +65,22 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
 }
 
 #[test]
+fn shares_are_of_the_best_oracle_in_the_table() {
+    let mut runs = three_policies();
+    runs.extend(
+        (1..)
+            .zip([5.0, 10.0, 10.0])
+            .map(|(world, reward)| run("ahead", "truth", world, reward)),
+    );
+    let table = render_table(&runs, "coverage");
+    let share = |policy| row(&table, policy, 0)[6].clone();
+    assert_eq!(
+        ["coverage", "oracle_beam", "ahead"].map(share),
+        ["36.0", "80.0", "100.0"]
+    );
+}
+
+#[test]
 fn teams_are_compared_with_as_many_robots_alone() {
     let table = render_table(&teams(3), "beam");
     assert!(

@@ -16,6 +16,7 @@ fn damaged() -> Vec<u8> {
         protocol: 2,
         build: "0.1.0".into(),
         pid: 1,
+        pid_namespace: None,
         height: 2,
         width: 3,
         n_moves: 1,

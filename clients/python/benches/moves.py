@@ -1,4 +1,4 @@
-"""Moves a second of many worlds of `WildfireMoves-v0`, and decisions of `WildfireObjective-v0`.
+"""Moves a second of many worlds of `WildfireMoves-v0`, and decisions of `WildfireObjective-v1`.
 
 Peers: Gymnasium's `SyncVectorEnv` of the single environments, and of an environment with the same
 spaces that simulates nothing. Rounds take turns, so that a noisy machine is noisy for all. Prints
@@ -21,7 +21,7 @@ import emberwatch
 from emberwatch.programs import Program, unused_instance
 
 MOVES = "emberwatch:emberwatch/WildfireMoves-v0"
-OBJECTIVE = "emberwatch:emberwatch/WildfireObjective-v0"
+OBJECTIVE = "emberwatch:emberwatch/WildfireObjective-v1"
 NO_END = 2**31 - 1
 #: Of one server.
 CLIENTS = 16

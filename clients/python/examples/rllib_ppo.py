@@ -21,7 +21,7 @@ def make(settings: dict[str, Any]) -> gymnasium.Env:
     """Makes the environment, in the runner's process."""
     import emberwatch  # noqa: F401  (registers the environments there)
 
-    return gymnasium.make("emberwatch/WildfireObjective-v0", **settings)
+    return gymnasium.make("emberwatch/WildfireObjective-v1", **settings)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ import emberwatch
 
 WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
-OBJECTIVE = "emberwatch/WildfireObjective-v0"
+OBJECTIVE = "emberwatch/WildfireObjective-v1"
 
 #: Of its worlds every seed and every step looks different.
 LIVELY = str(Path(__file__).with_name("lively.toml"))

@@ -298,7 +298,7 @@ def test_rust_and_python_see_the_same_frames() -> None:
 
 def test_seeds_are_checked() -> None:
     env = make()
-    with pytest.raises(gymnasium.error.Error, match="greater or equal"):
+    with refuses(r"seed: expected an integer .*, got -1"):
         env.reset(seed=-1)
     with refuses(r"seed: expected an integer .*, got 18446744073709"):
         env.reset(seed=2**64)

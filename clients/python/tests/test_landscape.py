@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from numpy.typing import NDArray
 from PIL import Image
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
@@ -73,9 +74,42 @@ def test_files_upside_down_are_turned(tmp_path: Path, out: Path) -> None:
     np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
 
 
-def test_scale_and_offset_of_a_band_count(tmp_path: Path, out: Path) -> None:
-    import rasterio
+def test_rotations_by_rounding_are_none(tmp_path: Path, out: Path) -> None:
+    for values, numbers in (
+        (ARRIVAL, (30, 6e-17, 500_000, 6e-17, -30, 4_000_000)),
+        (ARRIVAL, (30, 0, 500_000, 1e-12, -30, 4_000_000)),
+        (ARRIVAL[::-1, ::-1], (-30, 4e-15, 500_000, 4e-15, 30, 4_000_000)),
+    ):
+        file = geotiff(tmp_path / "fire.tif", values)
+        with rasterio.open(file, "r+") as opened:
+            opened.transform = rasterio.Affine(*numbers)
+        np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit=min", "--force"), FIRE)
 
+
+def test_a_word_can_mean_no_value_in_an_ascii_grid(tmp_path: Path, out: Path) -> None:
+    for word in ("null", "NA", "*", "1.#QNAN", "-inf", "nan", "-9999.00"):
+        file = ascii_grid(tmp_path / "fire.asc")
+        file.write_text(file.read_text().replace("value -9999.0", f"value {word}"))
+        if word != "-9999.00":
+            file.write_text(file.read_text().replace("-9999.0", word.lower()))
+        np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit=min", "--force"), FIRE)
+
+
+def test_files_about_layers_are_none(tmp_path: Path, out: Path) -> None:
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    for k, layer in enumerate(masks()):
+        geotiff(folder / f"{k}.tif", layer, nodata=None)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "0.tif", "r+") as file:
+        file.write_mask(np.ones((3, 4), bool))
+    assert (folder / "0.tif.msk").exists()
+    for name in "0.tif.ovr 1.tif.aux.xml 2.tif.vat.dbf 3.qml 3.tfw 3.png a.prj a.xml".split():
+        (folder / name).write_text("")
+    flags = ("--kind", "mask", *STEP, "--burning", 2)
+    np.testing.assert_array_equal(one(out, folder, *flags), FIRE[:4])
+
+
+def test_scale_and_offset_of_a_band_count(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", np.where(ARRIVAL == NEVER, NEVER, ARRIVAL / 5 + 2))
     with rasterio.open(file, "r+") as opened:
         opened.scales, opened.offsets = [5.0], [-10.0]

@@ -149,7 +149,10 @@ CASES: dict[str, tuple[Case, str]] = {
         ascii_file("20.0", "20.0 20.0"),
         "a.asc: expected 12 numbers for 3 x 4 cells, got 14",
     ),
-    "word in an ASCII grid": (ascii_file("35.0", "x"), "a.asc: expected numbers, got 'x'"),
+    "word in an ASCII grid": (
+        ascii_file("35.0", "x"),
+        "a.asc: expected numbers, got 'x'; NODATA_value names a word for no value",
+    ),
     "no NumPy file": (lambda f: (text(f / "a.npz", "hello"), *MASKS), "expected a NumPy file, got"),
     "objects": (
         lambda f: (array(f, np.array([{}], object)), *MASKS),
@@ -193,7 +196,7 @@ CASES: dict[str, tuple[Case, str]] = {
     "variable of a GeoTIFF": (arrivals("--variable", "at"), "which has no variables, got 'at'"),
     "fourth dimension": (
         lambda f: (netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True), *MASKS),
-        "expected a variable of time, rows and columns, in this order, got it over level",
+        "expected a variable of time, rows and columns, got it over level",
     ),
     "other size": (
         lambda f: (
@@ -222,7 +225,15 @@ CASES: dict[str, tuple[Case, str]] = {
         "degrees of latitude; reproject it",
     ),
     "rotated grid": (
-        lambda f: (rotated(f / "a.tif"), *ARRIVALS),
+        lambda f: (rotated(f / "a.tif", 30, 5, 0, 5, -30, 0), *ARRIVALS),
+        "expected rows from west to east, got a rotated grid",
+    ),
+    "grid rotated by a hundredth of a cell": (
+        lambda f: (rotated(f / "a.tif", 30, 0, 0, 0.075, -30, 0), *ARRIVALS),
+        "expected rows from west to east, got a rotated grid",
+    ),
+    "grid on its side": (
+        lambda f: (rotated(f / "a.tif", 1e-15, 30, 0, 30, 1e-15, 0), *ARRIVALS),
         "expected rows from west to east, got a rotated grid",
     ),
     "missing data": (
@@ -314,14 +325,7 @@ CASES: dict[str, tuple[Case, str]] = {
             netcdf(f / "a.nc", at=np.zeros((2, 3, 4)), times=[0, 1], over=("member", "y", "x")),
             *MASKS,
         ),
-        "expected a variable of time, rows and columns, in this order, got it over member",
-    ),
-    "rows before times": (
-        lambda f: (
-            netcdf(f / "a.nc", at=np.zeros((2, 2, 2)), times=[0, 1], over=("y", "x", "time")),
-            *MASKS,
-        ),
-        "expected a variable of time, rows and columns, in this order, got it over y",
+        "expected a variable of time, rows and columns, got it over member",
     ),
     "a height that stretches": (
         arrivals("--height", 2),
@@ -432,7 +436,10 @@ CASES: dict[str, tuple[Case, str]] = {
         lambda f: arrivals("--picture", folder(f / "a.png"))(f),
         "--picture: expected a file, got the folder ",
     ),
-    "name that is no text": (arrivals("--name", "\udcff"), r"--name: expected UTF-8, got '\udcff'"),
+    "name that is no text": (
+        arrivals("--name", "\udcff"),
+        r"has its letters, such as LC_ALL=C.UTF-8, got '\udcff'",
+    ),
     "cells of nothing": (
         arrivals("--cell", "1e-320"),
         "--cell: expected at least 0.001 metres, got 1e-320",
@@ -470,12 +477,12 @@ CASES: dict[str, tuple[Case, str]] = {
 }
 
 
-def rotated(path: Path) -> Path:
+def rotated(path: Path, *numbers: float) -> Path:
     import rasterio
 
     geotiff(path)
     with rasterio.open(path, "r+") as file:
-        file.transform = rasterio.Affine(30, 5, 0, 5, -30, 0)
+        file.transform = rasterio.Affine(*numbers)
     return path
 
 
@@ -522,11 +529,14 @@ def test_output_that_is_there_is_kept_without_force(
 def test_a_missing_library_names_the_extra(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = geotiff(tmp_path / "a.tif")
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    line = refused((file, *ARRIVALS, "--out", tmp_path / "world.npz"), capsys)
-    assert "expected rasterio to read it with" in line
-    assert line.endswith("pip install emberwatch[landscape]")
+    for file, name in (
+        (geotiff(tmp_path / "a.tif"), "rasterio"),
+        (netcdf(tmp_path / "a.nc", at=ARRIVAL), "netCDF4"),
+    ):
+        monkeypatch.setitem(sys.modules, name, None)
+        line = refused((file, *ARRIVALS, "--out", tmp_path / "world.npz"), capsys)
+        assert f"expected {name} to read it with" in line
+        assert line.endswith("pip install emberwatch[landscape]")
 
 
 def test_an_output_that_cannot_be_written_is_named(

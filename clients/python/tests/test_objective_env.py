@@ -1,21 +1,31 @@
-"""`WildfireObjective-v0` and the agent behind it."""
+"""`WildfireObjective-v1` and the agent behind it."""
 
 from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import environments
+import gymnasium
 import numpy as np
 import pytest
-from environments import OBJECTIVE, agent_pid, assert_same, impatient, private_pid, rollout
+from environments import (
+    OBJECTIVE,
+    agent_pid,
+    assert_same,
+    closed_later,
+    impatient,
+    private_pid,
+    rollout,
+)
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
 from processes import eventually, server, stopped
 
 import emberwatch
-from emberwatch import errors
+from emberwatch import errors, programs
 from emberwatch.programs import Program
 from emberwatch.wrappers import BeliefObservation
 
@@ -46,9 +56,7 @@ def decide(env: Any) -> Any:
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
 
 
-@pytest.mark.parametrize(
-    "keywords", [{}, {"truth": True}, {"planner": "shooting"}, {"estimator": "spatial_filter"}]
-)
+@pytest.mark.parametrize("keywords", [{}, {"truth": True}, {"estimator": "spatial_filter"}])
 def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     check_env(env, skip_render_check=True)
@@ -58,11 +66,63 @@ def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
 
 def test_actions_and_numbers_have_names(env: Any) -> None:
     observation, _ = env.reset(seed=1000)
-    assert env.objectives == ("normal", "latent", "fire", "entropy")
     assert env.action_space.n == len(env.objectives)
-    assert observation.shape == (len(env.summary_names),) == (74,)
-    named = dict(zip(env.summary_names, observation, strict=True))
-    assert sum(named[f"mean_{state}"] for state in env.objectives[:3]) == pytest.approx(1.0)
+    assert observation.shape == (len(env.objectives), len(env.feature_names)) == (8, 26)
+    for objective, row in zip(env.objectives, observation, strict=True):
+        named = dict(zip(env.feature_names, row.tolist(), strict=True))
+        assert [named[f"is_{name}"] for name in env.objectives].count(1.0) == 1
+        assert named[f"is_{objective}"] == 1.0
+        assert named["n_paths"] == named["last_reward"] == 0.0
+    observation, reward, *_ = env.step(0)
+    named = dict(zip(env.feature_names, observation.T, strict=True))
+    assert np.allclose(named["last_reward"], reward / 4)
+    assert np.allclose(named["n_paths"], 1 / 200)
+
+
+def test_the_former_version_is_named() -> None:
+    with pytest.raises(gymnasium.error.DeprecatedEnv, match="WildfireObjective-v1"):
+        gymnasium.make("emberwatch/WildfireObjective-v0")
+
+
+def trained(folder: Path, **world: object) -> Path:
+    """The checkpoint of a filter that learned a little."""
+    settings = folder / "agent.toml"
+    settings.write_text("[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n")
+    flags = {"worlds": 2, "steps": 40, "config": settings, "out": folder / "out", "moves": 4}
+    flags |= world
+    command = ["train", *(f"--{name.replace('_', '-')}={flag}" for name, flag in flags.items())]
+    programs.run("emberwatch-agent", command, timeout=120)
+    return folder / "out" / "checkpoint.safetensors"
+
+
+def test_a_checkpoint_brings_its_filter(tmp_path: Path) -> None:
+    checkpoint = trained(tmp_path, height=7, width=5, burn_in=50, model=environments.LIVELY)
+    learned = make(checkpoint=checkpoint)
+    seen, _ = learned.reset(seed=1000)
+    assert learned._agent.info.estimator == "learned_filter"
+    assert not np.array_equal(seen, make().reset(seed=1000)[0])
+    spatial = make_vec(checkpoint=str(checkpoint), estimator="learned_spatial_filter")
+    spatial.reset(seed=1000)
+    decide(spatial)
+    known = make(checkpoint=checkpoint, estimator="known_model")
+    assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
+    with fails("program", match="expected --checkpoint FILE of such a filter"):
+        make(estimator="learned_own_filter").reset()
+    with fails("program", match="no file"):
+        make(checkpoint=tmp_path / "no file").reset()
+
+
+def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> None:
+    states = tmp_path / "lab.npy"
+    np.save(states, np.random.default_rng(5).integers(0, 3, (30, 7, 9), np.uint8))
+    states.with_suffix(".toml").write_bytes(environments.RECORDED.read_bytes())
+    checkpoint = trained(tmp_path, states=states)
+    world = {"states": states, "n_moves": 4}
+    env: Any = closed_later(gymnasium.make(OBJECTIVE, checkpoint=checkpoint, **world))
+    env.reset(seed=1000)
+    assert env.step(0)[4]["step"] == 1
+    with fails("program", match="recorded worlds, without a model"):
+        closed_later(gymnasium.make(OBJECTIVE, **world)).reset()
 
 
 def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:
@@ -83,7 +143,7 @@ def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
     env.reset(seed=1000)
     env.step(2)
     for takeover in (False, True):
-        other = make(instance=env.instance, planner="shooting", takeover=takeover)
+        other = make(instance=env.instance, takeover=takeover)
         with fails("program", match="served already, by pid"):
             other.reset(seed=1001)
     assert env.step(2)[4]["step"] == 2
@@ -131,7 +191,7 @@ def test_a_hidden_model_must_be_given() -> None:
     assert env.step(2)[4]["step"] == 1
 
 
-@pytest.mark.parametrize("action", [4, [0, 1, 4], "fire"])
+@pytest.mark.parametrize("action", [8, [0, 1, 8], "fire"])
 def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: object) -> None:
     with refuses("action: expected"):
         any_env.step(action)
@@ -141,8 +201,7 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
 @pytest.mark.parametrize(
     ("keywords", "words"),
     [
-        ({"planner": "magic"}, "expected one of beam, shooting, got 'magic'"),
-        ({"estimator": "truth"}, "expected one of known_model, spatial_filter, got 'truth'"),
+        ({"estimator": "truth"}, "expected one of None, known_model, .*, got 'truth'"),
         ({"prior": "none"}, "expected one of simulated, initial, uniform"),
         ({"agent": "other"}, "expected one of own, running"),
         ({"agent": "running"}, "expected instance="),
@@ -206,13 +265,14 @@ def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
     envs.reset(seed=1000)
     decide(envs)
     with emberwatch.Decisions(started.instance, 1) as decisions:
-        assert (decisions.worlds, decisions.info.planner) == (range(1, 4), "beam")
+        assert (decisions.worlds, decisions.info.estimator) == (range(1, 4), "known_model")
+        assert decisions.features(decisions.last()).shape == (3, 8, 26)
         assert [made.step for made in decisions.decide([2, None, np.int64(1)])] == [2, 1, 2]
         assert [made.objective for made in decisions.reset([7], worlds=[3])] == [2, 0, None]
         assert [made.seed for made in decisions.last()] == [1000, 1001, 7]
-        with fails("bad_objective", match="expected 0 to 3, got 9 for world 2") as refused:
+        with fails("bad_objective", match="expected 0 to 7, got 9 for world 2") as refused:
             decisions.decide([2, 9, 2])
-        assert refused.value.detail == 4
+        assert refused.value.detail == 8
         with fails("malformed", match="objectives: expected 3, one a world, got 1"):
             decisions.decide([2])
         for wrong in (1.5, -1, "fire", True, 2**64, [0, 1]):

@@ -252,6 +252,7 @@ impl Replay<'_> {
         };
         let version = request.user_header().version;
         let (reply, next) = self.state.answer(version, request.payload(), &counts);
+        let reply = self.ports.with_memory(reply);
         self.send(&request, &reply);
         if next == Next::End {
             wait_until_taken(&[request]);

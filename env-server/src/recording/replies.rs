@@ -3,6 +3,7 @@
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse};
 use protocol::message::{Status, VERSION};
 use protocol::payload::split_frame_payload;
+use protocol::program::pid_namespace;
 use protocol::recording::Event;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -104,6 +105,7 @@ impl ReplayState {
             }
             Ok(Request::Hello { .. }) => Reply::Hello(Box::new(ServerInfo {
                 pid: std::process::id(),
+                pid_namespace: pid_namespace(),
                 publish_truth: self.has_truth,
                 ..self.info.clone()
             })),

@@ -1,9 +1,10 @@
 //! The server's ends of the channels.
 
 use super::descriptors::raise_limit;
+use super::memory::{Memory, PortIds, check_shared_memory};
 use super::taken::{Taken, once_free};
 use crate::config::Checked;
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -15,17 +16,18 @@ use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
-    Channel, ChannelError, ControlService, Entries, FRAME_BUFFER, FrameService, Instance, Ipc,
-    MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services,
-    StepService, TRUTH_BUFFER, TruthService, create_node, ipc_error,
+    Channel, ChannelError, ControlService, Entries, FrameService, Instance, Ipc, RequestResponse,
+    Services, StepService, TruthService, create_node, ipc_error, lives_elsewhere,
 };
-use protocol::control::ServerInfo;
+use protocol::control::{Reply, ServerInfo};
 use protocol::failed_connections::FailedConnections;
-use protocol::message::{FrameHeader, Header, StepReply, StepRequest, TruthHeader};
+use protocol::message::{FrameHeader, Header, Status, StepReply, StepRequest, TruthHeader};
 use protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use protocol::program::node_pid;
 use protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
 };
+use protocol::shared_memory::fill_ports;
 use protocol::throttle::Throttle;
 use protocol::turn::Turn;
 use protocol::wait::{descriptor, drain};
@@ -36,12 +38,6 @@ use std::time::Instant;
 
 /// A request on `step` that waits for its answer.
 pub type ActiveStep = Active<StepRequest, StepReply>;
-
-/// Bytes that iceoryx2 adds to each message, at most.
-const MESSAGE_OVERHEAD: usize = 512;
-
-/// Shared memory for everything of fixed size: control messages, events, tables.
-const FIXED_BYTES: u64 = 8 << 20;
 
 /// The instance, and the sizes of its messages.
 #[derive(Debug, Clone)]
@@ -86,6 +82,7 @@ pub struct Ports {
     truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
     listener: Listener<Ipc>,
     answers: Answers,
+    memory: Memory,
     failed_connections: FailedConnections,
     unpublished: RefCell<Throttle>,
     control_service: ControlService,
@@ -146,16 +143,26 @@ impl Ports {
         let truth_service = config.publish_truth.then(|| services.truth()).transpose()?;
         let truth = truth_service.as_ref();
         let truth = truth.map(|service| publisher(service, config.n_cells, &failed));
+        let truth = truth.transpose()?;
         let listener = services.listener(Channel::WakeServer)?;
         let answers = Answers::new(&services)?;
+        fill_ports(&node, false)?;
+        let ids = PortIds {
+            control: control.id().value(),
+            step: step.id().value(),
+            frames: frames.id().value(),
+            truth: truth.as_ref().map(|truth| truth.id().value()),
+        };
+        let memory = Memory::new(&ids, config)?;
         let entries = Entries::of(&node)?;
         Ok(Self {
             step,
             control,
             frames,
-            truth: truth.transpose()?,
+            truth,
             listener,
             answers,
+            memory,
             failed_connections: failed,
             unpublished: RefCell::default(),
             control_service,
@@ -190,6 +197,18 @@ impl Ports {
         received(self.control.receive(), &self.failed_connections)
     }
 
+    /// A reply, or a refusal if it welcomes a client for whose answers there is no memory.
+    pub fn with_memory(&self, reply: Reply) -> Reply {
+        let n_clients = self.control_service.dynamic_config().number_of_clients();
+        match (
+            &reply,
+            self.memory.for_clients(n_clients.max(self.n_clients())),
+        ) {
+            (Reply::Hello(_), Err(error)) => Reply::error(Status::NoMemory, 0, error.to_string()),
+            _ => reply,
+        }
+    }
+
     /// Sends answers to requests of both kinds.
     pub fn answers(&mut self) -> &mut Answers {
         &mut self.answers
@@ -197,14 +216,20 @@ impl Ports {
 
     /// Publishes a step of a world, if anybody observes.
     pub fn publish_frame(&self, header: FrameHeader, bytes: &[u8]) {
-        let sent = publish(&self.frames, header, bytes);
+        let (n_observers, _) = self.observers();
+        let ready = self.memory.for_observers(n_observers);
+        let ready = ready.map_err(|error| error.to_string());
+        let sent = ready.and_then(|()| publish(&self.frames, header, bytes));
         self.warn_of(sent, "a frame was not published");
     }
 
     /// Publishes hidden states, if the server does so at all.
     pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
         let Some(truth) = &self.truth else { return };
-        let sent = publish(truth, header, states);
+        let (_, n_readers) = self.observers();
+        let ready = self.memory.for_readers(n_readers);
+        let ready = ready.map_err(|error| error.to_string());
+        let sent = ready.and_then(|()| publish(truth, header, states));
         self.warn_of(sent, "hidden states were not published");
     }
 
@@ -349,31 +374,12 @@ fn taken<Q: Header, R: Header>(
 ) -> anyhow::Error {
     let instance = config.instance.name().to_owned();
     match port_owner(service, &error) {
-        Some(pid) => Taken { instance, pid }.into(),
+        Some(node) if lives_elsewhere(node) => ChannelError::OtherPidNamespace { instance }.into(),
+        Some(node) => Taken {
+            instance,
+            pid: node_pid(node),
+        }
+        .into(),
         None => ipc_error("create a server")(error).into(),
     }
-}
-
-/// Checks that `/dev/shm` has enough room: a write to a full one ends the process with SIGBUS.
-fn check_shared_memory(config: &PortConfig) -> Result<()> {
-    let bytes =
-        |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
-    // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
-    let answers = bytes(MAX_CLIENTS * 2 * 3, config.answer_bytes);
-    let frames = bytes(MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2, config.frame_bytes);
-    let truth = bytes(MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2, config.n_cells);
-    let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
-    let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
-        return Ok(());
-    };
-    let free = status.f_bavail * status.f_frsize;
-    ensure!(
-        needed <= free,
-        "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
-         (docker: --shm-size), or serve fewer worlds or robots, or a smaller \
-         grid",
-        needed.div_ceil(1 << 20),
-        free >> 20
-    );
-    Ok(())
 }

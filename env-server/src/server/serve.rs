@@ -183,7 +183,7 @@ impl Server {
             .simulator
             .control(now, client, version, request.payload(), &stats)
         {
-            Outcome::Answer(reply) => self.send_reply(&request, &reply),
+            Outcome::Answer(reply) => self.send_reply(&request, &self.ports.with_memory(reply)),
             Outcome::Pending(jobs, pending) => {
                 self.resets.start(jobs);
                 self.pending_replies.push((request, pending));

@@ -9,6 +9,7 @@ use protocol::control::{
     parse,
 };
 use protocol::message::{Status, VERSION, WorldResult};
+use protocol::program::pid_namespace;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::ops::Range;
@@ -240,6 +241,7 @@ impl Simulator {
             protocol: VERSION,
             build: env!("CARGO_PKG_VERSION").into(),
             pid: std::process::id(),
+            pid_namespace: pid_namespace(),
             height: config.height,
             width: config.width,
             n_moves: config.moves,

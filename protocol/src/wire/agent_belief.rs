@@ -4,11 +4,14 @@
 //! from each sample.
 
 use super::channels::{
-    AgentService, ChannelError, Entries, Instance, Ipc, Services, create_node, ipc_error,
+    AGENT_BUFFER, AgentService, ChannelError, Entries, Instance, Ipc, MAX_AGENT_READERS, Services,
+    create_node, ipc_error, limited_error,
 };
 use super::message::{AgentHeader, VERSION};
 use super::node::Opened;
 use super::observer::Sample;
+use super::resources::check_room_for_ports;
+use super::shared_memory::{MessageMemory, fill_ports};
 use super::turn::Turn;
 use crate::model::grid::{Probabilities, Shape};
 use iceoryx2::node::Node;
@@ -66,6 +69,9 @@ pub struct BeliefPublisher {
 #[derive(Debug)]
 struct Ports {
     service: AgentService,
+    memory: MessageMemory,
+    /// Length of a sample for which there is memory.
+    n_bytes: usize,
     publisher: Publisher<Ipc, [u8], AgentHeader>,
     _node: Node<Ipc>,
 }
@@ -89,12 +95,18 @@ impl BeliefPublisher {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .max_loaned_samples(1)
             .create()
-            .map_err(ipc_error(
-                "publish beliefs (are there more than 16 agents?)",
-            ))?;
+            .map_err(limited_error("publish beliefs", "16 agents"))?;
+        let memory = MessageMemory::of(
+            publisher.id().value(),
+            n_messages(MAX_AGENT_READERS),
+            n_bytes,
+        )?;
+        fill_ports(&node, false)?;
         let entries = Entries::of(&node)?;
         let ports = Ports {
             service,
+            memory,
+            n_bytes,
             publisher,
             _node: node,
         };
@@ -124,6 +136,12 @@ impl BeliefPublisher {
         let (n_states, height, width) = belief.dim();
         let text = serde_json::to_vec(intent).expect("invariant: an intent serialises");
         let n_bytes = belief.len() * size_of::<f32>() + text.len();
+        if n_bytes <= self.ports.n_bytes {
+            let n_readers = self.ports.service.dynamic_config().number_of_subscribers();
+            self.ports.memory.make_ready(n_messages(n_readers))?;
+        } else {
+            check_room_for_ports(n_bytes)?; // It will be in a new file.
+        }
         let mut sample = self
             .ports
             .publisher
@@ -147,6 +165,11 @@ impl BeliefPublisher {
         self.sequence += 1;
         Ok(())
     }
+}
+
+/// Samples in use at a time with so many readers: a buffer and one that is read for each, the last and the next.
+fn n_messages(n_readers: usize) -> usize {
+    n_readers * (AGENT_BUFFER + 1) + 2
 }
 
 impl TryFrom<&Sample<AgentHeader>> for AgentBelief {

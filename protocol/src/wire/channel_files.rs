@@ -6,12 +6,13 @@
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::error::Ipc;
-use super::process::{if_there, process_state};
+use super::process::{if_there, node_pid, process_state};
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
+use rustix::process::{Flock, FlockType, fcntl_getlk};
 use rustix::time::{ClockId, clock_gettime};
 use std::collections::HashSet;
-use std::fs::Metadata;
+use std::fs::{File, Metadata};
 use std::io::Error;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -169,6 +170,18 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
     Ok((living, dead))
 }
 
+/// Whether a node without a process of its number here lives: in another PID namespace.
+pub fn lives_elsewhere(node: u128) -> bool {
+    let monitor = format!("nodes/{}{node}.node_monitor", prefix());
+    // To close that of a node of this process would end its lock.
+    if node_pid(node) == std::process::id() as i32 {
+        return false;
+    }
+    let locked = File::open(channel_directory().join(monitor))
+        .and_then(|file| Ok(fcntl_getlk(file, &Flock::from(FlockType::ReadLock))?));
+    matches!(locked, Ok(Some(_)))
+}
+
 fn service_id(text: &str) -> Option<u128> {
     let table = text.parse::<toml::Table>().ok()?;
     let id = table.get("unique_service_id")?;
@@ -186,7 +199,7 @@ pub(super) fn is_in_the_making(id: u128) -> Result<bool, Error> {
 /// Whether the process that began an id lives, or another one of its number.
 pub(super) fn lives(id: u128) -> Result<bool, Error> {
     Ok(!matches!(
-        process_state((id >> 64) as i32)?,
+        process_state(node_pid(id))?,
         None | Some('Z' | 'X')
     ))
 }

@@ -16,9 +16,11 @@ use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
 use std::sync::{Mutex, PoisonError};
 
+pub use super::channel_files::lives_elsewhere;
 pub use super::directory::{Entries, SHARED_MEMORY, channel_directory, node_config};
-pub use super::error::{ChannelError, Ipc, ipc_error};
+pub use super::error::{ChannelError, Ipc};
 pub use super::node::create_node;
+pub use super::resources::{check_room, ipc_error, limited_error};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
@@ -129,6 +131,13 @@ impl Instance {
     /// The error for an instance without a server.
     pub(crate) fn no_server(&self) -> ChannelError {
         ChannelError::NoServer {
+            instance: self.0.clone(),
+        }
+    }
+
+    /// The error for an instance whose server is in another PID namespace.
+    pub(crate) fn elsewhere(&self) -> ChannelError {
+        ChannelError::OtherPidNamespace {
             instance: self.0.clone(),
         }
     }
@@ -353,14 +362,14 @@ impl Services<'_> {
     }
 }
 
-/// The process id of the service's server, running or dead.
-pub(crate) fn server_pid<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<i32> {
-    let mut pid = None;
+/// The node of the service's server, running or dead.
+pub(crate) fn server_node<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<u128> {
+    let mut node = None;
     service.dynamic_config().list_servers(|server| {
-        pid = server.node_id.pid::<Ipc>().ok().map(|id| id.value());
+        node = Some(server.node_id.value());
         CallbackProgression::Stop
     });
-    pid
+    node
 }
 
 #[cfg(test)]

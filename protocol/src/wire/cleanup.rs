@@ -74,7 +74,7 @@ impl ChannelFiles {
         ports.extend(self.of_prefix(&self.root)?);
         let (mut living, dead) = nodes(config)?;
         let mut used = self.used(&living)?;
-        let mut n_removed = self.remove_unfinished()?;
+        let mut n_removed = self.remove_unfinished(&used)?;
         for node in dead {
             let id = node.id().value();
             // Unfinished tags were for nothing yet, but iceoryx2 could not remove the folder.
@@ -97,9 +97,12 @@ impl ChannelFiles {
     }
 
     /// Unfinished segments of dead processes: to open one could take without end.
-    fn remove_unfinished(&self) -> Result<usize, Error> {
+    fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
-            Ok(self.is_unfinished(path)? && !any(&self.ids(path), is_in_the_making)?)
+            let ids = self.ids(path);
+            // A port of another PID namespace, whose process cannot be asked for, may grow now.
+            let is_of_living = ids.iter().any(|id| used.ids.contains(id));
+            Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
     }
 

@@ -90,11 +90,13 @@ pub enum Status {
     Incomplete = 21,
     /// A robot outside the server's; detail: number of robots of all worlds.
     NoSuchRobot = 22,
+    /// There is too little shared memory for the answer; detail: its bytes, or 0.
+    NoMemory = 23,
 }
 
 impl Status {
     /// Every status, in the order of its code.
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 24] = [
         Self::Ok,
         Self::VersionMismatch,
         Self::UnknownOperation,
@@ -118,6 +120,7 @@ impl Status {
         Self::Early,
         Self::Incomplete,
         Self::NoSuchRobot,
+        Self::NoMemory,
     ];
 
     /// What to tell a client of another version.
@@ -180,6 +183,7 @@ impl Status {
                 "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
                  a step of several worlds needs them all"
             ),
+            Self::NoMemory => "shared memory is full: free some, and ask again".into(),
             Self::NoSuchRobot => format!(
                 "no such robot: the server has robots 0 to {}",
                 detail.saturating_sub(1)

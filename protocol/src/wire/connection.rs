@@ -2,8 +2,10 @@
 //!
 //! Nothing returned points into shared memory.
 
+use super::channel_files::lives_elsewhere;
 use super::channels::{
-    Channel, Entries, Instance, Ipc, Services, StepService, create_node, ipc_error, server_pid,
+    Channel, ChannelError, ControlService, Entries, Instance, Ipc, Services, StepService,
+    create_node, ipc_error, limited_error, server_node,
 };
 use super::control::{Reply, Request, ServerInfo};
 use super::exchange::{Exchange, check_answer, check_status, garbled};
@@ -12,7 +14,9 @@ use super::message::{
 };
 use super::node::Opened;
 use super::payload::split_step_payload;
-use super::process::WatchedProcess;
+use super::process::{WatchedProcess, node_pid, pid_namespace};
+use super::resources::check_room_for_ports;
+use super::shared_memory::fill_ports;
 use super::turn::Turn;
 use super::wait::Waiter;
 use iceoryx2::port::client::Client;
@@ -72,9 +76,9 @@ impl Connection {
         let longest = info.n_worlds as usize * of_world;
         let _turn = Turn::take_within(left())?;
         let step = step.client_builder().initial_max_slice_len(longest.max(1));
-        ports.step = Some(step.create().map_err(ipc_error(
-            "create a step client (are there more than 16 clients?)",
-        ))?);
+        let step = step.create();
+        ports.step = Some(step.map_err(limited_error("create a step client", "16 clients"))?);
+        fill_ports(&ports.exchange.node, true)?;
         Ok(Self {
             ports,
             info,
@@ -95,10 +99,7 @@ impl Connection {
         };
         let control_service = services.open_control()?;
         let step_service = services.open_step()?;
-        let server_process = server_pid(&control_service)
-            .and_then(|pid| WatchedProcess::open(pid).ok())
-            .filter(|server| !server.has_ended())
-            .ok_or_else(|| instance.no_server())?;
+        let server_process = server_process(&control_service, instance)?;
         let server = services
             .wake(Channel::WakeServer)?
             .notifier_builder()
@@ -107,13 +108,11 @@ impl Connection {
         let listener = services.listener(Channel::WakeClient)?;
         let control = control_service
             .client_builder()
-            .initial_max_slice_len(CONTROL_SLICE);
-        let control = control
+            .initial_max_slice_len(CONTROL_SLICE)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .create();
-        let control = control.map_err(ipc_error(
-            "create a control client (are there more than 16 clients?)",
-        ))?;
+            .create()
+            .map_err(limited_error("create a control client", "16 clients"))?;
+        fill_ports(&node, true)?;
         let entries = Entries::of(&node)?;
         let exchange = Exchange {
             instance: instance.clone(),
@@ -121,7 +120,7 @@ impl Connection {
             listener,
             server_process,
             waiter: Waiter::default(),
-            _node: node,
+            node,
         };
         let ports = Ports {
             step: None,
@@ -234,6 +233,20 @@ pub fn worlds_of(first_robot: u32, n_robots: u32, team: u32) -> Range<u32> {
     first_robot / team..end.div_ceil(team)
 }
 
+/// The process of a service's server.
+fn server_process(
+    service: &ControlService,
+    instance: &Instance,
+) -> Result<WatchedProcess, ChannelError> {
+    let node = server_node(service).ok_or_else(|| instance.no_server())?;
+    let process = WatchedProcess::open(node_pid(node)).ok();
+    match process.filter(|process| !process.has_ended()) {
+        Some(process) => Ok(process),
+        None if lives_elsewhere(node) => Err(instance.elsewhere()),
+        None => Err(instance.no_server()),
+    }
+}
+
 fn shake_hands(
     control: &Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
     exchange: &Exchange,
@@ -245,6 +258,14 @@ fn shake_hands(
         client: client.into(),
     };
     match ask(control, exchange, 1, &hello, timeout)? {
+        // A process of the server's number may be another one here.
+        Reply::Hello(info)
+            if info
+                .pid_namespace
+                .is_some_and(|it| pid_namespace() != Some(it)) =>
+        {
+            Err(exchange.instance.elsewhere().into())
+        }
         Reply::Hello(info) => Ok(*info),
         other => Err(unexpected("hello", &other)),
     }
@@ -259,6 +280,9 @@ fn ask(
 ) -> Result<Reply, ConnectionError> {
     const WHAT: &str = "a control request";
     let text = serde_json::to_vec(request).expect("invariant: requests serialise");
+    if text.len() > CONTROL_SLICE {
+        check_room_for_ports(text.len())?; // It will be in a new file.
+    }
     let (listener_low, listener_high) = exchange.listener_id();
     let header = ControlRequest {
         version: VERSION,

@@ -173,6 +173,9 @@ pub struct ServerInfo {
     pub build: String,
     /// The server's process.
     pub pid: u32,
+    /// The PID namespace of this number, as Linux numbers it; only there a client can watch the process.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pid_namespace: Option<u64>,
     /// Grid height H.
     pub height: usize,
     /// Grid width W.

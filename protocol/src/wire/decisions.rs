@@ -1,5 +1,5 @@
 //! The messages of decisions: an external learner decides the objective of the next path in each world, the agent
-//! estimates, plans and steps. JSON text both ways, behind the headers of `control`.
+//! estimates, plans, describes its plans and steps. JSON text both ways, behind the headers of `control`.
 
 use super::control::WorldSeed;
 use super::message::Status;
@@ -21,7 +21,7 @@ pub enum Request {
         /// The worlds and their seeds.
         worlds: Vec<WorldSeed>,
     },
-    /// Plan for objectives, fly the paths, correct the beliefs with the frames.
+    /// Fly the paths planned for objectives, correct the beliefs with the frames, plan again.
     Decide {
         /// One for each world: its position among [`AgentInfo::objectives`], or `None` to leave the world as it is.
         objectives: Vec<Option<u64>>,
@@ -66,6 +66,9 @@ pub struct AgentInfo {
     pub build: String,
     /// The agent's process.
     pub pid: u32,
+    /// The PID namespace of this number, as Linux numbers it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pid_namespace: Option<u64>,
     /// The instance of its server.
     pub instance: String,
     /// The first world it acts on.
@@ -82,14 +85,12 @@ pub struct AgentInfo {
     pub max_steps: u64,
     /// Names of the states.
     pub states: Vec<String>,
-    /// Names of the objectives: each state's probability, then `entropy`.
+    /// Names of the objectives, which are whole plans.
     pub objectives: Vec<String>,
-    /// The estimator: `known_model` or `spatial_filter`.
+    /// What keeps the belief, such as `known_model`.
     pub estimator: String,
-    /// The planner: `beam` or `shooting`.
-    pub planner: String,
-    /// Names of the numbers in [`Decision::summary`].
-    pub summary: Vec<String>,
+    /// Names of the numbers that describe the plan for an objective; see [`Decision::features`].
+    pub features: Vec<String>,
 }
 
 /// A world and the agent's belief after its last decision or reset.
@@ -117,8 +118,9 @@ pub struct Decision {
     pub episode: u64,
     /// The objective decided for; `None` after a reset, and before this agent's first decision.
     pub objective: Option<u64>,
-    /// The belief that the next plan uses, in a few numbers from 0 to 1; see [`AgentInfo::summary`].
-    pub summary: Vec<f32>,
+    /// What the next plans promise: 32-bit floats, little-endian, in base64; for each of [`AgentInfo::objectives`] the
+    /// numbers that [`AgentInfo::features`] names.
+    pub features: String,
 }
 
 impl Reply {

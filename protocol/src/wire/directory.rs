@@ -1,6 +1,7 @@
 //! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
 
-use super::error::{ChannelError, Ipc, ipc_error};
+use super::error::{ChannelError, Ipc};
+use super::resources::{REMEDY, ipc_error};
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 use std::cell::Cell;
@@ -9,8 +10,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-/// Where iceoryx2 keeps shared memory: a folder that every user may write to.
-pub const SHARED_MEMORY: &str = "/dev/shm";
+pub use super::resources::SHARED_MEMORY;
 
 /// How often to check that a program's files are still there.
 const CHECK_INTERVAL: Duration = Duration::from_millis(200);
@@ -130,6 +130,9 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
                 "{error}: channels need a {SHARED_MEMORY} that can be written to; as root, \
                  `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
             ),
+            std::io::ErrorKind::StorageFull => {
+                format!("{error}: {REMEDY}")
+            }
             _ => error.to_string(),
         },
     )

@@ -1,7 +1,6 @@
 //! Why a channel could not be opened or used.
 
 use iceoryx2::prelude::ipc;
-use std::fmt::Debug;
 use std::time::Duration;
 use thiserror::Error;
 
@@ -54,6 +53,43 @@ pub enum ChannelError {
         /// The world that has no agent.
         world: u32,
     },
+    /// Its server is in another PID namespace, where process ids mean other processes.
+    #[error(
+        "instance {instance:?} is served from another PID namespace: run both programs in one (docker: \
+         --pid=container:NAME; Kubernetes: shareProcessNamespace: true), or give each container a /dev/shm of its own \
+         (docker: --ipc=private)"
+    )]
+    OtherPidNamespace {
+        /// Name of the instance.
+        instance: String,
+    },
+    /// There is too little shared memory.
+    #[error("shared memory: {problem}")]
+    NoRoom {
+        /// What was expected, what there is, and what to do.
+        problem: String,
+    },
+    /// All places that a channel has are taken.
+    #[error("{what}: expected at most {most} at a time, got one more")]
+    NoPlace {
+        /// What was attempted.
+        what: &'static str,
+        /// How many there may be of whom.
+        most: &'static str,
+    },
+    /// The process may open no more files.
+    #[error(
+        "{what}: expected {needed} file descriptors, got fewer of the limit of {limit}; close some, or raise the limit \
+         (`ulimit -n`; docker: --ulimit nofile)"
+    )]
+    NoDescriptors {
+        /// What was attempted.
+        what: &'static str,
+        /// How many it takes.
+        needed: usize,
+        /// How many the process may have.
+        limit: String,
+    },
     /// iceoryx2 refused.
     #[error("{what}: iceoryx2 says {problem}")]
     Ipc {
@@ -62,12 +98,4 @@ pub enum ChannelError {
         /// iceoryx2's reason.
         problem: String,
     },
-}
-
-/// Adds context to an error of iceoryx2.
-pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
-    move |error| ChannelError::Ipc {
-        what,
-        problem: format!("{error:?}"),
-    }
 }

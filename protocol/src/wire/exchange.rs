@@ -68,7 +68,7 @@ pub(super) struct Exchange {
     pub(super) listener: Listener<Ipc>,
     pub(super) server_process: WatchedProcess,
     pub(super) waiter: Waiter,
-    pub(super) _node: Node<Ipc>,
+    pub(super) node: Node<Ipc>,
 }
 
 impl Exchange {

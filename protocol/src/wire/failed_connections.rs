@@ -1,18 +1,13 @@
 //! Connections that could not be opened, for example as no file descriptors are left: their clients get no answer.
 
+use super::resources::free_descriptors;
 use crate::throttle::Throttle;
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationFn, DegradationInfo};
-use rustix::event::{EventfdFlags, eventfd};
-use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 use std::cell::RefCell;
-use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
-
-/// Descriptors that a new client takes.
-const PER_CLIENT: usize = 10;
 
 /// Counts them, and warns of those for which there were no file descriptors: limits may change, and the system has
 /// one too.
@@ -42,10 +37,9 @@ impl FailedConnections {
         if self.count.swap(0, Ordering::Relaxed) == 0 {
             return;
         }
-        let free: Result<Vec<OwnedFd>, Errno> = (0..PER_CLIENT)
-            .map(|_| eventfd(0, EventfdFlags::CLOEXEC))
-            .collect();
-        let Err(problem) = free else { return };
+        let Err(problem) = free_descriptors() else {
+            return;
+        };
         if let Some(n_unsaid) = self.warnings.borrow_mut().pass(now) {
             let limit = getrlimit(Resource::Nofile).current;
             tracing::warn!(

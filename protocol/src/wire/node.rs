@@ -2,7 +2,8 @@
 
 use super::cleanup::make_way;
 use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, prefix};
-use super::error::{ChannelError, Ipc, ipc_error};
+use super::error::{ChannelError, Ipc};
+use super::resources::{check_room_for_ports, ipc_error};
 use super::turn::{SHORT_WAIT, Turn};
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::SignalHandlingMode;
@@ -20,6 +21,7 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
     let shared_memory = std::path::Path::new(SHARED_MEMORY);
     let config = node_config()?;
+    check_room_for_ports(0)?;
     let _turn = Turn::take()?;
     make_way()?;
     own_segments(shared_memory, &prefix())?;

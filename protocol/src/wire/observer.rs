@@ -2,10 +2,11 @@
 
 use super::channels::{
     AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Services,
-    TRUTH_BUFFER, create_node, ipc_error,
+    TRUTH_BUFFER, create_node, ipc_error, limited_error,
 };
 use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use super::node::Opened;
+use super::shared_memory::fill_ports;
 use super::turn::Turn;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
@@ -60,9 +61,8 @@ impl Observer<FrameHeader> {
     /// # Errors
     /// If the channel cannot be opened, or has too many observers.
     pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
-        let refusal = "observe frames (are there more than 16 observers?)";
         let frames = |services: &Services<'_>| services.frames();
-        Self::new(instance, frames, FRAME_BUFFER, refusal, true)
+        Self::new(instance, frames, FRAME_BUFFER, "16 observers", true)
     }
 }
 
@@ -72,9 +72,14 @@ impl Observer<TruthHeader> {
     /// # Errors
     /// If the channel cannot be opened, or has too many readers.
     pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
-        let refusal = "read the truth (are there more than 4 readers?)";
         let truth = |services: &Services<'_>| services.truth();
-        Self::new(instance, truth, TRUTH_BUFFER, refusal, true)
+        Self::new(
+            instance,
+            truth,
+            TRUTH_BUFFER,
+            "4 readers of the truth",
+            true,
+        )
     }
 }
 
@@ -84,9 +89,8 @@ impl Observer<AgentHeader> {
     /// # Errors
     /// If the channel cannot be opened, or has too many readers.
     pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
-        let refusal = "read the agents' beliefs (are there more than 4 readers?)";
         let agent = |services: &Services<'_>| services.agent();
-        Self::new(instance, agent, AGENT_BUFFER, refusal, false)
+        Self::new(instance, agent, AGENT_BUFFER, "4 readers of beliefs", false)
     }
 }
 
@@ -95,7 +99,7 @@ impl<H: Header> Observer<H> {
         instance: &Instance,
         service: impl FnOnce(&Services<'_>) -> Result<PortFactory<Ipc, [u8], H>, ChannelError>,
         buffer: usize,
-        refusal: &'static str,
+        most: &'static str,
         is_of_server: bool,
     ) -> Result<Self, ChannelError> {
         let _turn = Turn::take()?;
@@ -106,10 +110,11 @@ impl<H: Header> Observer<H> {
         };
         let service = service(&services)?;
         let subscriber = service.subscriber_builder().buffer_size(buffer).create();
-        let subscriber = subscriber.map_err(ipc_error(refusal))?;
+        let subscriber = subscriber.map_err(limited_error("observe an instance", most))?;
         if is_of_server {
             wake_server(&services)?;
         }
+        fill_ports(&node, true)?;
         let now = Instant::now();
         Ok(Self {
             ports: Opened::new(Entries::of(&node)?, (subscriber, node)),

@@ -47,6 +47,18 @@ impl WatchedProcess {
     }
 }
 
+/// The PID namespace of this process, by its number; `None` if the system does not say.
+pub fn pid_namespace() -> Option<u64> {
+    let link = std::fs::read_link("/proc/self/ns/pid").ok()?; // "pid:[4026531836]"
+    let number = link.to_str()?.strip_prefix("pid:[")?.strip_suffix(']')?;
+    number.parse().ok()
+}
+
+/// The process that an iceoryx2 id of a node or a port names, by its number in that process's PID namespace.
+pub fn node_pid(id: u128) -> i32 {
+    (id >> 64) as i32
+}
+
 /// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is no such process.
 pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
     let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;

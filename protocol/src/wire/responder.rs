@@ -2,13 +2,18 @@
 //!
 //! The server uses [`Answers`] on each of its channels; an agent uses a [`Responder`] for the decisions of a world.
 
+use super::channel_files::lives_elsewhere;
 use super::channels::{
     Channel, ChannelError, ControlService, Entries, Instance, Ipc, RequestResponse, Services,
-    create_node, ipc_error, server_pid,
+    create_node, ipc_error, server_node,
 };
+use super::control::Reply;
 use super::failed_connections::FailedConnections;
 use super::message::{ControlReply, ControlRequest, Header, Status, VERSION};
 use super::node::Opened;
+use super::process::node_pid;
+use super::resources::check_room_for_ports;
+use super::shared_memory::fill_ports;
 use super::turn::Turn;
 use super::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
@@ -26,7 +31,7 @@ use std::time::{Duration, Instant};
 use thiserror::Error;
 
 /// Length that answers in JSON may have before their segment grows, bytes.
-const JSON_SLICE: usize = 16_384;
+pub const JSON_SLICE: usize = 16_384;
 
 /// Listeners remembered before the table is emptied.
 const MAX_KNOWN_LISTENERS: usize = 1024;
@@ -126,8 +131,17 @@ impl Answers {
         }
     }
 
-    /// Sends an answer in JSON and wakes its client.
+    /// Sends an answer in JSON and wakes its client; a refusal if there is too little memory for a long answer.
     pub fn send_json(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
+        let mut status = status;
+        let mut text = serde_json::to_vec(reply).expect("invariant: replies serialise");
+        if text.len() > JSON_SLICE
+            && let Err(error) = check_room_for_ports(text.len())
+        {
+            let refusal = Reply::error(Status::NoMemory, text.len() as u64, error.to_string());
+            status = Status::NoMemory;
+            text = serde_json::to_vec(&refusal).expect("invariant: replies serialise");
+        }
         let asked = request.user_header();
         let header = ControlReply {
             version: VERSION,
@@ -135,7 +149,6 @@ impl Answers {
             sequence: asked.sequence,
         };
         let listener = listener_id(asked.listener_low, asked.listener_high);
-        let text = serde_json::to_vec(reply).expect("invariant: replies serialise");
         self.send(request, header, &text, listener);
     }
 
@@ -180,16 +193,18 @@ impl Responder {
         let server =
             control_server(&service, &failed_connections).map_err(|error| {
                 match port_owner(&service, &error) {
-                    Some(pid) => ResponderError::Taken {
+                    Some(node) if lives_elsewhere(node) => instance.elsewhere().into(),
+                    Some(node) => ResponderError::Taken {
                         instance: instance.name().into(),
                         world,
-                        pid,
+                        pid: node_pid(node),
                     },
                     None => ipc_error("create a server")(error).into(),
                 }
             })?;
         let listener = services.listener(Channel::WakeAgent(world))?;
         let answers = Answers::new(&services)?;
+        fill_ports(&node, true)?;
         let entries = Entries::of(&node)?;
         let ports = Ports {
             server,
@@ -260,13 +275,13 @@ pub fn control_server(
         .create()
 }
 
-/// The process that has a service's one answering port, if this is why another could not be created.
+/// The node that has a service's one answering port, if this is why another could not be created.
 pub fn port_owner<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
     error: &ServerCreateError,
-) -> Option<i32> {
+) -> Option<u128> {
     (*error == ServerCreateError::ExceedsMaxSupportedServers)
-        .then(|| server_pid(service))
+        .then(|| server_node(service))
         .flatten()
 }
 

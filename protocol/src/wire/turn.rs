@@ -127,7 +127,9 @@ fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
             return Err(ChannelError::Locked {
                 path: path.display().to_string(),
                 limit,
-                holder: holder(&file).map_or("a process".into(), |pid| format!("pid {pid}")),
+                holder: holder(&file).map_or("a process of another PID namespace".into(), |pid| {
+                    format!("pid {pid}")
+                }),
             });
         }
         std::thread::sleep(INTERVAL);

@@ -1,6 +1,7 @@
 //! The bounded wait that both sides use: spin while that pays, then block, never past a deadline.
 
-use super::error::{ChannelError, Ipc, ipc_error};
+use super::error::{ChannelError, Ipc};
+use super::resources::ipc_error;
 use super::spinning::Spinning;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::FileDescriptorBased;

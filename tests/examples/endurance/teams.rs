@@ -2,9 +2,11 @@
 //! moments, while this process flies one more robot, which paces the world, and checks each step.
 
 use agent::config::AgentConfig;
-use agent::estimation::belief::Belief;
-use agent::planning::team::robot_seed;
-use agent::planning::{CellValues, Objective, Planner, PlanningProblem, RandomWalk, Target};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_belief::planning::{
+    CellValues, Objective, Planner, PlanningProblem, RandomWalk, Target,
+};
 use protocol::message::FrameHeader;
 use protocol::observer::Sample;
 use protocol::path::path_to_bytes;

@@ -3,17 +3,20 @@
 use super::target::Seed;
 use agent::config::AgentConfig;
 use agent::estimation::Follower;
-use agent::estimation::belief::Belief;
-use agent::estimation::parameters::Dimensions;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
-use agent::learning::learner::{self, Learner};
+use agent::learning::learners::decisions::{self, Base, DecisionsLearner};
+use agent::learning::learners::filter::fit::{self, FilterFit};
+use agent::learning::learners::filter::{FilterLearner, SavedFilter};
+use agent::learning::learners::network::{self, Position, SavedNetwork};
+use agent::learning::learners::{Learner, Worlds};
 use agent::learning::reward::RewardEstimate;
-use agent::learning::student::decisions::{self, Decisions};
-use agent::learning::student::filter::{FilterStudent, SavedFilter};
-use agent::learning::student::network::{self, Position, SavedNetwork};
-use agent::learning::student::{Student, Worlds};
+use agent::policy::EstimatorKind;
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
+use network::{Dqn, DqnShape};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
 use std::collections::BTreeMap;
@@ -99,8 +102,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         learned = Learned::from_bytes(&bytes);
     }
     let Ok(learned) = learned else { return false };
-    let one = (learned.filter, learner::KIND, dimensions(false));
-    let own = (learned.own_filter, learner::OWN_KIND, dimensions(true));
+    let one = (learned.filter, fit::KIND, dimensions(false));
+    let own = (learned.own_filter, fit::OWN_KIND, dimensions(true));
     for (filter, kind, dimensions) in [one, own] {
         let Some(filter) = filter else { continue };
         let likelihood = filter.tables.likelihood_array();
@@ -110,15 +113,12 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             "likelihoods sum to {sums}"
         );
         let (_, contents) = decode(&[kind], &bytes).expect("read before");
-        if let Ok(mut student) = FilterStudent::resume(&contents, dimensions, worlds(), &config()) {
-            let again = student.contents().expect("no device");
+        if let Ok(mut learner) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
+            let again = learner.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
             // More takes its time. Numbers that are finite may be too large to work with.
-            let _ = (saved.learner.owed < 8.0).then(|| student.learn());
+            let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
         }
-    }
-    if let Some(contents) = learned.decisions {
-        let _ = decisions().load(&contents);
     }
     true
 }
@@ -150,8 +150,17 @@ fn config() -> AgentConfig {
     config
 }
 
-fn decisions() -> Decisions {
-    Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
+fn decisions() -> Contents {
+    let (model, shape) = (Model::wildfire(), worlds().shape);
+    let filter = BayesFilter::known(&model, Belief::uniform(3, shape)).expect("valid");
+    let base = Base::known(EstimatorKind::KnownModel, filter, &model);
+    let learner = DecisionsLearner::new(base, None, worlds(), &AgentConfig::default());
+    learner.expect("nothing to read").contents().expect("whole")
+}
+
+fn dqn() -> Dqn {
+    let settings = AgentConfig::default().dqn.settings();
+    Dqn::new(settings, DqnShape::of_actions(4, 4), 0)
 }
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
@@ -160,13 +169,13 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     // The tensors of networks would be too long for a corpus.
     let decisions = Contents {
         tensors: BTreeMap::new(),
-        ..decisions().to_contents()
+        ..decisions()
     };
     vec![
-        ("filter", encoded(learner::KIND, filter(dimensions(false)))),
+        ("filter", encoded(fit::KIND, filter(dimensions(false)))),
         (
             "own_filter",
-            encoded(learner::OWN_KIND, filter(dimensions(true))),
+            encoded(fit::OWN_KIND, filter(dimensions(true))),
         ),
         ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
@@ -178,19 +187,19 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape, config());
-    let mut learner = Learner::new(dimensions, shape, &config);
+    let mut fit = FilterFit::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
-    learner.begin(0);
+    fit.begin(0);
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
-        let learned = learner.learned();
-        learner.see(0, &frame, Some(&belief), &learned);
-        learner.reward(&belief, &[0, 2], 0.5);
-        learner.learn().expect("finite");
+        let learned = fit.learned();
+        fit.see(0, &frame, Some(&belief), &learned);
+        fit.reward(&belief, &[0, 2], 0.5);
+        fit.learn().expect("finite");
     }
-    let tensors = learner.named_tensors();
+    let tensors = fit.named_tensors();
     let state = SavedFilter {
-        learner,
+        fit,
         worlds: BTreeMap::new(),
     };
     Contents::new(tensors, &state)
@@ -203,13 +212,13 @@ fn autoencoder(side: usize, length: usize) -> Contents {
         shape: Shape::new(side, side).expect("a grid"),
         n_observations: 3,
         counters: [0, 0],
-        dqn: decisions().dqn.saved(),
+        dqn: dqn().saved(),
         frames: Vec::new(),
         tracks: Vec::new(),
         position: Position {
             follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
             estimate: None,
-            track: decisions().dqn.track(),
+            track: dqn().track(),
             reward: RewardEstimate::new(3),
             iterations: 0,
             place: None,

@@ -14,9 +14,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fmt;
 
-/// Width of both hidden layers, as in the authors' code.
-const WIDTH: usize = 128;
-
 /// Settings of the learner, as in files; there the optimiser has none.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DqnSettings {
@@ -38,6 +35,10 @@ pub struct DqnSettings {
     pub epsilon_steps: u64,
     /// Whether the network, and not its target, picks the action whose value the target gives.
     pub double: bool,
+    /// Whether an error of more than 1 counts by its size (Huber's loss), not by its square.
+    pub huber: bool,
+    /// Width of both hidden layers.
+    pub width: usize,
     /// The optimiser: by default the authors'.
     #[serde(skip, default = "adam")]
     pub adam: AdamSettings,
@@ -56,6 +57,8 @@ impl DqnSettings {
             epsilon_end: 0.1,
             epsilon_steps: 0,
             double: false,
+            huber: false,
+            width: 128,
             adam: adam(),
         }
     }
@@ -80,12 +83,52 @@ fn adam() -> AdamSettings {
     }
 }
 
+/// What a decision is made on, and among.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DqnShape {
+    /// Numbers that the network reads at once.
+    pub n_inputs: usize,
+    /// Values that it gives for them.
+    pub n_outputs: usize,
+    /// How often it reads for a decision: once, or for each candidate its own numbers.
+    pub n_candidates: usize,
+}
+
+impl DqnShape {
+    /// One vector, of which the network gives the value of each action.
+    pub fn of_actions(n_inputs: usize, n_actions: usize) -> Self {
+        Self {
+            n_inputs,
+            n_outputs: n_actions,
+            n_candidates: 1,
+        }
+    }
+
+    /// Candidates, each with numbers of its own, of which the network gives the candidate's value.
+    pub fn of_candidates(n_inputs: usize, n_candidates: usize) -> Self {
+        Self {
+            n_inputs,
+            n_outputs: 1,
+            n_candidates,
+        }
+    }
+
+    /// Numbers that a decision is made on.
+    pub fn n_numbers(&self) -> usize {
+        self.n_inputs * self.n_candidates
+    }
+
+    /// Choices of a decision.
+    pub fn n_choices(&self) -> usize {
+        self.n_outputs * self.n_candidates
+    }
+}
+
 /// Values of actions, learned from transitions.
 pub struct Dqn {
     pub(super) settings: DqnSettings,
     pub(super) seed: u64,
-    pub(super) n_inputs: usize,
-    pub(super) n_actions: usize,
+    pub(super) shape: DqnShape,
     network: Perceptron,
     pub(super) adam: Adam,
     /// Follows the network slowly.
@@ -108,8 +151,7 @@ struct Batch {
 
 impl Perceptron {
     /// Named as the layers of `torch.nn.Sequential`.
-    fn new(vb: &VarBuilder<'_>, n_inputs: usize, n_actions: usize) -> CandleResult<Self> {
-        let sizes = [n_inputs, WIDTH, WIDTH, n_actions];
+    fn new(vb: &VarBuilder<'_>, sizes: [usize; 4]) -> CandleResult<Self> {
         let layers = sizes.windows(2).enumerate().map(|(index, sizes)| {
             let (vb, init) = (vb.pp(2 * index), uniform_init(sizes[0]));
             let weight = vb.get_with_hints((sizes[1], sizes[0]), "weight", init)?;
@@ -129,17 +171,22 @@ impl Perceptron {
 }
 
 impl Dqn {
-    /// A learner over `n_inputs` numbers and `n_actions` actions; its target starts equal.
-    pub fn new(settings: DqnSettings, n_inputs: usize, n_actions: usize, seed: u64) -> Self {
-        let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, n_inputs, n_actions);
+    /// A learner whose target starts equal.
+    pub fn new(settings: DqnSettings, shape: DqnShape, seed: u64) -> Self {
+        let sizes = [
+            shape.n_inputs,
+            settings.width,
+            settings.width,
+            shape.n_outputs,
+        ];
+        let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, sizes);
         // First values depend on the seed and names alone.
         let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
         let ((network, variables), (target, target_variables)) = (made(), made());
         Self {
             settings,
             seed,
-            n_inputs,
-            n_actions,
+            shape,
             network,
             adam: on_cpu(Adam::new(variables)),
             target,
@@ -168,15 +215,24 @@ impl Dqn {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// The value of each action, `Q(h, .)`.
+    /// The value of each choice of a decision, `Q(h, .)`.
     ///
     /// # Panics
     /// If `input` has another length.
     pub fn values(&self, input: &[f32]) -> Vec<f32> {
-        assert_eq!(input.len(), self.n_inputs, "numbers of the input");
+        assert_eq!(input.len(), self.shape.n_numbers(), "numbers of the input");
         let values = Tensor::from_slice(input, (1, input.len()), &Device::Cpu)
-            .and_then(|input| self.network.forward(&input)?.squeeze(0)?.to_vec1());
+            .and_then(|input| self.choices(&self.network, &input)?.squeeze(0)?.to_vec1());
         on_cpu(values)
+    }
+
+    /// Values of all choices, `[N, n_choices]`, from the numbers of N decisions.
+    fn choices(&self, network: &Perceptron, input: &Tensor) -> CandleResult<Tensor> {
+        let n = input.dim(0)?;
+        let input = input.reshape((n * self.shape.n_candidates, self.shape.n_inputs))?;
+        network
+            .forward(&input)?
+            .reshape((n, self.shape.n_choices()))
     }
 
     /// The action of the largest value.
@@ -189,9 +245,10 @@ impl Dqn {
     /// The best action, or with the chance of this step a random one.
     pub fn act(&self, input: &[f32], step: u64) -> usize {
         let mut rng = stream(self.seed, Purpose::Exploration, step);
-        match uniform(&mut rng) < self.settings.epsilon_at(step) {
-            true => (rng.next_u64() % self.n_actions as u64) as usize,
-            false => self.best(input),
+        if uniform(&mut rng) < self.settings.epsilon_at(step) {
+            (rng.next_u64() % self.shape.n_choices() as u64) as usize
+        } else {
+            self.best(input)
         }
     }
 
@@ -205,10 +262,7 @@ impl Dqn {
     /// # Panics
     /// If it has other numbers of inputs or an action that there is not.
     pub fn remember(&mut self, transition: Transition) {
-        assert!(transition.action < self.n_actions, "transition: action");
-        for vector in [&transition.input, &transition.next] {
-            assert_eq!(vector.len(), self.n_inputs, "transition: numbers");
-        }
+        assert!(self.fits(&transition), "transition: numbers or action");
         self.memory.push_back(transition);
         if self.memory.len() > self.settings.replay {
             self.memory.pop_front();
@@ -227,7 +281,7 @@ impl Dqn {
         let mut rng = stream(self.seed, Purpose::Replay, self.n_updates());
         let ages = std::iter::repeat_with(|| rng.next_u64() % self.memory.len() as u64);
         let rows = ages.map(|age| &self.memory[age as usize]);
-        let batch = Batch::new(rows.take(self.settings.batch), self.n_inputs)?;
+        let batch = Batch::new(rows.take(self.settings.batch), self.shape)?;
         self.learn_batch(&batch).map(Some)
     }
 
@@ -236,7 +290,7 @@ impl Dqn {
     /// # Errors
     /// [`NetworkError`] for a number that is not finite; nothing has changed then.
     pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NetworkError> {
-        let batch = Batch::new(batch.iter(), self.n_inputs)?;
+        let batch = Batch::new(batch.iter(), self.shape)?;
         self.learn_batch(&batch)
     }
 
@@ -258,33 +312,46 @@ impl Dqn {
         Ok(loss)
     }
 
-    /// The mean of `(Q(h, a) - (r + gamma^n Q'(h', a')))^2`.
+    /// The mean of `(Q(h, a) - (r + gamma^n Q'(h', a')))^2`, or of its Huber loss.
     fn loss(&self, batch: &Batch) -> CandleResult<Tensor> {
-        let after = self.target.forward(&batch.next)?.detach();
-        let judge = match self.settings.double {
-            true => self.network.forward(&batch.next)?.detach(),
-            false => after.clone(),
+        let after = self.choices(&self.target, &batch.next)?.detach();
+        let judge = if self.settings.double {
+            self.choices(&self.network, &batch.next)?.detach()
+        } else {
+            after.clone()
         };
         let next = after.gather(&judge.argmax_keepdim(1)?, 1)?;
         let gamma = f64::from(self.settings.gamma).powi(self.settings.n_step.max(1) as i32);
         let goal = (&batch.reward + (next * gamma)?)?;
         let values = self.network.forward(&batch.input)?;
-        mse(&values.gather(&batch.action, 1)?, &goal)
+        let values = values.gather(&batch.action, 1)?;
+        if self.settings.huber {
+            huber(&values, &goal)
+        } else {
+            mse(&values, &goal)
+        }
+    }
+
+    /// Whether a transition is of such decisions: an input is of one candidate, what follows of all.
+    pub(super) fn fits(&self, transition: &Transition) -> bool {
+        transition.input.len() == self.shape.n_inputs
+            && transition.next.len() == self.shape.n_numbers()
+            && transition.action < self.shape.n_outputs
     }
 }
 
 impl Batch {
-    fn new<'a>(rows: impl Iterator<Item = &'a Transition>, n_inputs: usize) -> CandleResult<Self> {
+    fn new<'a>(rows: impl Iterator<Item = &'a Transition>, shape: DqnShape) -> CandleResult<Self> {
         let rows: Vec<&Transition> = rows.collect();
-        let vectors = |vector: fn(&&'a Transition) -> &'a [f32]| {
+        let vectors = |vector: fn(&&'a Transition) -> &'a [f32], length: usize| {
             let numbers: Vec<f32> = rows.iter().flat_map(vector).copied().collect();
-            Tensor::from_vec(numbers, (rows.len(), n_inputs), &Device::Cpu)
+            Tensor::from_vec(numbers, (rows.len(), length), &Device::Cpu)
         };
         let actions: Vec<u32> = rows.iter().map(|row| row.action as u32).collect();
         let rewards: Vec<f32> = rows.iter().map(|row| row.reward).collect();
         Ok(Self {
-            input: vectors(|row| &row.input)?,
-            next: vectors(|row| &row.next)?,
+            input: vectors(|row| &row.input, shape.n_inputs)?,
+            next: vectors(|row| &row.next, shape.n_numbers())?,
             action: Tensor::new(actions, &Device::Cpu)?.unsqueeze(1)?,
             reward: Tensor::new(rewards, &Device::Cpu)?.unsqueeze(1)?,
         })
@@ -306,6 +373,13 @@ impl fmt::Debug for Dqn {
         debug.field("n_updates", &self.n_updates());
         debug.finish_non_exhaustive()
     }
+}
+
+/// The mean of half the squared differences, which grow linearly from 1 on.
+fn huber(got: &Tensor, goal: &Tensor) -> CandleResult<Tensor> {
+    let size = (got - goal)?.abs()?;
+    let near = size.minimum(1.0)?;
+    (&near * (&size - (&near * 0.5)?)?)?.mean_all()
 }
 
 /// What candle gives for tensors of known sizes on the CPU.

@@ -82,15 +82,14 @@ impl Dqn {
             reward,
             next,
         } = transition;
-        let (n_inputs, n_actions) = (self.n_inputs, self.n_actions);
-        let numbers = || input.iter().chain(next).chain([reward]);
-        let fits = [input, next].iter().all(|vector| vector.len() == n_inputs);
-        if fits && *action < n_actions && numbers().all(|number| number.is_finite()) {
+        let mut numbers = input.iter().chain(next).chain([reward]);
+        if self.fits(transition) && numbers.all(|number| number.is_finite()) {
             return Ok(());
         }
+        let (n_inputs, n_outputs) = (self.shape.n_inputs, self.shape.n_outputs);
         Err(NetworkError::Transition {
             at,
-            expected: format!("{n_inputs} finite inputs and an action below {n_actions}"),
+            expected: format!("{n_inputs} finite inputs and an action below {n_outputs}"),
             got: format!("{} and {action}", input.len()),
         })
     }

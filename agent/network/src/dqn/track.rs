@@ -6,13 +6,13 @@ use std::collections::VecDeque;
 /// One row `(h, a, r, h')` of the replay.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Transition {
-    /// Before.
+    /// Before; of several candidates, the chosen one's numbers.
     pub input: Vec<f32>,
-    /// What was chosen.
+    /// What was chosen; of several candidates, 0.
     pub action: usize,
     /// What it brought.
     pub reward: f32,
-    /// After.
+    /// After; of several candidates, the numbers of each.
     pub next: Vec<f32>,
 }
 

@@ -2,11 +2,18 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
-use network::{Dqn, DqnSettings, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition};
+use network::{
+    Dqn, DqnSettings, DqnShape, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition,
+};
 use protocol::randomness::split_mix;
 
 const N_INPUTS: usize = 6;
 const N_ACTIONS: usize = 4;
+const ACTIONS: DqnShape = DqnShape {
+    n_inputs: N_INPUTS,
+    n_outputs: N_ACTIONS,
+    n_candidates: 1,
+};
 
 fn number(index: u64) -> f32 {
     (split_mix(3, index) >> 40) as f32 / (1 << 23) as f32 - 1.0
@@ -82,7 +89,7 @@ fn check(double: bool) -> Result<()> {
         double,
         ..DqnSettings::paper()
     };
-    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 1);
+    let mut dqn = Dqn::new(settings, ACTIONS, 1);
     let var = |(_, dims, numbers)| -> Result<Var> {
         let (dims, numbers): (Vec<usize>, Vec<f32>) = (dims, numbers);
         Var::from_tensor(&Tensor::from_vec(numbers, dims, &Device::Cpu)?)
@@ -146,7 +153,7 @@ fn it_learns_which_action_pays() {
         gamma: 0.0,
         ..DqnSettings::paper()
     };
-    let mut dqn = Dqn::new(settings, 1, 2, 1);
+    let mut dqn = Dqn::new(settings, DqnShape::of_actions(1, 2), 1);
     for index in 0..200_u64 {
         let input = if index % 2 == 0 { 1.0 } else { -1.0 };
         let action = (index / 2 % 2) as usize;
@@ -175,7 +182,7 @@ fn it_learns_which_action_pays() {
 
 /// With a full replay, and one update made.
 fn learner(settings: DqnSettings, seed: u64) -> Dqn {
-    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, seed);
+    let mut dqn = Dqn::new(settings, ACTIONS, seed);
     for transition in (0..3).flat_map(batch) {
         dqn.remember(transition);
     }
@@ -223,7 +230,7 @@ impl From<NetworkError> for Problem {
 fn a_saved_dqn_resumes_bit_for_bit() {
     let mut dqn = learner(small(), 2);
     dqn.set_learning_rate(0.003);
-    let mut resumed = Dqn::new(*dqn.settings(), N_INPUTS, N_ACTIONS, 2);
+    let mut resumed = Dqn::new(*dqn.settings(), ACTIONS, 2);
     load(&mut resumed, &saved(&dqn)).expect("the same sizes");
     assert_eq!(resumed.n_updates(), 1);
     assert_eq!(resumed.n_remembered(), 150);
@@ -243,7 +250,7 @@ fn the_latest_transitions_are_kept_oldest_first() {
         replay: 3,
         ..small()
     };
-    let (mut dqn, rows) = (Dqn::new(settings, N_INPUTS, N_ACTIONS, 2), batch(0));
+    let (mut dqn, rows) = (Dqn::new(settings, ACTIONS, 2), batch(0));
     for n in 1..=8 {
         dqn.remember(rows[n - 1].clone());
         assert_eq!(dqn.saved().transitions, rows[n.saturating_sub(3)..n]);
@@ -257,7 +264,7 @@ fn a_shorter_replay_loads_the_latest_transitions() {
         replay: 70,
         ..small()
     };
-    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+    let mut dqn = Dqn::new(settings, ACTIONS, 2);
     load(&mut dqn, &longer).expect("the same sizes");
     assert_eq!(dqn.saved().transitions, longer.1.transitions[80..]);
 }
@@ -348,9 +355,63 @@ fn what_follows_several_steps_is_discounted_as_often() {
             n_step,
             ..small()
         };
-        let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+        let mut dqn = Dqn::new(settings, ACTIONS, 2);
         dqn.learn(&batch(0)).expect("finite")
     };
     assert_eq!(targets(0.5, 3), targets(0.125, 1));
     assert_ne!(targets(0.5, 3), targets(0.5, 1));
+}
+
+#[test]
+fn it_learns_which_candidate_pays() {
+    let settings = DqnSettings {
+        gamma: 0.5,
+        double: true,
+        huber: true,
+        width: 16,
+        ..DqnSettings::paper()
+    };
+    // A candidate pays its first number; the second means nothing.
+    let candidates = |row: u64| -> Vec<f32> { (0..6).map(|at| number(row * 6 + at)).collect() };
+    let mut dqn = Dqn::new(settings, DqnShape::of_candidates(2, 3), 1);
+    for row in 0..300 {
+        let (now, chosen) = (candidates(row), row as usize % 3);
+        dqn.remember(Transition {
+            input: now[2 * chosen..][..2].to_vec(),
+            action: 0,
+            reward: now[2 * chosen],
+            next: candidates(row + 1),
+        });
+    }
+    for _ in 0..500 {
+        dqn.update().expect("finite").expect("enough transitions");
+    }
+    let right = (1000..1100).filter(|&row| {
+        let now = candidates(row);
+        let pays = |a: &usize, b: &usize| now[2 * a].total_cmp(&now[2 * b]);
+        Some(dqn.best(&now)) == (0..3).max_by(pays)
+    });
+    assert!(right.count() > 90);
+    // The same numbers have the same value wherever they stand.
+    let (one, other) = ([0.5, 0.1], [-0.3, 0.2]);
+    let values = dqn.values(&[one, other, one].concat());
+    assert_eq!(values[0], values[2]);
+}
+
+#[test]
+fn hubers_loss_grows_linearly_with_large_errors() {
+    let loss = |reward: f32, huber: bool| {
+        let settings = DqnSettings {
+            gamma: 0.0,
+            huber,
+            ..small()
+        };
+        let mut dqn = Dqn::new(settings, ACTIONS, 2);
+        let mut row = batch(0).swap_remove(0);
+        row.reward = dqn.values(&row.input)[row.action] + reward;
+        dqn.learn(&[row]).expect("finite")
+    };
+    let near = |got: f32, expected: f32| (got - expected).abs() < 1e-3 * expected;
+    assert!(near(loss(0.5, true), 0.125) && near(loss(-9.0, true), 8.5));
+    assert!(near(loss(-9.0, false), 81.0));
 }

@@ -1,11 +1,11 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
 use super::*;
-use crate::estimation::dqn_input::DqnInput;
-use crate::learning::learner::Learner;
-use crate::learning::student::Worlds;
-use crate::learning::student::network::Progress;
-use ::network::{Device, Dqn, DqnSettings};
+use crate::learning::learners::Worlds;
+use crate::learning::learners::decisions::SHAPE;
+use crate::learning::learners::filter::fit::FilterFit;
+use crate::learning::learners::network::Progress;
+use ::network::{Device, Dqn, DqnSettings, DqnShape};
 use anyhow::Result;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Grid};
@@ -43,7 +43,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 }
 
 /// A network that never learned, with the first seed whose DQN suits.
-fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> Progress {
+fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> Progress {
     let worlds = Worlds {
         shape: shape(),
         n_observations: 3,
@@ -51,10 +51,10 @@ fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> P
         numbers: 0..1,
     };
     let mut config = config(basis);
-    (config.dqn.input, config.seed) = (input, 1);
+    config.seed = 1;
     let mut network = Progress::first(&worlds, &config, &Device::Cpu).expect("a network");
-    let n_inputs = input.length(network.autoencoder.shape().hidden, 3);
-    let dqn = |seed| Dqn::new(DqnSettings::paper(), n_inputs, 4, seed);
+    let actions = DqnShape::of_actions(network.autoencoder.shape().hidden, 4);
+    let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
     network.dqn = (0..1000).map(dqn).find(suits).expect("a seed that suits");
     network
 }
@@ -72,7 +72,8 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
     super::agent(&Policy::named(policy, &model).expect("known"), config, task)
 }
 
-/// Whether all plans of some steps are those on an estimate, a predictor.
+/// Whether all plans of some steps are those on an estimate, a predictor: `on` plans with another agent of the policy
+/// whose belief is given.
 fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
     let mut agent = agent(policy, config, learned).expect("an agent");
     let mut all = [true; 2];
@@ -83,11 +84,10 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
         agent.predict();
         agent.foresee(&world(step + 1).0).expect("valid states");
         let predictor = agent.belief().clone();
-        let (action, got) = (agent.choose(ROBOT), agent.plan(&[ROBOT], step));
-        for (all, belief) in all.iter_mut().zip([estimate, predictor]) {
-            let mut planner = config.planner(agent.policy());
-            let expected = action.plan(&mut *planner, &belief, &[ROBOT], N_MOVES, (7, step));
-            *all &= got == expected;
+        let got = agent.plan(&[ROBOT], step);
+        let beliefs = [estimate, predictor];
+        for (all, belief) in all.iter_mut().zip(beliefs) {
+            *all &= got == agent.plan_on(&belief, &[ROBOT], step);
         }
     }
     all
@@ -95,15 +95,15 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 
 #[test]
 fn every_policy_plans_on_the_belief_that_settings_say() {
-    let network = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true);
+    let network = network(BasisKind::Predictor, |_| true);
     let filter = |sees_own_state| {
-        let dimensions = crate::estimation::parameters::Dimensions {
+        let dimensions = emberwatch_belief::estimation::parameters::Dimensions {
             n_states: 3,
             n_observations: 3,
             kernel: (3, 3),
             sees_own_state,
         };
-        Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned())
+        Some(FilterFit::new(dimensions, shape(), &AgentConfig::default()).learned())
     };
     let learned = Learned {
         filter: filter(false),
@@ -114,8 +114,10 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
     for policy in [
         "shooting_exploit",
         "beam_exploit",
-        "act_exploit_at_0_3",
+        "known_entropy",
+        "learned_spatial_rule",
         "oracle_beam",
+        "oracle_ahead",
         "learned_beam",
         "learned_own_spatial_beam",
         "autoencoder_explore",
@@ -138,55 +140,51 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
             BasisKind::Predictor => BasisKind::Estimate,
             BasisKind::Estimate => BasisKind::Predictor,
         });
-        let network = network(DqnInput::AfterFrame, basis, |_| true);
+        let network = network(basis, |_| true);
         let mut learned = Learned {
             network: Some(Arc::new(network)),
             ..Learned::default()
         };
         let expected = [basis == BasisKind::Estimate, basis == BasisKind::Predictor];
         assert_eq!(plans("autoencoder_policy", &other, &learned), expected);
-        let decisions = Decisions::first(&Model::wildfire(), &other.decisions, 0);
-        let mut contents = decisions.to_contents();
-        learned.decisions = Some(Arc::new(contents.clone()));
-        let error = agent("dqn_beam", &other, &learned)
-            .err()
-            .expect("no settings");
+        let scorer = Dqn::new(config(basis).decisions.settings(), SHAPE, 0);
+        learned.decisions = Some(LearnedDecisions {
+            scorer: Arc::new(scorer),
+            estimator: EstimatorKind::KnownModel,
+            basis,
+        });
+        assert_eq!(plans("known_policy", &other, &learned), expected);
+        let error = agent("spatial_policy", &other, &learned).err();
+        let error = error.expect("decisions on another belief").to_string();
         assert!(
-            format!("{error:#}").contains("settings: expected"),
+            error.contains("of spatial_filter, got some on that of known"),
             "{error}"
         );
-        contents.settings = toml::to_string(&config(basis)).expect("TOML");
-        learned.decisions = Some(Arc::new(contents));
-        let agent = agent("dqn_beam", &other, &learned).expect("an agent");
-        assert_eq!(agent.basis, basis);
     }
 }
 
 #[test]
 fn a_network_decides_on_what_it_was_learned_with() {
-    let learned = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true).autoencoder;
+    let learned = network(BasisKind::Predictor, |_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
     let hidden = |estimator: &AutoencoderEstimator| estimator.follower().expect("one").clone();
     let before = hidden(&estimator).hidden().to_vec();
     estimator.correct(&world(0).1, None).expect("possible");
-    let follower = hidden(&estimator);
-    let of = |input: DqnInput| input.of(&follower, ROBOT, N_MOVES);
-    let after = of(DqnInput::AfterFrame);
-    for input in [DqnInput::AfterFrame, DqnInput::Summary] {
-        let network = network(input, BasisKind::Predictor, |dqn| {
-            input == DqnInput::Summary || dqn.best(&before) != dqn.best(&after)
-        });
-        let best = network.dqn.best(&of(input));
-        let expected = Policy::network_choices(3)[best].objective.target;
-        let learned = Learned {
-            network: Some(Arc::new(network)),
-            ..Learned::default()
-        };
-        let config = config(BasisKind::Predictor);
-        let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
-        agent.correct(&world(0).1, None).expect("possible");
-        agent.predict();
-        let target = agent.choose(ROBOT).objective.target;
-        assert_eq!(target, expected, "{}", input.label());
-    }
+    let after = hidden(&estimator).hidden().to_vec();
+    let network = network(BasisKind::Predictor, |dqn| {
+        dqn.best(&before) != dqn.best(&after)
+    });
+    let best = network.dqn.best(&after);
+    let expected = Policy::network_choices(3)[best].objective.target;
+    let learned = Learned {
+        network: Some(Arc::new(network)),
+        ..Learned::default()
+    };
+    let config = config(BasisKind::Predictor);
+    let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
+    agent.correct(&world(0).1, None).expect("possible");
+    agent.predict();
+    agent.plan(&[ROBOT], 0);
+    let aim = agent.intent(std::time::Duration::ZERO).objective;
+    assert_eq!(aim, expected.label(&numbered_states(3)));
 }

@@ -8,8 +8,8 @@ use crate::benchmark::report::statistics::ratio_of_means;
 use comfy_table::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The policy that others are given as a percentage of: the best planner fed with the true state.
-const ORACLE: &str = "oracle_beam";
+/// What oracles are fed with: others are given as a percentage of the best of them.
+const TRUTH: &str = "truth";
 
 /// Every policy over all worlds, its figures of merit, then the worlds with less and with more fire.
 ///
@@ -66,7 +66,7 @@ fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
     if has_teams {
         columns.add_mean("repeated", 3, |run| Some(run.mean_repeated));
     }
-    if groups.iter().any(|group| group.policy == ORACLE) {
+    if groups.iter().any(|group| group.estimator == TRUTH) {
         columns.add("% of oracle", |group| percent_of_oracle(group, groups));
     }
     columns.add_mean("Brier", 4, |run| run.brier);
@@ -82,10 +82,13 @@ fn rewards(group: &Group<'_>) -> impl Iterator<Item = f64> {
     group.by_seed(reward).into_values()
 }
 
-/// Of an oracle's with as many robots.
+/// Of the best oracle's with as many robots.
 fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
-    let wanted = (ORACLE, group.robots);
-    let oracle = groups.iter().rfind(|it| (it.policy, it.robots) == wanted);
+    let wanted = (TRUTH, group.robots);
+    let oracles = groups.iter();
+    let oracles = oracles.filter(|it| (it.estimator, it.robots) == wanted);
+    let mean = |oracle: &Group<'_>| oracle.estimate(reward).map_or(f64::MIN, |it| it.mean);
+    let oracle = oracles.max_by(|a, b| mean(a).total_cmp(&mean(b)));
     let ratio =
         oracle.and_then(|oracle| ratio_of_means(&group.by_seed(reward), &oracle.by_seed(reward)));
     ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))

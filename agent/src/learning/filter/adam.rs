@@ -1,6 +1,6 @@
 //! Adam (Kingma and Ba, 2015, algorithm 1) on the filter's three tensors.
 
-use crate::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use serde::{Deserialize, Serialize};
 
 /// Added to the root of the second moment: the paper's.

@@ -8,7 +8,7 @@
 //! `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with `d[o] = sum_m g[m] q[o, m]`:
 //! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has `d[o]` too.
 
-use crate::learning::filter::correlation::{Base, Correlation, Region, load, store};
+use crate::learning::filter::convolution::{Base, Convolution, Region, load, store};
 use crate::learning::filter::layout::Layout;
 use pulp::Simd;
 use std::ops::Range;
@@ -17,8 +17,8 @@ use std::ops::Range;
 #[derive(Debug, Clone)]
 pub(super) struct Operator {
     pub(super) layout: Layout,
-    forward: Correlation,
-    backward: Correlation,
+    forward: Convolution,
+    backward: Convolution,
     /// Where kernels see the cell's own state: the weights of their centres, `[own, to]`.
     centres: Option<Vec<f32>>,
     mask: Vec<f32>,
@@ -35,7 +35,7 @@ impl Operator {
             };
             centres(&layout).map(take).collect()
         });
-        let forward = Correlation::new(layout, layout.n_states, weights);
+        let forward = Convolution::new(layout, layout.n_states, weights);
         Self {
             layout,
             backward: forward.turned(),

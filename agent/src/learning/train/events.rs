@@ -1,10 +1,10 @@
 //! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
 
-use crate::estimation::belief::Belief;
+use crate::learning::learners::Learner;
 use crate::learning::metrics::{ModelUpdate, Tick, averages};
-use crate::learning::student::Student;
 use crate::learning::tensorboard::{EventFile, Value};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
 use figures::{Heat, heat};
 use std::path::Path;
 
@@ -28,16 +28,16 @@ impl Events {
         &mut self,
         tick: &Tick,
         updates: &[ModelUpdate],
-        student: &dyn Student,
+        learner: &dyn Learner,
     ) -> Result<()> {
-        let averages = averages(tick, updates, student.columns());
+        let averages = averages(tick, updates, learner.columns());
         let scalars = averages
             .iter()
             .map(|&(name, value)| (name, Value::Scalar(value)));
         self.file.add(tick.world_steps, scalars)?;
         let is_due = self.n_ticks.is_multiple_of(TICKS_PER_PICTURE);
         self.n_ticks += 1;
-        match student.belief().filter(|_| is_due) {
+        match learner.belief().filter(|_| is_due) {
             Some((belief, state)) => self.show(tick.world_steps, belief, state),
             None => Ok(()),
         }

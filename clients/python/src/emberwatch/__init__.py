@@ -10,6 +10,7 @@ Without Gymnasium, `connect` talks to a running server and `observe` reads what 
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -28,6 +29,10 @@ from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus
 from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
 
 if TYPE_CHECKING:
+    from emberwatch import benchmark as benchmark
+    from emberwatch import planning as planning
+    from emberwatch import sb3 as sb3
+    from emberwatch import wrappers as wrappers
     from emberwatch.parallel import WildfireParallelEnv
 
 __all__ = [
@@ -67,17 +72,27 @@ __version__ = VERSION
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-for _module, _kind, _steps in (
-    ("env", "Wildfire", MAX_EPISODE_STEPS),
-    ("moves_env", "WildfireMoves", 64 * MAX_EPISODE_STEPS),
-    ("objective_env", "WildfireObjective", MAX_EPISODE_STEPS),
+for _module, _kind, _version, _steps in (
+    ("env", "Wildfire", 0, MAX_EPISODE_STEPS),
+    ("moves_env", "WildfireMoves", 0, 64 * MAX_EPISODE_STEPS),
+    ("objective_env", "WildfireObjective", 1, MAX_EPISODE_STEPS),
 ):
     gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-        f"emberwatch/{_kind}-v0",
+        f"emberwatch/{_kind}-v{_version}",
         entry_point=f"emberwatch.{_module}:{_kind}Env",
         vector_entry_point=f"emberwatch.{_module}:{_kind}VectorEnv",
         max_episode_steps=_steps,
     )
+
+
+#: Modules that are imported when they are first used.
+_LATER = frozenset(("benchmark", "planning", "sb3", "wrappers"))
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return import_module(f"{__name__}.{name}")
 
 
 def parallel_env(**keywords: Any) -> WildfireParallelEnv:

@@ -26,7 +26,7 @@ from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
-from emberwatch.session import LOST, Session, not_reset, timed_out_before
+from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
@@ -35,11 +35,22 @@ from emberwatch.wire import StepAnswer
 _LEASE_LOST: Final = 3
 
 _CHOICES: Final = {
-    "estimator": ("known_model", "spatial_filter"),
-    "planner": ("beam", "shooting"),
+    "estimator": (
+        None,
+        "known_model",
+        "spatial_filter",
+        "learned_filter",
+        "learned_spatial_filter",
+        "learned_own_filter",
+        "learned_own_spatial_filter",
+    ),
     "prior": ("simulated", "initial", "uniform"),
     "agent": ("own", "running"),
 }
+
+#: Objectives of an agent that serves decisions, and numbers that describe the plan for each.
+_N_OBJECTIVES: Final = 8
+_N_FEATURES: Final = 26
 
 
 class AgentSession(Session):
@@ -48,11 +59,13 @@ class AgentSession(Session):
     Its answers' frames are empty unless there is a render mode.
     """
 
-    def __init__(self, settings: Settings, arguments: Mapping[str, str], n_worlds: int = 1) -> None:
-        """`arguments` are `estimator`, `planner`, `prior` and `agent` of the environment."""
+    def __init__(
+        self, settings: Settings, arguments: Mapping[str, str | None], n_worlds: int = 1
+    ) -> None:
+        """`arguments` are `estimator`, `checkpoint`, `prior` and `agent` of the environment."""
         for name, choices in _CHOICES.items():
             if arguments[name] not in choices:
-                expected = f"one of {', '.join(choices)}"
+                expected = f"one of {', '.join(map(str, choices))}"
                 raise invalid(name, expected, repr(arguments[name]))
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
@@ -63,20 +76,18 @@ class AgentSession(Session):
         super().__init__(settings, n_worlds)
         if self.spec.n_robots > 1:
             raise _no_team()
-        if self.spec.model is None:
-            has_none = "recorded worlds have none"
-            hides = has_none if self.spec.is_recorded else "the server does not reveal its own"
-            raise InvalidArgumentError(f"model: expected one, as {hides}")
-        n_objectives = self.spec.model.n_states + 1
+        if self.spec.model is None and not self.spec.is_recorded:
+            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         #: Of one world.
-        self.action_space: Final = spaces.Discrete(n_objectives)
-        self.space: Final = spaces.Box(0.0, 1.0, (18 * n_objectives + 2,), np.float32)
+        self.action_space: Final = spaces.Discrete(_N_OBJECTIVES)
+        shape = _N_OBJECTIVES, _N_FEATURES
+        self.space: Final = spaces.Box(-np.inf, np.inf, shape, np.float32)
         self._arguments = arguments
         self._own_agent: Program | None = None
         self._decisions: Decisions | None = None
         self._frames: Newest[Frame] | None = None
-        #: What the agent believes of each world, in a few numbers; new after each answer.
-        self.summaries = np.zeros((n_worlds, *self.space.shape), np.float32)
+        #: What the plans of each world promise; new after each answer.
+        self.features = np.zeros((n_worlds, *self.space.shape), np.float32)
         #: The cells of each world's last path, where there is a render mode.
         self.paths: list[NDArray[np.intp]] = []
 
@@ -96,26 +107,29 @@ class AgentSession(Session):
     def decide(self, objectives: NDArray[np.uint8], moved: NDArray[np.bool_]) -> StepAnswer:
         """One step of the worlds `moved`, each for its objective; returns how all stand."""
         agent = self._asked()
-        if self._is_lost:
-            raise timed_out_before()
         worlds = zip(objectives.tolist(), moved.tolist(), strict=True)
         asked = [objective if moves else None for objective, moves in worlds]
-        try:
+        with self._told():
             decisions = agent.decide(asked, timeout=self.settings.timeout)
-        except LOST as error:
-            raise self._lost(error) from None
+        self._has_moved = True
         return self._answer(decisions)
 
     def close(self) -> None:
         """Ends the agent and the private server, if they are its own. May be called again."""
-        for part in (self._frames, self._decisions):
-            if part is not None:
-                part.close()
-        self._frames = self._decisions = None
-        agent, self._own_agent = self._own_agent, None
-        if agent is not None:
-            agent.stop()
-        super().close()
+        decisions, self._decisions = self._decisions, None
+        try:
+            if decisions is not None:
+                decisions.close()
+        finally:
+            super().close()
+
+    def _drop(self) -> None:
+        if self._frames is not None:
+            self._frames.close()
+        if self._own_agent is not None:
+            self._own_agent.stop()
+        self._frames = self._own_agent = None
+        super()._drop()
 
     def _hold(self, client: Client) -> None:
         """Starts the agent, which acquires the worlds."""
@@ -128,20 +142,23 @@ class AgentSession(Session):
         if self._arguments["agent"] == "own":
             self._decisions = self._start_agent(instance)
             return
-        self._decisions = decisions = connect_with_retry(
+        decisions = connect_with_retry(
             self.settings.timeout, partial(self._connect_to_agent, instance)
         )
         if decisions.worlds != self._worlds:
+            decisions.close()
             first, last = decisions.worlds[0], decisions.worlds[-1]
             raise InvalidArgumentError(
                 f"agent='running': expected one of worlds {self._worlds[0]} to {self._worlds[-1]}, "
                 f"got one of {first} to {last}"
             )
+        self._decisions = decisions
 
     def _start_agent(self, instance: str) -> Decisions:
         settings = self.settings
         flags = {"instance": instance, "world": settings.world, "worlds": self.n_worlds, "wait": 0}
-        flags |= {name: self._arguments[name] for name in ("estimator", "planner", "prior")}
+        given = {name: self._arguments[name] for name in ("estimator", "checkpoint", "prior")}
+        flags |= {name: value for name, value in given.items() if value is not None}
         if settings.instance is not None and settings.model is not None:
             flags["model"] = str(settings.model)
         command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
@@ -170,24 +187,25 @@ class AgentSession(Session):
         return Decisions(instance, self.settings.world, timeout=self.settings.timeout)
 
     def _restart(self, worlds: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        return self._began(self._asked().reset(seeds, worlds=worlds))
+        decisions = self._asked().reset(seeds, worlds=worlds)
+        self._has_moved = True
+        return self._answer(decisions)
 
     def _observe(self) -> StepAnswer:
         if self._program is not None and self._program.exit_code() is not None:
             # An agent answers from memory until it notices.
             raise ServerGoneError(f"the server of instance {self.instance!r} has ended")
-        return self._began(self._asked().last(timeout=self.settings.timeout))
+        return self._answer(self._asked().last(timeout=self.settings.timeout))
 
-    def _began(self, decisions: tuple[Decision, ...]) -> StepAnswer:
-        self._is_lost = False
-        return self._answer(decisions)
+    def _settle(self) -> None:
+        """The agent answers one request after the other: those before are done, or are dropped."""
 
     def _answer(self, decisions: tuple[Decision, ...]) -> StepAnswer:
-        """Takes in the summaries; the rest as the server would tell it."""
-        spec, expected = self.spec, self.summaries.shape
-        self.summaries = np.array([made.summary for made in decisions], np.float32)
-        if self.summaries.shape != expected:
-            raise bad_answer("decisions", f"summaries of shape {expected}", self.summaries.shape)
+        """Takes in the features; the rest as the server would tell it."""
+        spec, expected = self.spec, self.features.shape
+        self.features = self._asked().features(decisions)
+        if self.features.shape != expected:
+            raise bad_answer("decisions", f"features of shape {expected}", self.features.shape)
         header = wire.StepReply(
             first_robot=self.settings.world,
             n_robots=len(decisions),
@@ -239,8 +257,8 @@ def _robot(made: Decision) -> bytes:
     return wire.ROBOT.pack(made.reward, made.reward, *counts, *cell, *cell, 0, 0)
 
 
-class Summaries:
-    """Observations of worlds that an agent acts on: its summaries of the beliefs."""
+class Features:
+    """Observations of worlds that an agent acts on: what its plans promise."""
 
     def __init__(self, session: AgentSession) -> None:
         self._session = session
@@ -254,7 +272,7 @@ class Summaries:
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
         """The observations of all worlds, stacked."""
-        return self._session.summaries
+        return self._session.features
 
 
 class AgentSessionOwner:
@@ -264,10 +282,10 @@ class AgentSessionOwner:
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """What each action plans for, once the environment has been reset."""
+        """The names of the actions, once the environment has been reset."""
         return self._agent.info.objectives
 
     @property
-    def summary_names(self) -> tuple[str, ...]:
-        """What each number of an observation is, once the environment has been reset."""
-        return self._agent.info.summary
+    def feature_names(self) -> tuple[str, ...]:
+        """The names of an observation's columns, once the environment has been reset."""
+        return self._agent.info.features

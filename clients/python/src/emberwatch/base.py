@@ -1,14 +1,18 @@
 """What the environments of one robot share: its session, its pictures, its beginning."""
 
-from typing import Any, ClassVar, Final, Literal, TypeAlias
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.arguments import as_seed
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.observations import Observations
-from emberwatch.session import Session, SessionOwner
+from emberwatch.owner import SessionOwner
+from emberwatch.session import Session
 from emberwatch.settings import draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
 from emberwatch.wire import UNOBSERVED, RobotResult, StepAnswer, StepResult
@@ -25,6 +29,9 @@ REPORTED: Final = {
     "n_hits": "robot",
 }
 
+#: Their values, as a tuple.
+_reported: Final = attrgetter(*(f"{part}.{name}" for name, part in REPORTED.items()))
+
 #: What a robot's step can pay, and the field of a result that says it.
 REWARDS: Final = {
     "share": ("robot", "reward"),
@@ -37,7 +44,7 @@ Reward: TypeAlias = Literal["share", "team", "marginal"]
 ONE_ROW: Final = np.ones(1, np.bool_)
 
 
-class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
+class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One robot of a private or a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -71,10 +78,14 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""
+        resumes = wants_to_resume(options, seed) or self._robot is not None
+        seed = None if seed is None else as_seed(seed)
         super().reset(seed=seed)
-        if wants_to_resume(options, seed) or self._robot is not None:
+        self._session.begin_reset()
+        if resumes:
             answer = self._session.resume()
             if self._robot is not None and answer.worlds["truncated"][0]:
+                self._session.finish()
                 raise EmberwatchError(
                     "the episode of the world is over: a reset is for a client that holds all "
                     "its robots",
@@ -105,9 +116,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        info: dict[str, Any] = {
-            name: getattr(getattr(result, part), name) for name, part in REPORTED.items()
-        }
+        info: dict[str, Any] = dict(zip(REPORTED, _reported(result), strict=True))
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
@@ -141,12 +150,21 @@ def paid(result: StepResult, field: tuple[str, str]) -> float:
     return getattr(getattr(result, part), name)
 
 
+def as_options(options: object) -> dict[str, Any]:
+    """The options of a reset, checked to be a dictionary; None: none."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise invalid("options", "a dictionary such as {'resume': True}, or None", repr(options))
+    return dict(cast("Mapping[str, Any]", options))
+
+
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Reads the options of a reset."""
-    for key in options or {}:
+    for key in as_options(options):
         if key != "resume":
             raise invalid("options", "'resume'", repr(key))
-    resume = (options or {}).get("resume", False)
+    resume = as_options(options).get("resume", False)
     if not isinstance(resume, bool):
         raise invalid("options", "resume True or False", repr(resume))
     if resume and seed is not None:

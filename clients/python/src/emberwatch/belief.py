@@ -103,7 +103,8 @@ def _correct(
     n_observations = likelihood.shape[1]
 
     def cell(index: np.intp) -> tuple[int, int]:
-        return divmod(int(cells[index]) % (frames.shape[-2] * frames.shape[-1]), frames.shape[-1])
+        *_, row, col = np.unravel_index(int(cells[index]), frames.shape)
+        return int(row), int(col)
 
     if (observed >= n_observations).any():
         first = np.argmax(observed >= n_observations)

@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 from emberwatch import wire
 from emberwatch.cleanup import ChannelFiles
 from emberwatch.errors import EmberwatchError, invalid
+from emberwatch.resources import SHARED_MEMORY, cause, check_room, fill
 from emberwatch.turn import LONGEST_WAIT, SHORT_WAIT, cannot_create, turn
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -26,9 +27,6 @@ _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 iox2: Final[Any] = importlib.import_module("iceoryx2")
 
 _BYTES: Final[Any] = iox2.Slice[ctypes.c_uint8]
-
-#: Where iceoryx2 keeps shared memory: a folder that every user may write to.
-_SHARED_MEMORY: Final = Path("/dev/shm")
 
 #: How often to check that a node's files are still there, seconds.
 _CHECK_INTERVAL: Final = 0.2
@@ -57,12 +55,13 @@ class Node:
         config = _config()
         self._files: list[Path] = []
         self._checked = 0.0
+        check_room()
         with in_turn() as is_alone, channel_errors("create a node"):
-            _own_segments(_SHARED_MEMORY, _prefix())
+            _own_segments(SHARED_MEMORY, _prefix())
             _make_way(is_alone)
             self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
             # Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
-            _own_segments(_SHARED_MEMORY, _prefix())
+            _own_segments(SHARED_MEMORY, _prefix())
         self.keep(self.node)
         _nodes.add(self)
 
@@ -107,6 +106,10 @@ class Node:
         services = [base / "services" / name for name in names]
         self._files = [base / "nodes" / f"{_prefix()}{node}.node_monitor", *tags, *services]
 
+    def fill_ports(self) -> None:
+        """Gives all memory of the ports of this node its room; call it when they are made."""
+        fill(_files_of_user().of_node(int(self.node.id.value)))
+
     def check_files(self) -> None:
         """Raises if these files were removed, which cuts this node off. Costs little."""
         now = time.monotonic()
@@ -115,7 +118,7 @@ class Node:
             if removed is not None:
                 raise EmberwatchError(
                     f"{removed} was removed while it was in use: keep cleaners of old files away "
-                    f"from {_SHARED_MEMORY}",
+                    f"from {SHARED_MEMORY}",
                     "channel",
                 )
             self._checked = now
@@ -134,8 +137,8 @@ class Node:
         except iox2.RequestResponseOpenError as error:
             if "DoesNotExist" in str(error):
                 return None
-            problem = f"open {service} on instance {self.instance!r}: {error}"
-            raise EmberwatchError(problem, "channel") from None
+            what = f"open {service} on instance {self.instance!r}"
+            raise cause(what, error, f"{wire.MAX_NODES} processes") from None
 
     def other_version(self, service: str) -> int | None:
         """The protocol version of a server on the instance that speaks another one, if any."""
@@ -202,19 +205,19 @@ class Closable:
 
 
 @contextlib.contextmanager
-def channel_errors(what: str) -> Generator[None]:
-    """Turns iceoryx2's errors into one that says what was attempted."""
+def channel_errors(what: str, most: str = f"{wire.MAX_NODES} processes") -> Generator[None]:
+    """Turns iceoryx2's errors into one that says what was attempted, and why it failed."""
     try:
         yield
     except EmberwatchError:
         raise
     except Exception as error:
-        raise EmberwatchError(f"{what}: {error}", "channel") from None
+        raise cause(what, error, most) from None
 
 
 def directory() -> Path:
     """The directory of this user's channels, beside the shared memory: both are there, or none."""
-    return _SHARED_MEMORY / f"emberwatch-{os.getuid()}"
+    return SHARED_MEMORY / f"emberwatch-{os.getuid()}"
 
 
 def in_turn(limit: float = LONGEST_WAIT) -> contextlib.AbstractContextManager[bool]:
@@ -223,7 +226,7 @@ def in_turn(limit: float = LONGEST_WAIT) -> contextlib.AbstractContextManager[bo
 
 
 def _files_of_user() -> ChannelFiles:
-    return ChannelFiles(directory(), _SHARED_MEMORY, _prefix())
+    return ChannelFiles(directory(), SHARED_MEMORY, _prefix())
 
 
 def _make_way(is_alone: bool) -> None:

@@ -33,6 +33,14 @@ class ChannelFiles:
         """Segments that are not finished, which iceoryx2 might wait for without end."""
         return [path for path in _entries(self._shared, self._prefix) if self._is_unfinished(path)]
 
+    def of_node(self, node: int) -> list[Path]:
+        """The segments of a living node's ports and services."""
+        ports, hashes = self._used({node})
+        services = _entries(self._root / "services", self._prefix, ".service")
+        services = [it for it in services if it.stem.removeprefix(self._prefix) in hashes]
+        used = ports | set(map(_service_id, services))
+        return [it for it in _entries(self._shared, self._prefix) if self._ids(it) & used]
+
     def remove_leftovers(self, config: Any) -> None:
         """Removes what dead processes left; call it in a turn that no other process shares.
 
@@ -44,9 +52,11 @@ class ChannelFiles:
         folders = (self._shared, self._root)
         port_files = [path for folder in folders for path in _entries(folder, self._prefix)]
         living, dead = _nodes(config)
-        _, services = self._used(living)
+        ports, services = self._used(living)
         for path in self.unfinished():
-            if not any(map(_is_in_the_making, self._ids(path))):
+            ids = self._ids(path)
+            # Memory of a port in another PID namespace, whose process cannot be seen, may grow now.
+            if not ids & ports and not any(map(_is_in_the_making, ids)):
                 _remove(path)
         for node in dead:
             identity = int(node.id.value)
@@ -84,8 +94,7 @@ class ChannelFiles:
                 _remove(path)
                 continue
             with suppress(FileNotFoundError):
-                identity = tomllib.loads(path.read_text())["unique_service_id"]
-                yield identity["unique_value"] << 64 | identity["payload_value"]
+                yield _service_id(path)
 
     def _used(self, living: set[int]) -> tuple[set[int], set[str]]:
         """Ids of the ports, and hashes of the services' names, that living nodes use."""
@@ -133,6 +142,11 @@ def _nodes(config: Any) -> tuple[set[int], list[Any]]:
             # Of undefined state are those that died in their start, and those that cannot be read.
             living.add(int(node._0.value))
     return living, dead
+
+
+def _service_id(path: Path) -> int:
+    identity = tomllib.loads(path.read_text())["unique_service_id"]
+    return identity["unique_value"] << 64 | identity["payload_value"]
 
 
 def _is_in_the_making(identity: int) -> bool:

@@ -16,6 +16,7 @@ from emberwatch import wire
 from emberwatch.connection import ServerConnection
 from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
 from emberwatch.lease import Lease
+from emberwatch.paths import utf8
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import (
     Grant,
@@ -113,7 +114,7 @@ class Client(ServerConnection):
         """
         n_worlds = self.info.n_worlds - first_world if n_worlds is None else n_worlds
         place = {"first_world": first_world, "n_worlds": n_worlds}
-        request = {"op": "snapshot", **place, "path": os.path.abspath(path)}
+        request = {"op": "snapshot", **place, "path": utf8("path", os.path.abspath(path))}
         return records(WorldInfo, self.control(request, timeout=timeout))
 
     def belief(self, robot: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
@@ -182,6 +183,6 @@ def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Conn
             if not left > 0:
                 raise
             if not waits:
-                _log.warning("%s; waiting up to %g s for it", error, wait)
+                _log.warning(f"{error}; waiting up to {wait:g} s for it")
             waits = True
             time.sleep(min(_RETRY, left))

@@ -9,10 +9,11 @@ from typing import Any, Final, TypeVar, cast
 
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, in_turn
-from emberwatch.errors import RequestTimeoutError, bad_answer, refusal
+from emberwatch.errors import EmberwatchError, RequestTimeoutError, bad_answer, refusal
 from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
 from emberwatch.release import VERSION
 from emberwatch.replies import ServerInfo, record
+from emberwatch.turn import pid_namespace
 from emberwatch.wire import StepAnswer
 
 _Record = TypeVar("_Record")
@@ -37,6 +38,7 @@ class Connection(Closable):
                 self._control.create(slice_len=4096, grows=True)
                 self._open_others()
                 self._node.remember_files()
+                self._node.fill_ports()
 
     def _open_others(self) -> None:
         """Opens further services, in the same turn."""
@@ -90,6 +92,15 @@ class Connection(Closable):
             problem = f"no answer to 'hello' from instance {self.instance!r} within {self._limit} s"
             raise RequestTimeoutError(problem) from None
         info = record(kind, reply)
+        # A process of the same number may be another one here.
+        if reply.get("pid_namespace", pid_namespace()) != pid_namespace():
+            raise EmberwatchError(
+                f"instance {self.instance!r} is served from another PID namespace: run both "
+                "programs in one (docker: --pid=container:NAME; Kubernetes: "
+                "shareProcessNamespace: true), or give each container a /dev/shm of its own "
+                "(docker: --ipc=private)",
+                "pid_namespace",
+            )
         self._peer.watch(reply["pid"])
         return info
 
@@ -118,6 +129,7 @@ class ServerConnection(Connection):
             with in_turn(self._left()):
                 longest = info.n_worlds * (8 + info.n_robots * info.n_moves)
                 self._step.create(slice_len=longest, grows=False)
+                self._node.fill_ports()
 
     def _open_others(self) -> None:
         self._step = self._open("step", wire.StepRequest, wire.StepReply)

@@ -1,14 +1,19 @@
-"""An agent that serves decisions: it estimates and plans, its client chooses the objectives.
+"""An agent that serves decisions: it estimates and plans, its client chooses among the plans.
 
 PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 """
 
+import binascii
+from base64 import b64decode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
-from emberwatch.arguments import as_choice, as_seeds
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.arguments import as_choice, as_list, as_seeds
 from emberwatch.connection import Connection
-from emberwatch.errors import NoServerError
+from emberwatch.errors import NoServerError, bad_answer
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Decision, DecisionsInfo, records
 
@@ -55,7 +60,7 @@ class Decisions(Connection):
     def decide(
         self, objectives: Iterable[int | None], *, timeout: float = 2 * STEP_TIMEOUT
     ) -> tuple[Decision, ...]:
-        """Plans and flies a path for an objective in each world, and takes in what was seen.
+        """Flies the path planned for an objective in each world, and takes in what was seen.
 
         Args:
             objectives: One per world; None: the world stays as it is.
@@ -64,12 +69,27 @@ class Decisions(Connection):
             LeaseLostError: If another client took a world over; the agent ends.
             EmberwatchError: With code `"bad_objective"` or `"episode_over"`. Nothing is done.
         """
-        asked = [None if one is None else as_choice(one, 2**64) for one in objectives]
+        asked = [
+            None if one is None else as_choice(one, 2**64)
+            for one in as_list(objectives, "objectives")
+        ]
         return self._ask({"op": "decide", "objectives": asked}, timeout)
 
     def last(self, *, timeout: float = STEP_TIMEOUT) -> tuple[Decision, ...]:
         """The last decisions again; changes nothing."""
         return self._ask({"op": "last"}, timeout)
+
+    def features(self, decisions: Sequence[Decision]) -> NDArray[np.float32]:
+        """What the next plans promise, of shape (decisions, objectives, features).
+
+        `info` names objectives and features.
+        """
+        shape = len(decisions), len(self.info.objectives), len(self.info.features)
+        try:
+            numbers = b"".join(b64decode(made.features, validate=True) for made in decisions)
+            return np.frombuffer(bytearray(numbers), "<f4").reshape(shape)
+        except (binascii.Error, ValueError):
+            raise bad_answer("decisions", f"features of shape {shape}", "others") from None
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
         """Releases the worlds and ends the agent."""

@@ -79,7 +79,7 @@ class WildfireEnv(WorldEnv):
     seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
     reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
     has been observed. `reset(options={"resume": True})` begins nothing but goes on from
-    where the world stands, such as after another agent.
+    where the world stands, such as after another agent, or after a step that was interrupted.
 
     ## Episode End
 
@@ -146,7 +146,9 @@ class WildfireEnv(WorldEnv):
         """Begins an episode; see the class, *Starting State*."""
         self._answer = answer = self._begin(seed, options)
         self._observations.reset(ONE_ROW, answer.frames)
-        return self._seen(answer, answer.result())
+        seen = self._seen(answer, answer.result())
+        self._session.finish()
+        return seen
 
     def step(
         self, action: NDArray[np.integer[Any]]
@@ -158,8 +160,11 @@ class WildfireEnv(WorldEnv):
             LeaseLostError: If another client took the world over.
             ServerGoneError: If the server has ended; the next reset starts or finds another.
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
+                as after Ctrl-C: reset or resume. Nothing is sent.
         """
         moves = as_moves(action, 1, self._spec.n_moves)
+        self._session.begin_step()
         self._answer = answer = self._session.step(moves)
         self._update(self._observations, answer)
         result = answer.result()
@@ -167,6 +172,7 @@ class WildfireEnv(WorldEnv):
             self._trace(result.robot, moves.reshape(-1))
         observation, info = self._seen(answer, result)
         reward, world = paid(result, self._pays), result.world
+        self._session.finish()
         return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:

@@ -3,7 +3,7 @@
 Subclasses exist only where a caller acts differently.
 """
 
-from typing import Final
+from typing import Final, Self
 
 
 class EmberwatchError(Exception):
@@ -11,16 +11,19 @@ class EmberwatchError(Exception):
 
     Attributes:
         code: The cause. A refusal has the name of its status (PROTOCOL.md section 5), such as
-            `"busy"`, and changed nothing in the world. Others: `"closed"`, `"forked"` (shared
-            memory does not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
+            `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
+            earlier step or reset did not finish: reset or resume), `"forked"` (shared memory does
+            not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
             and server are not of one release), `"program"` (could not be started, or failed),
-            `"impossible_frame"`, `"recording"`.
+            `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
     """
 
     code: str = "unknown"
 
-    def __init__(self, message: str, code: str | None = None, detail: int = 0) -> None:
+    def __init__(self, message: str | Self, code: str | None = None, detail: int = 0) -> None:
+        if isinstance(message, EmberwatchError):  # made again, as `AsyncVectorEnv` does
+            message, code, detail = str(message), code or message.code, detail or message.detail
         super().__init__(message)
         self.code = code or self.code
         self.detail = detail
@@ -104,6 +107,7 @@ STATUSES: Final = (
         "world, and a step of several worlds needs them all",
     ),
     ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
+    ("no_memory", "shared memory is full: free some, and ask again"),
 )
 
 _CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}

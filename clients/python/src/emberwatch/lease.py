@@ -13,6 +13,7 @@ from emberwatch import wire
 from emberwatch.arguments import as_moves, as_seeds
 from emberwatch.connection import ServerConnection
 from emberwatch.errors import invalid
+from emberwatch.paths import utf8
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
@@ -156,7 +157,7 @@ class Lease:
         """
         chosen = self.worlds if worlds is None else _part("worlds", worlds, self.worlds)
         place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
-        reply = self._ask("restore", timeout, **place, path=os.path.abspath(path))
+        reply = self._ask("restore", timeout, **place, path=utf8("path", os.path.abspath(path)))
         return self._note(records(WorldInfo, reply))
 
     def fork(

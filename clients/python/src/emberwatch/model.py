@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
+from emberwatch.paths import utf8
 from emberwatch.programs import check_settings
 
 Color = tuple[int, int, int]
@@ -122,6 +123,7 @@ class Model(Description):
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
         """The built-in model of a name, or that of a file, which the server checks first."""
+        utf8("model", name)
         check_settings([f"--model={fspath(name)}"])
         return cls.checked(name)
 

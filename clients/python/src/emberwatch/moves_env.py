@@ -15,7 +15,7 @@ from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.flights import Flights
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
-from emberwatch.session import Session, not_reset
+from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.view import fly
@@ -120,7 +120,9 @@ class WildfireMovesEnv(WorldEnv):
         answer = self._begin(seed, options)
         self._observations.reset(ONE_ROW, answer.frames)
         self._begin_path(answer)
-        return self._seen(answer)
+        seen = self._seen(answer)
+        self._session.finish()
+        return seen
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one move; the T-th completes the path and moves the world.
@@ -129,18 +131,26 @@ class WildfireMovesEnv(WorldEnv):
             EmberwatchError: As `WildfireEnv.step`.
         """
         move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
-        if self._answer is None or not self.is_open:
-            raise not_reset()
-        flights = self._flights
-        if not flights.completes()[0]:
-            reward = float(flights.move(_FIRST, move)[0])
-            self._observations.visit(_FIRST)
-            observation, info = self._seen(self._answer)
-            return observation, reward, False, False, info
-        path = flights.paths(move)
+        self._session.begin_step()
+        completes = self._flights.completes()[0]
+        outcome = self._complete(move) if completes else self._move(move)
+        self._session.finish()
+        return outcome
+
+    def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """A move that does not complete its path."""
+        assert self._answer is not None
+        reward = float(self._flights.move(_FIRST, move)[0])
+        self._observations.visit(_FIRST)
+        observation, info = self._seen(self._answer)
+        return observation, reward, False, False, info
+
+    def _complete(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """The last move of a path, which the server flies."""
+        path = self._flights.paths(move)
         answer = self._session.step(path)
         result = answer.result()
-        reward = paid(result, self._pays) - float(flights.paid[0])
+        reward = paid(result, self._pays) - float(self._flights.paid[0])
         if self.render_mode is not None:
             self._trace(result.robot, path[0])
         self._update(self._observations, answer)
@@ -215,8 +225,6 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return as_choices(actions, self.num_envs, wire.N_MOVES)
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
-        if not self.is_open:
-            raise not_reset()
         completed = flown & self._flights.completes()
         if not completed.any():
             return self._move(actions, flown)

@@ -159,7 +159,7 @@ class Observations:
         """Where the other robots of each row's world are; `robots` are all of the worlds."""
         spec = self._spec
         shown = np.zeros((self._n_rows, spec.height, spec.width, 1), np.uint8)
-        own = (self._first + np.arange(self._n_rows)) % spec.n_robots
+        own = np.remainder(self._first + np.arange(self._n_rows), spec.n_robots)
         n_same = self._n_rows * spec.n_robots // len(robots)  # rows of a world
         rows, others = np.nonzero(own[:, np.newaxis] != np.arange(spec.n_robots))
         cells = robots[rows // n_same * spec.n_robots + others]
@@ -225,7 +225,7 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
     }
     if window is None:
         return known
-    if not isinstance(window, int | np.integer) or window < 3 or window % 2 == 0:  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not isinstance(window, int | np.integer) or window < 3 or not window & 1:  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("window", "an odd number from 3 on", repr(window))
 
     def around(n_of_world: int) -> spaces.Box:

@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from traceback import clear_frames
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -138,13 +139,14 @@ class Reader(Closable, Generic[_Sample]):
             self._node = node = Node(instance)
             try:
                 factory = node.open_publications(service, header, readers, buffer, publishers)
-                with channel_errors(f"read {service} (are there more than {readers} readers?)"):
+                with channel_errors(f"read {service}", f"{readers} readers"):
                     port = factory.subscriber_builder().buffer_size(buffer).create()
                     self._subscriber: Any = node.keep(port)
                     if publishers == 1:  # the server, which publishes the current state on this
                         wake = node.keep(node.open_wake("wake-server").notifier_builder())
                         node.keep(wake.create()).notify()
                     node.remember_files()
+                    node.fill_ports()
             except BaseException:
                 node.close()
                 raise
@@ -174,16 +176,29 @@ class Reader(Closable, Generic[_Sample]):
         self._node.check()
         start = time.perf_counter()
         while True:
-            with channel_errors("receive a sample"):
-                sample = self._subscriber.receive()
-            if sample is not None:
+            copied = self._take()
+            if copied is not None:
                 self._n_found += 1
-                return self._copied(sample)
+                return copied
             self._node.check_files()
             waited = time.perf_counter() - start
             if not waited < timeout:
                 return None
             time.sleep(min(self._interval(), timeout - waited))
+
+    def _take(self) -> tuple[Any, bytearray, int] | None:
+        """A sample, copied, if there is one."""
+        sample = None
+        try:
+            with channel_errors("receive a sample"):
+                sample = self._subscriber.receive()
+            return None if sample is None else self._copied(sample)
+        except BaseException as error:
+            # Its traceback, which a notebook keeps, keeps what is lent alive, too.
+            clear_frames(error.__traceback__)
+            raise
+        finally:
+            sample = None
 
     def _copied(self, sample: Any) -> tuple[Any, bytearray, int]:
         """Header, payload and the number of samples lost before it."""
@@ -255,7 +270,7 @@ class Newest(Generic[_Step]):
 
     def __init__(self, subscribe: Callable[[], Reader[_Step]], worlds: range) -> None:
         self._subscribe = subscribe
-        self._reader = subscribe()
+        self._reader: Reader[_Step] | None = subscribe()
         self._worlds = worlds
         self._samples: dict[int, _Step] = {}
 
@@ -278,9 +293,10 @@ class Newest(Generic[_Step]):
             # The samples of other worlds may have displaced these: a new reader gets all again.
             # Where it missed nothing, they may just take longer.
             if now - asked > (_RETRY if n_lost else _RETRY * 2**n_asked):
-                self._reader.close()
-                self._reader = self._subscribe()
+                self.close()
                 asked, n_asked, n_lost = now, n_asked + 1, 0
+            if self._reader is None:  # also where it was interrupted in between
+                self._reader = self._subscribe()
             sample = self._reader.receive(min(timeout, _RETRY))
             if sample is not None:
                 n_lost += sample.n_lost
@@ -289,7 +305,9 @@ class Newest(Generic[_Step]):
         return [self._samples[world] for world in wanted]
 
     def close(self) -> None:
-        self._reader.close()
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
 
     def _moment(self, world: int) -> tuple[int, int, int] | None:
         sample = self._samples.get(world)

@@ -4,6 +4,7 @@ Lightness distinguishes marks from cells, also in grey and under every colour bl
 """
 
 from dataclasses import dataclass
+from itertools import cycle, islice
 from typing import Final, Self
 
 import numpy as np
@@ -53,9 +54,8 @@ class Palette:
         if isinstance(source, Description):
             states, observations = source.state_colors, source.observation_colors
         else:
-            states = tuple(
-                color_from_hex(_COLORS[i % len(_COLORS)]) for i in range(MAX_VALUES)
-            )  # however many there may be
+            # However many there may be.
+            states = tuple(map(color_from_hex, islice(cycle(_COLORS), MAX_VALUES)))
             observations = states[:source]
         return cls(
             states=states,

@@ -13,11 +13,13 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from emberwatch.base import NOTHING_TO_DRAW
+from emberwatch.arguments import as_array
+from emberwatch.base import NOTHING_TO_DRAW, as_options
 from emberwatch.env import WildfireVectorEnv
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.observations import MovesParts, of_row
+from emberwatch.owner import state_of
 from emberwatch.settings import WorldArguments
 from emberwatch.vector_base import WorldVectorEnv, info_of
 from emberwatch.view import RENDER_FPS, RENDER_MODES
@@ -100,7 +102,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Begins an episode; of the options, only `resume` counts, see `WildfireEnv`."""
-        known = {key: value for key, value in (options or {}).items() if key == "resume"}
+        known = {key: value for key, value in as_options(options).items() if key == "resume"}
         seen, infos = self._worlds.reset(seed=seed, options=known)
         self.agents = list(self.possible_agents)
         return self._by_agent(seen), self._infos(infos)
@@ -120,10 +122,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             raise invalid("actions", f"one for each of {self.agents}", actions)
         if not actions:
             return {}, {}, {}, {}, {}
-        try:
-            chosen = np.array([actions[agent] for agent in self.agents])
-        except ValueError as error:
-            raise InvalidArgumentError(f"actions: expected all of one shape: {error}") from None
+        chosen = as_array([actions[agent] for agent in self.agents], "actions", "all of one shape")
         seen, rewards, terminated, truncated, infos = self._worlds.step(chosen)
         if (terminated | truncated).any():
             self.agents = []
@@ -159,6 +158,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def close(self) -> None:
         self._worlds.close()
         self.agents = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        return state_of(self, self._worlds.is_open, "emberwatch.parallel_env")
 
     @property
     def _all(self) -> slice:

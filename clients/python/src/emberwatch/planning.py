@@ -49,9 +49,10 @@ def beam_search(
         longer = scores[worlds, parents] + found + 1e-6 * rng.random(reached.shape)
         n_kept = min(width, longer.shape[1])
         kept = np.argpartition(-longer, n_kept - 1, axis=1)[:, :n_kept]
-        parents, moves = kept // 4, (kept % 4).astype(np.uint8)
+        parents, moves = np.divmod(kept, 4)
         cells, scores = reached[worlds, kept], longer[worlds, kept]
-        paths = np.concatenate((paths[worlds, parents], moves[..., np.newaxis]), axis=2)
+        last = moves[..., np.newaxis].astype(np.uint8)
+        paths = np.concatenate((paths[worlds, parents], last), axis=2)
         seen = seen[worlds, parents]
         seen[worlds, np.arange(n_kept)[np.newaxis], cells] = True
     return paths[np.arange(n), scores.argmax(axis=1)]

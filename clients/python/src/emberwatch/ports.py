@@ -9,11 +9,13 @@ import os
 import select
 import time
 import weakref
+from traceback import clear_frames
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
 from emberwatch.channels import Node, channel_errors, iox2
 from emberwatch.errors import EmberwatchError, NoServerError, RequestTimeoutError, ServerGoneError
+from emberwatch.resources import check_room
 from emberwatch.spinning import Spinning
 
 Reply = TypeVar("Reply", bound=wire.Header)
@@ -41,7 +43,7 @@ class Peer:
         """`wake` is the event service that it listens on, `who` its name in errors."""
         self.node: Final = node
         self._who = who
-        with channel_errors("open the wake services (are there more than 64 processes?)"):
+        with channel_errors("open the wake services"):
             notifier = node.open_wake(wake).notifier_builder().create()
             listener = node.open_wake("wake-client").listener_builder().create()
         self.notify: Any = node.keep(notifier).notify
@@ -143,6 +145,7 @@ class RequestPort(Generic[Reply]):
         if self._factory is None or self._factory.dynamic_config.number_of_servers == 0:
             raise no_server(peer.node, service)
         self._client: Any = None
+        self._slice_len = 0
 
     def create(self, *, slice_len: int, grows: bool) -> None:
         """Makes the port.
@@ -151,9 +154,9 @@ class RequestPort(Generic[Reply]):
         """
         growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
         builder = self._factory.client_builder().initial_max_slice_len(max(slice_len, 1))
-        problem = f"create a {self._service} client (are there more than 16 clients?)"
-        with channel_errors(problem):
+        with channel_errors(f"create a {self._service} client", "16 clients"):
             self._client = self._peer.node.keep(builder.allocation_strategy(growth).create())
+        self._slice_len = slice_len
 
     def close(self) -> None:
         """Drops the port; closing the node closes it."""
@@ -167,8 +170,9 @@ class RequestPort(Generic[Reply]):
         if self._peer.has_ended():
             # A new server on the instance would take the request, but knows nothing of it.
             raise self._peer.gone()
-        pending = self._send(header, payload)
+        pending = response = None
         try:
+            pending = self._send(header, payload)
             if pending.number_of_server_connections == 0:
                 raise self._peer.gone()
             self._peer.notify()
@@ -178,11 +182,18 @@ class RequestPort(Generic[Reply]):
             )
             length = response.payload().len()
             return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        except BaseException as error:
+            # Its traceback, which a notebook keeps, keeps what is lent alive, too.
+            clear_frames(error.__traceback__)
+            raise
         finally:
-            # The traceback of an error keeps `pending` alive, but the next request needs its place.
-            pending.delete()
+            response = None
+            if pending is not None:
+                pending.delete()  # the next request needs its place
 
     def _send(self, header: bytes, payload: bytes) -> Any:
+        if len(payload) > self._slice_len:
+            check_room(len(payload))  # It will be in a new file.
         deadline = time.perf_counter() + _RELEASE_TIMEOUT
         while True:
             try:

@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import programs
+from emberwatch.arguments import as_array
 from emberwatch.belief import initial_prior, uniform_prior
 from emberwatch.errors import EmberwatchError, invalid
 from emberwatch.model import Model
+from emberwatch.resources import SHARED_MEMORY
 
 PriorKind = Literal["simulated", "initial", "uniform"]
 """A prior by name, see `wrappers.BeliefObservation`."""
@@ -28,9 +30,12 @@ def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> N
     (S, H, W); the same array again for the same arguments, so it cannot be written to.
     """
     name = "emberwatch-agent"
-    with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
+    with _folder() as directory:
         file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
-        file.write_text(model.toml, "utf-8")
+        try:
+            file.write_text(model.toml, "utf-8")
+        except OSError as error:
+            raise EmberwatchError(f"write {file}: {error.strerror}", "program") from None
         flags = {"model": file, "height": height, "width": width, "burn-in": burn_in, "out": out}
         arguments = ["prior", *(f"--{flag}={value}" for flag, value in flags.items())]
         programs.run(name, arguments, _SIMULATION_TIMEOUT)
@@ -48,8 +53,20 @@ def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> N
     return prior
 
 
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """A temporary folder; in shared memory, which must be writable anyhow, if there is no other."""
+    prefix = "emberwatch-prior-"
+    try:
+        return tempfile.TemporaryDirectory(prefix=prefix)
+    except OSError:
+        try:
+            return tempfile.TemporaryDirectory(prefix=prefix, dir=SHARED_MEMORY)
+        except OSError as error:
+            raise EmberwatchError(f"make a temporary folder: {error.strerror}", "program") from None
+
+
 def prior_of(
-    prior: PriorKind | NDArray[np.floating] | None,
+    prior: PriorKind | ArrayLike | None,
     model: Model,
     *,
     height: int,
@@ -61,9 +78,10 @@ def prior_of(
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):
         expected = (model.n_states, height, width)
-        if prior.shape != expected:
-            raise invalid("prior", f"shape {expected}", prior.shape)
-        return prior
+        given = as_array(prior, "prior", f"an array of shape {expected}")
+        if given.shape != expected:
+            raise invalid("prior", f"shape {expected}", given.shape)
+        return given
     if prior == "simulated":
         return simulated_prior(model, height=height, width=width, burn_in=burn_in)
     simple = {"initial": initial_prior, "uniform": uniform_prior}

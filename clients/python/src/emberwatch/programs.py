@@ -5,6 +5,7 @@ import contextlib
 import itertools
 import os
 import re
+import secrets
 import shutil
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import tomllib
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, Any, Final, TypeVar
+from typing import IO, Any, Final, Protocol, TypeVar
 
 from emberwatch.errors import (
     EmberwatchError,
@@ -26,7 +27,7 @@ from emberwatch.errors import (
     ServerGoneError,
 )
 
-_Connection = TypeVar("_Connection")
+_Connection = TypeVar("_Connection", bound="Introduced")
 
 # Seconds that a program may take to answer, to stop before it is killed, and to end after it has
 # said that it ends.
@@ -35,6 +36,23 @@ _STOP_TIMEOUT: Final = 3.0
 _EXIT_TIMEOUT: Final = 3.0
 
 _numbers = itertools.count()
+
+
+class _Described(Protocol):
+    @property
+    def pid(self) -> int: ...
+
+
+class Introduced(Protocol):
+    """A connection to a process that has said who it is."""
+
+    @property
+    def instance(self) -> str: ...
+
+    @property
+    def info(self) -> _Described: ...
+
+    def close(self) -> None: ...
 
 
 def find(name: str) -> Path:
@@ -54,8 +72,9 @@ def find(name: str) -> Path:
 
 
 def unused_instance() -> str:
-    """An instance name that no other program in this process-id namespace uses."""
-    return f"python-{os.getpid()}-{next(_numbers)}"
+    """An instance name that no other program uses."""
+    # A process of this number may have one in another container that shares /dev/shm.
+    return f"python-{os.getpid()}-{next(_numbers)}-{secrets.token_hex(8)}"
 
 
 def check_settings(flags: Sequence[str]) -> dict[str, Any]:
@@ -81,7 +100,7 @@ def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.Comp
             command,
             env=os.environ | {"RUST_LOG": "warn"},
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             errors="replace",
             stdin=subprocess.DEVNULL,
             timeout=timeout,
@@ -94,6 +113,14 @@ def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.Comp
 
 def _not_started(command: Sequence[str], error: OSError) -> EmberwatchError:
     return EmberwatchError(f"start {command[0]}: {error.strerror}", "program")
+
+
+def _nameless_file() -> IO[bytes]:
+    """A file that ends with this process; in memory where no folder can be written to."""
+    try:
+        return tempfile.TemporaryFile()  # noqa: SIM115
+    except OSError:
+        return os.fdopen(os.memfd_create("output"), "w+b")
 
 
 def _cleaned(text: str) -> str:
@@ -110,7 +137,7 @@ class Program:
         self._name = name
         self._owner = os.getpid()
         # For the error if it ends at once. A file, unlike a pipe, never fills up and blocks it.
-        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        self._output = _nameless_file()
         try:
             # A process group of its own: Ctrl-C is for Python, which then stops it. Not a session:
             # each has its own share of the cores, and between shares a wake-up waits longer.
@@ -135,7 +162,7 @@ class Program:
         deadline, pause = time.monotonic() + timeout, 0.002
         while True:
             try:
-                return connect()
+                return self._own(connect())
             except (NoServerError, ServerGoneError, RequestTimeoutError) as error:
                 problem = None
                 if self._process.poll() is not None:
@@ -151,6 +178,17 @@ class Program:
             except EmberwatchError:
                 self.stop()
                 raise
+
+    def _own(self, connection: _Connection) -> _Connection:
+        """A connection, if it is to this program."""
+        if connection.info.pid == self.pid:
+            return connection
+        connection.close()
+        who = f"{self._name} as pid {self.pid}, which was started"
+        raise EmberwatchError(
+            f"instance {connection.instance!r}: expected {who}, got pid {connection.info.pid}",
+            "program",
+        )
 
     @property
     def pid(self) -> int:

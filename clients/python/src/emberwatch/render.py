@@ -81,7 +81,7 @@ class Picture:
 
     def color_of(self, robot: int) -> Color | None:
         """The colour of a robot of a team; None if it is alone."""
-        return ROBOTS[robot % len(ROBOTS)] if len(self.robots) > 1 else None
+        return ROBOTS[divmod(robot, len(ROBOTS))[1]] if len(self.robots) > 1 else None
 
 
 def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
@@ -276,7 +276,7 @@ def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
     gap = np.full(shape, _EDGE, dtype=np.uint8)
     image = np.concatenate([part for panel in panels for part in (gap, panel)][1:], axis=axis)
     height, width, _ = image.shape
-    return np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    return np.pad(image, ((0, height & 1), (0, width & 1), (0, 0)), mode="edge")
 
 
 def _marks(

@@ -151,17 +151,17 @@ class DecisionsInfo:
     n_moves: int
     max_steps: int
     states: tuple[str, ...]
-    #: What can be decided, by position: each state, then "entropy".
+    #: What can be decided, by position: plans, by their names.
     objectives: tuple[str, ...]
+    #: What keeps the belief.
     estimator: str
-    planner: str
-    #: Names of the numbers in a decision's summary.
-    summary: tuple[str, ...]
+    #: Names of the numbers that describe a plan.
+    features: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """What came of a world's last decision: the step's result, and the belief about the next.
+    """What came of a world's last decision: the step's result, and what the next plans promise.
 
     `seed` and `n_target_cells` are not for learners.
     """
@@ -178,8 +178,8 @@ class Decision:
     episode: int
     #: What was decided; None after a reset.
     objective: int | None
-    #: Numbers from 0 to 1, as `DecisionsInfo.summary` names them.
-    summary: tuple[float, ...]
+    #: Of each objective's plan, in base64: `Decisions.features` reads them.
+    features: str
 
 
 def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:

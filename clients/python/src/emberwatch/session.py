@@ -8,16 +8,16 @@ import inspect
 import logging
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.arguments import as_seed
 from emberwatch.client import Client, connect
 from emberwatch.errors import (
     EmberwatchError,
@@ -27,7 +27,6 @@ from emberwatch.errors import (
     invalid,
 )
 from emberwatch.lease import Lease
-from emberwatch.model import Model
 from emberwatch.observer import Newest, Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
@@ -47,11 +46,18 @@ _SHUTDOWN_TIMEOUT: Final = 0.5
 #: After these the worlds are no longer held, or stand elsewhere than expected.
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
+#: Why there is no next step: the error's code, and its words.
+_INTERRUPTED: Final = "interrupted", "an earlier step or reset did not finish (Ctrl-C or an error)"
+_TIMED_OUT: Final = "closed", "an earlier step timed out"
+_CLOSED: Final = "closed", "the environment is closed"
+
 
 class Session:
     """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
 
-    It flies all robots of its worlds, or one robot of a world that others fly in.
+    It flies all robots of its worlds, or one robot of a world that others fly in. An environment
+    calls `begin_step` or `begin_reset` first and `finish` last: anything between the two may be
+    interrupted, by Ctrl-C or by a signal's handler, after which the worlds may have moved unseen.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -63,8 +69,12 @@ class Session:
         self._program: Program | None = None
         self._truth: Newest[Truth] | None = None
         self._has_warned = False
-        #: Whether a step has timed out, so that the worlds may stand elsewhere than expected.
-        self._is_lost = False
+        #: Why there is no next step, such as one that did not finish: worlds may have moved unseen.
+        self._unfinished: tuple[str, str] | None = _CLOSED
+        #: Whether the worlds may have moved since it began: a refusal alone changes nothing.
+        self._has_moved = False
+        #: Whether the server may still have a request of an unfinished step or reset.
+        self._is_torn = False
         #: World steps that passed unseen before the last answer, as a path came too late.
         self.n_skipped = 0
         if settings.instance is None:
@@ -95,22 +105,41 @@ class Session:
         """Whether there has been a reset since it was made or closed."""
         return self._lease is not None
 
+    def begin_step(self) -> None:
+        """Refuses a step before a reset, and after what did not finish."""
+        if self._unfinished is not None:
+            raise self._no_step()
+        self._has_moved = False
+        self._unfinished = _INTERRUPTED
+
+    def begin_reset(self) -> None:
+        """Before a reset of all worlds, or of some."""
+        self._is_torn = self._has_moved = self.is_unfinished
+        self._unfinished = _INTERRUPTED
+
+    def finish(self) -> None:
+        """The environment has taken in what `begin_step` or `begin_reset` began."""
+        self._unfinished = None
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether worlds may have moved unseen: then all are reset, or resumed."""
+        return self._unfinished not in (None, _CLOSED)
+
     def resume(self) -> StepAnswer:
         """Goes on from where the worlds stand, such as after another agent."""
         if self.settings.instance is None and not self.is_open:
             raise invalid("options", "a reset before resume=True", "the first one")
         self._open(0)
-        try:
+        with self._told():
+            self._settle()
             return self._observe()
-        except LOST as error:
-            raise self._lost(error) from None
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
 
         If the server has ended, those in all worlds begin at another.
         """
-        seeds = [as_seed(seed) for seed in seeds]
         may_move = self.is_open and len(indices) == self.n_worlds
         try:
             return self._begin(indices, seeds)
@@ -123,33 +152,36 @@ class Session:
         """Flies checked paths with all robots, or with those of some consecutive worlds.
 
         Slow teammates are waited for, without end while the server lives. A path that came too
-        late is given up, and the answer is how the world stands.
+        late for them is given up, and the answer is how the world stands.
         """
         lease = self._opened()
-        if self._is_lost:
-            raise timed_out_before()
         robots = lease.robots if rows is None else lease.robots[rows.start : rows.stop]
         self.n_skipped = 0
         # Sooner would take back the path with which the deadline began.
         timeout = self.settings.timeout + lease.client.info.deadline_millis / 1000
         while True:
             try:
-                return lease.step_moves(moves, robots, timeout=timeout)
+                answer = lease.step_moves(moves, robots, timeout=timeout)
+                self._has_moved = True
+                return answer
             except (LeaseLostError, ServerGoneError) as error:
                 raise self._lost(error) from None
             except EmberwatchError as error:
-                if error.code not in ("timeout", "late"):
+                # Nobody else moves worlds of which it flies all robots.
+                is_late = error.code == "late" and self.settings.robot is not None
+                if error.code != "timeout" and not is_late:
+                    self._refused(error)
                     raise
             before = int(lease.steps_of(robots)[0])
             answer = self._look(lease, robots)
             n_moved = int(answer.worlds["step"][0]) - before
             if n_moved > 0:
                 self.n_skipped = n_moved - 1
+                self._has_moved = True
                 return answer
             _log.warning(
-                "world %d waits for the paths of other robots that are held; environments of one "
-                "world need a thread or a process each",
-                self._worlds.start,
+                f"world {self._worlds.start} waits for the paths of other robots that are held; "
+                "environments of one world need a thread or a process each"
             )
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
@@ -167,7 +199,7 @@ class Session:
         shape, client = self.spec.shape, self._client
         if client is None:
             raise not_reset()
-        first = answer.first_robot - answer.first_robot % shape.n_robots
+        first = answer.first_robot // shape.n_robots * shape.n_robots
         step = int(answer.worlds["step"][0])
         return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
@@ -182,14 +214,13 @@ class Session:
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:
-        """Gives the worlds back; a private server stops. A new reset opens it again."""
+        """Gives the worlds back; a private server stops. A new reset opens it again.
+
+        May be called again, also after it was interrupted.
+        """
+        self._unfinished = _CLOSED
         lease, self._lease = self._lease, None
-        client, self._client = self._client, None
-        program, self._program = self._program, None
-        truth, self._truth = self._truth, None
-        self._is_lost = False
-        if truth is not None:
-            truth.close()
+        client, program = self._client, self._program
         try:
             if program is not None and client is not None:
                 # Quicker than a signal, which the server notices at its next check.
@@ -198,53 +229,84 @@ class Session:
                 lease.release(timeout=self.settings.timeout)
         except EmberwatchError:
             pass  # lost, or the server is gone: nothing is held any more
-        if client is not None:
-            client.close()
-        if program is not None:
-            program.stop()
+        finally:
+            self._drop()
+
+    def _drop(self) -> None:
+        """Closes all connections; a private server stops."""
+        for part in (self._truth, self._client):
+            if part is not None:
+                part.close()
+        self._truth = self._client = None
+        if self._program is not None:
+            self._program.stop()
+        self._program = None
 
     def _open(self, seed: int) -> None:
         """Connects and holds the worlds; a private server starts with `seed` for world 0."""
         if self.is_open:
             return
         settings = self.settings
+        self.close()  # what an interrupted call has left
         try:
             if settings.instance is None:
                 self._client = client = self.launch(seed)
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
-            self._hold(client)
             if settings.truth:
                 self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
+            self._hold(client)  # the last, as it is open from then on
+            self._is_torn, self._has_moved = False, True
+            self._unfinished = _INTERRUPTED
         except BaseException:
             self.close()
             raise
 
     def _hold(self, client: Client) -> None:
         """Gets the right to fly the robots."""
-        self._lease = client.acquire(
+        self._lease = self._acquire(client, self.settings.takeover)
+
+    def _acquire(self, client: Client, takeover: bool) -> Lease:
+        return client.acquire(
             self._robots.start,
             self.n_rows,
-            takeover=self.settings.takeover,
+            takeover=takeover,
             ttl=_PRIVATE_LEASE if self.settings.instance is None else _LEASE,
             timeout=RESET_TIMEOUT,
         )
+
+    def _settle(self) -> None:
+        """Waits until the server has nothing left of an unfinished step or reset."""
+        client = self._client
+        if not self._is_torn or client is None:
+            return
+        # A server that does not answer is not waited for as long as a burn-in may take.
+        client.status(timeout=self.settings.timeout)
+        try:
+            # Answered after the burn-in of a reset; paths under the old lease are refused by then.
+            self._lease = self._acquire(client, takeover=False)
+        except EmberwatchError as error:
+            if error.code == "busy":
+                words = f"lease lost to pid {error.detail}, which took the robots over"
+                raise LeaseLostError(words, detail=error.detail) from None
+            raise
+        self._is_torn = False
 
     def _connect(self, instance: str) -> Client:
         return connect(instance, timeout=self.settings.timeout, wait=self.settings.timeout)
 
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        self._open((seeds[0] - indices[0]) % 2**64)
-        try:
+        self._open((seeds[0] - indices[0]) & (2**64 - 1))
+        with self._told():
+            self._settle()
             answer = self._restart([self._worlds[index] for index in indices], seeds)
-        except LOST as error:
-            raise self._lost(error) from None
         self._warn_of_barren(answer)
         return answer
 
     def _restart(self, worlds: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         self._opened().reset(seeds, worlds=worlds)
+        self._has_moved = True
         return self._observe()
 
     def _warn_of_barren(self, answer: StepAnswer) -> None:
@@ -263,10 +325,36 @@ class Session:
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
         """Closes what is gone, a reset opens it again; remembers what timed out."""
         if isinstance(error, RequestTimeoutError):
-            self._is_lost = True
+            self._unfinished = _TIMED_OUT
         else:
             self.close()
         return error
+
+    def _refused(self, error: EmberwatchError) -> None:
+        """Forgets what has begun, if nothing has changed."""
+        if not self._has_moved and error.code not in ("late", "early"):
+            self._unfinished = None
+
+    @contextmanager
+    def _told(self) -> Generator[None]:
+        """Errors of a reset tell whether the worlds are held, and where they stand."""
+        try:
+            yield
+        except LOST as error:
+            raise self._lost(error) from None
+        except EmberwatchError as error:
+            self._refused(error)
+            raise
+
+    def _no_step(self) -> EmberwatchError:
+        if self._unfinished is None or self._unfinished is _CLOSED:
+            return not_reset()
+        code, words = self._unfinished
+        return EmberwatchError(
+            f"{words}, and the world may have moved: reset, or go on from where it stands with "
+            "reset(options={'resume': True})",
+            code,
+        )
 
     def _opened(self) -> Lease:
         if self._lease is None:
@@ -274,9 +362,7 @@ class Session:
         return self._lease
 
     def _observe(self) -> StepAnswer:
-        answer = self._opened().observe(timeout=self.settings.timeout)
-        self._is_lost = False
-        return answer
+        return self._opened().observe(timeout=self.settings.timeout)
 
     def _look(self, lease: Lease, robots: range) -> StepAnswer:
         """Where the worlds stand after a step that has no answer."""
@@ -300,52 +386,6 @@ def _told(spec: WorldSpec) -> WorldSpec:
     return replace(spec, model=None, description=None)
 
 
-class SessionOwner:
-    """What environments of one world and of many tell of their session."""
-
-    _session: Session
-
-    @property
-    def model(self) -> Model | None:
-        """The model behind the worlds; None if a running server hides it, or they were recorded."""
-        return self._session.spec.model
-
-    @property
-    def world_spec(self) -> WorldSpec:
-        """What is known of the worlds before the first reset."""
-        return self._session.spec
-
-    @property
-    def n_moves(self) -> int:
-        """Moves of a path, T."""
-        return self._session.spec.n_moves
-
-    @property
-    def burn_in(self) -> int:
-        """Steps that the worlds are simulated before k = 0."""
-        return self._session.spec.burn_in
-
-    @property
-    def instance(self) -> str:
-        """The server's instance name, once the environment has been reset."""
-        return self._session.instance
-
-    @property
-    def is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
-        return self._session.is_open
-
-    def __getstate__(self) -> dict[str, Any]:
-        """For copies, which only a closed environment has: no two may act on the same worlds."""
-        if self.is_open:
-            raise TypeError(
-                f"copy or pickle: expected a closed environment, got a {type(self).__name__} "
-                "that acts on a server's worlds: close it first, or make another with "
-                "gymnasium.make(env.spec); Client.snapshot and Lease.fork copy worlds"
-            )
-        return vars(self).copy()
-
-
 def _warn(message: str) -> None:
     """Warns at the caller's line: the first outside this package and Gymnasium."""
     frame, level = inspect.currentframe(), 1
@@ -357,12 +397,3 @@ def _warn(message: str) -> None:
 def not_reset() -> EmberwatchError:
     """The error of an environment without an episode."""
     return EmberwatchError("the environment is closed: reset it first", "closed")
-
-
-def timed_out_before() -> EmberwatchError:
-    """The error of a step after one that timed out."""
-    return EmberwatchError(
-        "an earlier step timed out, and the world may have moved: reset, or go on from "
-        "where it stands with reset(options={'resume': True})",
-        "closed",
-    )

@@ -12,6 +12,7 @@ import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model
+from emberwatch.paths import utf8
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
@@ -78,6 +79,9 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise invalid(field.name, field.type, repr(value))
+        for name, path in (("model", self.model), ("states", self.states)):
+            if path is not None:
+                utf8(name, path)
         if self.robots is not None and self.robots < 1:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
@@ -171,8 +175,10 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     robots = _robots(settings, n_rows, settings.robots or 1)
     n_worlds = len(robots) // (settings.robots or 1)
     checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
-    states = checked["states"]
-    described = _description(Path(states)) if states else Model.checked(checked["model"])
+    if settings.states is None:
+        described = Model.checked(settings.model or checked["model"])
+    else:
+        described = _description(Path(settings.states))
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
@@ -181,8 +187,8 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_observations=described.n_observations,
         burn_in=checked["burn_in"],
         n_robots=checked["robots"],
-        is_recorded=bool(states),
-        description=described if states else None,
+        is_recorded=settings.states is not None,
+        description=None if settings.states is None else described,
     )
     return spec, robots
 
@@ -241,7 +247,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
             raise invalid("robot", f"0 to {n_robots - 1}", settings.robot)
         return range(first + settings.robot, first + settings.robot + 1)
     n_rows = n_robots if n_rows is None else n_rows
-    if n_rows % n_robots:
+    if n_rows // n_robots * n_robots != n_rows:
         raise InvalidArgumentError(
             f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
             "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "

@@ -7,11 +7,12 @@ a dead one. The turn is a `flock`, which ends with its process.
 import errno
 import fcntl
 import os
+import re
 import threading
 import time
 import weakref
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -74,13 +75,22 @@ def process_state(pid: int) -> str | None:
         return None
 
 
+def pid_namespace() -> int | None:
+    """The PID namespace of this process, by its number; None if the system does not say."""
+    with suppress(OSError):
+        found = re.fullmatch(r"pid:\[(\d+)\]", os.readlink("/proc/self/ns/pid"))
+        return int(found[1]) if found else None
+    return None
+
+
 def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
-    remedy = (
-        ": channels need a /dev/shm that can be written to; as root, "
-        "`mount -o remount,rw /dev/shm`, or mount a tmpfs there"
-    )
-    remedy = remedy if error.errno == errno.EROFS else ""
+    remedies = {
+        errno.EROFS: ": channels need a /dev/shm that can be written to; as root, "
+        "`mount -o remount,rw /dev/shm`, or mount a tmpfs there",
+        errno.ENOSPC: ": free some, or give the container more (docker: --shm-size)",
+    }
+    remedy = remedies.get(error.errno or 0, "")
     return EmberwatchError(f"create {path}: {error.strerror}{remedy}", "channel")
 
 
@@ -88,6 +98,7 @@ def _wait(path: Path, limit: float) -> FileIO | None:
     """The lock, which ends with its last reference; None if a stopped or frozen process has it."""
     start = time.monotonic()
     holder, since = None, start
+    lock = None
     try:
         while True:
             lock = _open(path)
@@ -109,12 +120,18 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                 # Not ">": "not a number" would never end.
                 if not now - start < limit:
                     lock.close()
-                    problem = f"expected the lock within {limit} s, got it held by pid {holder}"
+                    who = f"pid {holder}" if holder else "a process of another PID namespace"
+                    problem = f"expected the lock within {limit} s, got it held by {who}"
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)
             lock.close()
-    except OSError as error:
-        raise cannot_create(path, error) from None
+    except BaseException as error:
+        if lock is not None:
+            lock.close()  # the error's traceback would keep it
+        # One without a number is not the system's: a signal's handler may raise a TimeoutError.
+        if isinstance(error, OSError) and error.errno is not None:
+            raise cannot_create(path, error) from None
+        raise
 
 
 def _open(path: Path) -> FileIO:

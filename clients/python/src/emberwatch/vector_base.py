@@ -15,18 +15,21 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from emberwatch.agent_session import Summaries
-from emberwatch.arguments import as_seed
-from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
+from emberwatch.agent_session import Features
+from emberwatch.arguments import as_array, as_integer, as_seed, told
+from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, as_options, wants_to_resume
 from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
-from emberwatch.session import Session, SessionOwner
+from emberwatch.owner import SessionOwner
+from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
-class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
+class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
+    SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]
+):
     """Many robots, stepped together."""
 
     # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
@@ -35,7 +38,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def __init__(
         self,
         session: Session,
-        observations: Observations | Summaries,
+        observations: Observations | Features,
         action_space: spaces.Space[Any],
         *,
         max_episode_steps: int | None,
@@ -84,20 +87,27 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
         """
-        rest = dict(options or {})
+        rest = as_options(options)
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
         if not mask.all() and not self.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
+        if not mask.all() and self._session.is_unfinished:
+            raise gymnasium.error.ResetNeeded(
+                "reset_mask: expected all worlds, as an earlier step or reset did not finish"
+            )
         self.closed = False
+        self._session.begin_reset()
         chosen = np.flatnonzero(mask).tolist()
         if resumes:
             self._take(self._session.resume())
             self._reset_episodes(chosen)
         else:
             self._restart(chosen, seeds)
-        return self._seen(), self._infos(mask)
+        outcome = self._seen(), self._infos(mask)
+        self._session.finish()
+        return outcome
 
     def step(
         self, actions: NDArray[np.integer[Any]]
@@ -115,13 +125,16 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
                 f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                 "options={'reset_mask': ...}"
             )
+        self._session.begin_step()
         flown = ~over
         self._exchanged = np.zeros_like(flown)
         rewards = self._fly(chosen, flown)
         self._elapsed += flown
         if over.any():
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
-        return self._outcome(flown, rewards)
+        outcome = self._outcome(flown, rewards)
+        self._session.finish()
+        return outcome
 
     def render(self) -> tuple[Any, ...] | None:
         """The picture of each robot, as `WildfireEnv.render` draws it."""
@@ -295,10 +308,13 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if seed is None:
             return [None] * n_worlds
         # Checked before any world's generator is replaced.
-        if isinstance(seed, int | np.integer):
-            return [as_seed(int(seed) + world) for world in range(n_worlds)]
-        if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
-            raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr(seed))
+        first = as_integer(seed)
+        if first is not None:
+            return [as_seed(first + world) for world in range(n_worlds)]
+        if isinstance(seed, np.ndarray):
+            seed = as_array(seed, "seed", "integers").tolist()
+        if not isinstance(seed, Sequence) or len(seed) != self.num_envs:
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", told(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]
 
@@ -307,8 +323,9 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if mask is None:
             return np.ones(shape, np.bool_)
         got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
-        if got != f"bool {shape}" or not mask.any():
-            raise invalid("reset_mask", f"an array {shape} of bool with at least one True", got)
+        if got != f"bool {shape}" or np.ma.is_masked(mask) or not mask.any():
+            expected = f"an array {shape} of bool with at least one True, none masked"
+            raise invalid("reset_mask", expected, got)
         worlds = mask.reshape(-1, self._spec.n_robots)
         if (worlds.any(axis=1) != worlds.all(axis=1)).any():
             raise invalid("reset_mask", "all robots of a world or none", "some")

@@ -213,7 +213,8 @@ class Shape(NamedTuple):
 
     def n_worlds(self, first_robot: int, n_robots: int) -> int:
         """How many worlds some consecutive robots are in."""
-        return (first_robot % self.n_robots + n_robots - 1) // self.n_robots + 1
+        last_robot = first_robot + n_robots - 1
+        return last_robot // self.n_robots - first_robot // self.n_robots + 1
 
 
 class StepAnswer:
@@ -276,8 +277,9 @@ class StepAnswer:
     @property
     def world_of(self) -> NDArray[np.intp]:
         """The position in `worlds` of each robot's world, `(n_robots,)`."""
-        first, n_robots = self.first_robot % self._shape.n_robots, len(self.robots)
-        return np.arange(first, first + n_robots) // self._shape.n_robots
+        robots = np.arange(self.first_robot, self.first_robot + len(self.robots))
+        worlds = robots // self._shape.n_robots
+        return worlds - worlds[0]
 
     @property
     def results(self) -> NDArray[np.void]:

@@ -4,6 +4,8 @@ A frame shows a path; the belief is what all frames so far say about every cell.
 without memory, the belief is the better observation.
 """
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
@@ -12,10 +14,11 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from emberwatch.arguments import as_json
 from emberwatch.belief import Filter
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
 from emberwatch.prior import PriorKind, prior_of
 
@@ -52,8 +55,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     ## Arguments
     `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-    ``"frame"``. `model`, a `Model`, its name or the path of its file, is for servers that do not
-    reveal theirs; else it is ``env.unwrapped.model``.
+    ``"frame"``. `model`, a `Model`, its name, or the path or the text of its file, is for servers
+    that do not reveal theirs; else it is ``env.unwrapped.model``.
     """
 
     def __init__(
@@ -62,10 +65,13 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         *,
         keep: bool = False,
         dtype: Literal["float32", "uint8"] = "float32",
-        prior: PriorKind | NDArray[np.floating] | None = None,
+        prior: PriorKind | ArrayLike | None = None,
         model: Model | str | Path | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
+        text = model.toml if isinstance(model, Model) else as_json(model)
+        RecordConstructorArgs.__init__(
+            self, keep=keep, dtype=dtype, prior=as_json(prior), model=text
+        )
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
             raise invalid("dtype", "'float32' or 'uint8'", repr(dtype))
@@ -85,27 +91,43 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     def filter(self) -> Filter:
         """The filter of the current episode, for its entropy or its belief in double precision."""
         if self._filter is None:
-            raise gymnasium.error.ResetNeeded("BeliefObservation: call reset before anything else")
+            raise gymnasium.error.ResetNeeded(
+                "BeliefObservation: call reset first, also after a step that did not finish"
+            )
         return self._filter
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
+        with self._between():
+            observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
-        self._filter = Filter(self._model, prior=self._prior)
-        self._filter.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        belief = Filter(self._model, prior=self._prior)
+        belief.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        self._filter = belief
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         belief = self.filter
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        with self._between():
+            observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._step = self._step, int(info.get("step", self._step + 1))
         for _ in range(before, self._step):
             belief.predict()
         if self._step > before:
             belief.correct(_frame_of(observation))
+        self._filter = belief
         return self._observe(observation), reward, terminated, truncated, info
+
+    @contextmanager
+    def _between(self) -> Generator[None]:
+        """Without a belief until what the environment does now is taken in; a refusal keeps it."""
+        belief, self._filter = self._filter, None
+        try:
+            yield
+        except (EmberwatchError, gymnasium.error.Error):
+            self._filter = belief
+            raise
 
     def _observe(self, observation: Any) -> Any:
         belief: NDArray[Any] = self.filter.belief
@@ -130,6 +152,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) -> Model:
     if isinstance(model, Model):
         return model
+    if isinstance(model, str) and "\n" in model:
+        return Model.from_toml(model)
     if model is not None:
         return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)

@@ -18,6 +18,7 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.film.scenes import Scene, Selection, scenes, steps
 from emberwatch.model import Model
 from emberwatch.observer import Frame
+from emberwatch.paths import shown
 from emberwatch.prior import PriorKind, prior_of
 from emberwatch.replies import ServerInfo
 
@@ -198,7 +199,8 @@ def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterato
         os.replace(beside, out)
     finally:
         beside.unlink(missing_ok=True)
-    print(f"{out}: {n_scenes} pictures of {width} x {height} pixels, {out.stat().st_size} bytes")
+    size = f"{width} x {height} pixels, {out.stat().st_size} bytes"
+    print(shown(f"{out}: {n_scenes} pictures of {size}"))
 
 
 def _pictures(page: Page, scenes: Iterator[Scene], n_scenes: int, fps: float) -> Iterator[Image]:

@@ -1,7 +1,8 @@
 """Recorded worlds from rasters of fires: `python -m emberwatch.landscape IN... --out world.npz`.
 
-`layers` reads files (with rasterio: ``pip install emberwatch[landscape]``), `schedule` says when
-layers are, `grid` checks where their cells are and resamples, `fire` makes states of times, masks
-or codes, `world` writes what `emberwatch-server --states` reads, `picture` draws it, `__main__`
-reads flags.
+`inputs` finds files; `raster` (with rasterio), `netcdf` (with netCDF4; its `axes` and `packing`
+know CF) and `numpy_file` read them as `layers`; ``pip install emberwatch[landscape]``. `schedule`
+says when layers are, `grid` checks where their cells are and resamples, `fire` makes states of
+times, masks or codes, `world` writes what `emberwatch-server --states` reads, `picture` draws it,
+`__main__` reads flags.
 """

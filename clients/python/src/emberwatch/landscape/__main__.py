@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
-from emberwatch.landscape.layers import Choice, read, stacks
+from emberwatch.landscape.inputs import read, stacks
+from emberwatch.landscape.layers import Choice
 from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
+from emberwatch.paths import shown, utf8
 
 _NAME: Final = "python -m emberwatch.landscape"
 _EXAMPLES: Final = """
@@ -108,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _import(flags: argparse.Namespace) -> None:
     meaning = _meaning(flags)
-    name = _name(flags)
+    name = utf8("--name", flags.name or flags.out.stem)
     check_outputs(flags.out, flags.picture, force=flags.force)
     if flags.picture is not None and find_spec("PIL") is None:
         raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
@@ -139,7 +141,8 @@ def _import(flags: argparse.Namespace) -> None:
     for states_of_fire in sequences:
         print(_told(states_of_fire))
     n_bytes = flags.out.stat().st_size
-    print(f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}")
+    told = f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}"
+    print(shown(told))
 
 
 def _meaning(flags: argparse.Namespace) -> Meaning:
@@ -171,15 +174,6 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         oblong=flags.oblong,
         missing_is_unburnt=flags.missing_is_unburnt,
     )
-
-
-def _name(flags: argparse.Namespace) -> str:
-    name: str = flags.name or flags.out.stem
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        raise invalid("--name", "UTF-8", ascii(name)) from None
-    return name
 
 
 def _told(sequence: NDArray[np.uint8]) -> str:

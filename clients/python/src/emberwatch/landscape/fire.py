@@ -17,11 +17,14 @@ from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place, Rule, check_same, check_square, crop, part, resampled
 from emberwatch.landscape.layers import Layer
 from emberwatch.landscape.schedule import SECONDS, Schedule, steps_at, unit_of
+from emberwatch.landscape.world import STATES
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 
+#: Parts of words for each state, in the order in which they are looked for.
+_WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
 _MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
 
 
@@ -168,6 +171,7 @@ def _add(
                 f"the first {_cell(missing)}; --missing-is-unburnt takes them as unburnt"
             )
         values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
+    _check_flags(layer, meaning)
     if meaning.kind == "states":
         unburnt, burning, done = (values == code for code in meaning.codes)
         known = unburnt | burning | done
@@ -190,6 +194,24 @@ def _add(
     arrival[(burning | done) & np.isinf(arrival)] = k
     burnt[done & np.isinf(burnt)] = k
     return mark
+
+
+def _check_flags(layer: Layer, meaning: Meaning) -> None:
+    """Refuses numbers that mean another state in the file."""
+    for number, word in layer.flags:
+        if meaning.kind == "states":
+            taken = [state for state, code in enumerate(meaning.codes) if code == number]
+        elif number == 0:
+            taken = [UNBURNT] if meaning.kind == "mask" else [UNBURNT, BURNT]
+        else:
+            taken = [BURNING, BURNT]
+        said = [k for k, words in enumerate(_WORDS) if any(each in word.lower() for each in words)]
+        if taken and said and said[0] not in taken:
+            raise invalid(
+                f"{layer.name}, flag_meanings",
+                f"{number:.6g} to mean {' or '.join(STATES[state].name for state in taken)}",
+                f"'{word}'; --kind and --codes say what numbers mean",
+            )
 
 
 def _check_order(

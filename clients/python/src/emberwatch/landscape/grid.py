@@ -11,10 +11,11 @@ from emberwatch.errors import InvalidArgumentError, invalid
 
 MAX_SIDE: Final = 4096
 """Most rows, and most columns, that the server takes."""
+LIKE: Final = 1e-3
+"""Share of a cell by which places may differ."""
 
 Rule = Literal["earliest", "nearest"]
 
-_LIKE: Final = 1e-3  # share of a cell by which places may differ
 _SQUARE: Final = 0.02  # by how much the sides of a square cell may differ
 
 
@@ -52,7 +53,7 @@ def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
     if place.shape != first.shape:
         raise invalid(name, f"{_size(first)} cells as in {first_name}", _size(place))
     apart = np.subtract(_extent(place), _extent(first))
-    if (np.abs(apart) > _LIKE * first.cell[0]).any():
+    if (np.abs(apart) > LIKE * first.cell[0]).any():
         raise invalid(name, f"the extent of {first_name}, {_extent(first)}", _extent(place))
 
 

@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
 
-SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+SECONDS: Final = {
+    "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9
+}  # fmt: skip
 """Of each unit."""
 EVEN: Final = 1e-3
 """Share of a step by which times may differ, as 32-bit numbers do."""
 
 _SPELLINGS: Final = {
-    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
+    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d",
+    "msec": "ms", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
 }  # fmt: skip
 #: Calendars whose dates are ours.
 _CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
@@ -174,6 +177,9 @@ def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
     in_file = clock.unit()
     if None not in (wanted, in_file) and wanted != in_file:
         raise invalid("--unit", f"{in_file}, as in {name}", wanted)
+    if wanted is None and in_file is None and clock.words.strip() not in ("", "1"):
+        got = f"'{clock.words}'; --unit says what they count"
+        raise invalid(name, "times in days or smaller units", got)
     return wanted or in_file
 
 

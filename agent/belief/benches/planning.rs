@@ -1,0 +1,125 @@
+//! Time of one step's work in the agent at the paper's size: 64 x 64 cells, 64 moves, 3 states.
+//!
+//! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::planning::team::{ROUNDS, plan_team};
+use emberwatch_belief::planning::{
+    BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
+};
+use protocol::frame::Frame;
+use protocol::grid::{Cell, Shape};
+use protocol::model::Model;
+use protocol::path::{Move, fly};
+use protocol::randomness::split_mix;
+use std::hint::black_box;
+
+const N_MOVES: usize = 64;
+
+fn shape() -> Shape {
+    Shape::new(64, 64).expect("valid shape")
+}
+
+fn filter() -> BayesFilter {
+    BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model")
+}
+
+/// An estimator that knows what 40 random walks saw, so that its belief has bumps like those of a running one.
+fn settled<E: Estimator>(mut estimator: E) -> E {
+    for step in 0..40 {
+        take_in(&mut estimator, &frame(step));
+    }
+    estimator
+}
+
+fn take_in(estimator: &mut dyn Estimator, frame: &Frame) {
+    estimator.correct(frame).expect("possible frame");
+    estimator.predict();
+}
+
+/// Observations of one of three values along a random walk from the centre.
+fn frame(step: u64) -> Frame {
+    let bits = |t: u64| split_mix(step, t) >> 62;
+    let moves: Vec<Move> = (0..512).map(|t| Move::from_low_bits(bits(t))).collect();
+    let mut frame = Frame::empty(shape());
+    for index in fly(shape(), shape().centre(), &moves)
+        .visited
+        .into_iter()
+        .take(N_MOVES)
+    {
+        frame.observe(index, (split_mix(index as u64 / 5, 0) % 3) as u8);
+    }
+    frame
+}
+
+fn planners(c: &mut Criterion) {
+    let values: CellValues = Objective::new(Target::State(2)).values(settled(filter()).belief());
+    let mut bench = |name: &str, planner: &mut dyn Planner| {
+        let mut step = 0;
+        c.bench_function(name, |b| {
+            b.iter(|| {
+                step += 1;
+                planner.plan(&PlanningProblem {
+                    start: Cell { row: 20, col: 30 },
+                    n_moves: N_MOVES,
+                    values: &values,
+                    seed: 1,
+                    step,
+                })
+            });
+        });
+    };
+    bench("random walk", &mut RandomWalk);
+    bench(
+        "shooting 2048 (authors: 1.5 s)",
+        &mut Shooting::new(2048, Default::default()),
+    );
+    bench(
+        "shooting 2048, paper preset (authors: 1.5 s)",
+        &mut Shooting::paper(),
+    );
+    for width in [50, 100, 200] {
+        bench(&format!("beam search {width}"), &mut BeamSearch::new(width));
+    }
+}
+
+fn teams(c: &mut Criterion) {
+    let values = Objective::new(Target::State(2)).values(settled(filter()).belief());
+    for n_robots in [1, 4, 8] {
+        let starts: Vec<Cell> = (0..n_robots)
+            .map(|robot| shape().cell(517 * robot + 100))
+            .collect();
+        let (mut planner, mut step) = (BeamSearch::default(), 0);
+        c.bench_function(&format!("one plan for {n_robots} robots"), |b| {
+            b.iter(|| {
+                step += 1;
+                plan_team(&mut planner, &values, &starts, N_MOVES, (1, step), ROUNDS)
+            });
+        });
+    }
+}
+
+fn estimators(c: &mut Criterion) {
+    let mut filter = settled(filter());
+    let spatial = SpatialFilter::new(self::filter(), 2, Correlations::default());
+    let mut spatial = settled(spatial);
+    let estimators: [(&str, &mut dyn Estimator); 2] = [
+        ("filter: correct + predict (authors: 120 us)", &mut filter),
+        ("spatial filter: correct + predict", &mut spatial),
+    ];
+    let frames: Vec<Frame> = (40..104).map(frame).collect();
+    for (name, estimator) in estimators {
+        let mut frames = frames.iter().cycle();
+        c.bench_function(name, |b| {
+            b.iter(|| take_in(estimator, black_box(frames.next().expect("a circle"))));
+        });
+    }
+    c.bench_function("entropy", |b| {
+        b.iter(|| filter.belief().entropy(EntropyKind::Sum))
+    });
+}
+
+criterion_group!(benches, planners, teams, estimators);
+criterion_main!(benches);

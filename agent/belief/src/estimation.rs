@@ -1,0 +1,22 @@
+//! From frames to a belief about every cell (paper sections III.A to III.C). A new estimator is one file with an
+//! [`Estimator`].
+
+pub mod bayes;
+pub mod belief;
+pub mod correlations;
+pub mod estimator;
+pub mod filter;
+mod innovation;
+pub mod parameters;
+pub mod prior;
+pub mod scoring;
+pub mod spatial;
+mod spread;
+pub mod truth;
+
+pub use bayes::ZeroEvidence;
+pub use correlations::Correlations;
+pub use estimator::{Estimator, EstimatorError, Handover, Told};
+pub use filter::BayesFilter;
+pub use prior::Prior;
+pub use spatial::SpatialFilter;

@@ -1,0 +1,193 @@
+//! The Bayes filter, for known and learned parameters (paper section III.A, in the masked form of section III.C).
+//!
+//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition turns that into
+//! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the
+//! frames, so this is an approximation even with the true model.
+
+use crate::estimation::bayes::correct;
+use crate::estimation::belief::Belief;
+use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
+use crate::estimation::parameters::Tables;
+use ndarray::{Array2, Array4};
+use protocol::frame::Frame;
+use protocol::grid::Probabilities;
+use protocol::model::{Model, ModelError};
+use protocol::transition::Transition;
+use std::borrow::Cow;
+
+/// Filter of one world.
+#[derive(Debug, Clone)]
+pub struct BayesFilter {
+    transition: Transition,
+    /// `P(y | x)`, shape `[S, O]`.
+    likelihood: Array2<f64>,
+    belief: Belief,
+    /// Where the transition writes.
+    predictor: Probabilities,
+    /// Checksum of the parameters, which give the belief its meaning.
+    checksum: u32,
+}
+
+impl BayesFilter {
+    /// A filter of a known model with the predictor `u_0`.
+    ///
+    /// # Panics
+    /// If the prior has another number of states than the model.
+    pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {
+        let expected = model.n_states();
+        assert_eq!(prior.n_states(), expected, "prior: expected other states");
+        let transition = Transition::new(model, prior.shape())?;
+        let checksum = known_checksum(model);
+        let likelihood = model.likelihood().clone();
+        Ok(Self::of(transition, likelihood, prior, checksum))
+    }
+
+    /// A filter with learned parameters and the predictor `u_0`.
+    ///
+    /// # Panics
+    /// If the prior has another number of states.
+    pub fn learned(tables: &Tables, prior: Belief) -> Self {
+        let (transition, likelihood, checksum) = parameters(tables, &prior);
+        Self::of(transition, likelihood, prior, checksum)
+    }
+
+    fn of(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
+        Self {
+            transition,
+            likelihood,
+            predictor: belief.probabilities().clone(),
+            belief,
+            checksum,
+        }
+    }
+
+    /// Takes newer learned parameters of the same dimensions; the belief stays.
+    pub fn set_tables(&mut self, tables: &Tables) {
+        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
+    }
+
+    /// The belief and `P(y | x)`, shape `[S, O]`.
+    pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
+        (&self.belief, &self.likelihood)
+    }
+
+    pub(super) fn belief_mut(&mut self) -> &mut Belief {
+        &mut self.belief
+    }
+}
+
+impl Estimator for BayesFilter {
+    /// # Panics
+    /// If the frame is of another grid or was decoded for more observations than the model has.
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        Ok(correct(&mut self.belief, &self.likelihood, frame)?)
+    }
+
+    fn predict(&mut self) {
+        let belief = self.belief.probabilities_mut();
+        self.transition.apply(belief, &mut self.predictor);
+        std::mem::swap(belief, &mut self.predictor);
+    }
+
+    /// The predictor `u_k`, or after [`Estimator::correct`] the posterior `p_k`.
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        Some(Cow::Borrowed(&self.likelihood))
+    }
+
+    fn handover(&self) -> Option<&dyn Handover> {
+        Some(self)
+    }
+
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
+        Some(self)
+    }
+}
+
+impl Handover for BayesFilter {
+    fn kind(&self) -> String {
+        let checksum = self.checksum;
+        format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        self.belief.to_bytes()
+    }
+
+    fn restore(&mut self, bytes: &[u8]) -> bool {
+        let belief = Belief::from_bytes(bytes, self.belief.probabilities().dim());
+        belief.map(|belief| self.belief = belief).is_some()
+    }
+}
+
+fn known_checksum(model: &Model) -> u32 {
+    let weights = model.kernels().iter().flatten();
+    let numbers = weights.chain(model.bias()).copied();
+    checksum(numbers, model.likelihood())
+}
+
+fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32) {
+    let dimensions = tables.dimensions;
+    let n_states = dimensions.n_states;
+    assert_eq!(belief.n_states(), n_states, "belief: expected other states");
+    let (height, width) = dimensions.kernel;
+    let n_weights = n_states * n_states * height * width;
+    let kernel = |weights: &[f32]| {
+        let weights = weights.iter().map(|&weight| f64::from(weight)).collect();
+        let kernel = Array4::from_shape_vec((n_states, n_states, height, width), weights);
+        kernel.expect("invariant: S x S kernels")
+    };
+    let kernels: Vec<_> = tables.kernel.chunks_exact(n_weights).map(kernel).collect();
+    let likelihood = tables.likelihood_array();
+    let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
+    let transition = Transition::of_weights(&kernels, &vec![0.0; n_states], belief.shape());
+    (transition, likelihood, checksum)
+}
+
+fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32 {
+    let numbers = weights.chain(likelihood.iter().copied());
+    let bytes: Vec<u8> = numbers.flat_map(f64::to_le_bytes).collect();
+    crc32fast::hash(&bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::grid::Shape;
+
+    fn frame(shape: Shape, values: &[u8]) -> Frame {
+        Frame::from_bytes(shape, 3, values).expect("test frame")
+    }
+
+    #[test]
+    fn correct_leaves_unseen_cells_unchanged() {
+        let shape = Shape::new(1, 3).expect("test shape");
+        let mut filter =
+            BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
+        filter
+            .correct(&frame(shape, &[255, 2, 255]))
+            .expect("possible");
+        let fire = filter.belief().probability(2);
+        assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
+        // .98 / (.01 + .05 + .98), the column of O for an observed fire.
+        assert!((fire[[0, 1]] - 0.98 / 1.04).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_tiny_probability_is_evidence() {
+        let shape = Shape::new(1, 1).expect("test shape");
+        let numbers = [1.0, 0.0, f32::MIN_POSITIVE];
+        let numbers = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);
+        let prior = Belief::from_probabilities(numbers).expect("valid");
+        let mut file = Model::wildfire().file().clone();
+        file.states[0].observed_as = vec![1.0, 0.0, 0.0];
+        file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
+        let mut filter =
+            BayesFilter::known(&Model::new(file).expect("valid"), prior).expect("valid");
+        filter.correct(&frame(shape, &[2])).expect("possible");
+        assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
+    }
+}

@@ -1,0 +1,357 @@
+//! The unknown parameters: free numbers that become weights `w >= 0`, rows of `O` and `u_0`.
+//!
+//! `w = softplus(kernel)`; each row of `P(y | x)` and the first belief are softmaxes. Free numbers
+//! are kept in ±[`BOUND`], so that no weight or probability vanishes and eqs. 3 and 5 never divide
+//! by zero.
+
+use crate::estimation::belief::Belief;
+use ndarray::Array2;
+use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
+use protocol::randomness::split_mix;
+use protocol::{Model, Shape};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
+pub const BOUND: f32 = 16.0;
+
+/// Weight of a cell's own state when learning starts; that of a neighbour; and what other states get
+/// of either. Chosen by what a robot can expect of something that lasts and spreads.
+const OWN_WEIGHT: f64 = 1.0;
+const NEIGHBOUR_WEIGHT: f64 = 0.1;
+const OTHER_STATE: f64 = 0.005;
+
+/// Logit by which a state is seen as its own observation when learning starts: .87 of three.
+const OWN_OBSERVATION: f32 = 2.5;
+
+/// Noise on the first logits and, relative, on the first weights: states without an observation of
+/// their own must not start alike.
+const NOISE: f32 = 0.1;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Dimensions {
+    pub n_states: usize,
+    pub n_observations: usize,
+    /// Rows and columns of the kernel, odd.
+    pub kernel: (usize, usize),
+    /// Whether each state that a cell itself can be in has a kernel of its own. The kind of a checkpoint tells it.
+    #[serde(skip)]
+    pub sees_own_state: bool,
+}
+
+/// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Parameters {
+    pub dimensions: Dimensions,
+    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
+    #[serde(skip)]
+    pub tensors: [Vec<f32>; 3],
+}
+
+/// What the free numbers stand for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tables {
+    pub dimensions: Dimensions,
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
+    pub kernel: Vec<f32>,
+    /// `P(y | x)`, shape `[S, O]`.
+    pub likelihood: Vec<f32>,
+    /// The belief about every cell before the first frame, shape `[S]`.
+    pub initial: Vec<f32>,
+}
+
+/// Dimensions that no model has.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum DimensionsError {
+    #[error("learned filter: {name}: expected {least} to {MAX_VALUES}, got {got}")]
+    Count {
+        name: &'static str,
+        least: usize,
+        got: usize,
+    },
+    #[error(
+        "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
+    )]
+    Kernel { height: usize, width: usize },
+}
+
+impl Dimensions {
+    /// Checks them against the limits of a model.
+    ///
+    /// # Errors
+    /// Names the first that is out of range.
+    pub fn check(self) -> Result<Self, DimensionsError> {
+        let counts = [
+            ("states", 2, self.n_states),
+            ("observations", 1, self.n_observations),
+        ];
+        for (name, least, got) in counts {
+            if !(least..=MAX_VALUES).contains(&got) {
+                return Err(DimensionsError::Count { name, least, got });
+            }
+        }
+        let is_side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
+        let (height, width) = self.kernel;
+        if !(is_side(height) && is_side(width)) {
+            return Err(DimensionsError::Kernel { height, width });
+        }
+        Ok(self)
+    }
+
+    /// Shapes of the tensors, in the order of [`Parameters::NAMES`].
+    pub fn shapes(&self) -> [Vec<usize>; 3] {
+        let (states, (height, width)) = (self.n_states, self.kernel);
+        let mut kernel = vec![states, states, height, width];
+        if self.sees_own_state {
+            kernel.insert(0, states);
+        }
+        [kernel, vec![states, self.n_observations], vec![states]]
+    }
+
+    /// One for all cells, or one for each state that a cell itself can be in.
+    pub fn n_kernels(&self) -> usize {
+        if self.sees_own_state {
+            self.n_states
+        } else {
+            1
+        }
+    }
+
+    pub fn lengths(&self) -> [usize; 3] {
+        self.shapes().map(|shape| shape.iter().product())
+    }
+}
+
+impl Parameters {
+    /// Names of the tensors in files and messages.
+    pub const NAMES: [&'static str; 3] = ["kernel", "likelihood", "initial"];
+
+    /// Where learning starts: states last, spread to neighbours, and look like the observation of
+    /// their own number, if there is one; alike for every state of the cell itself.
+    pub fn first(dimensions: Dimensions, seed: u64) -> Self {
+        let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
+        // Uniform in -1..1.
+        let noise = |index: usize| {
+            let bits = split_mix(seed, index as u64) >> 40;
+            NOISE * (bits as f32 / (1 << 23) as f32 - 1.0)
+        };
+        let kernel = |index| {
+            let weight = first_weight(dimensions, index) * f64::from(1.0 + noise(index));
+            weight.exp_m1().ln() as f32
+        };
+        let logit = |index: usize| {
+            let (state, seen) = (
+                index / dimensions.n_observations,
+                index % dimensions.n_observations,
+            );
+            let own = if state == seen { OWN_OBSERVATION } else { 0.0 };
+            own + noise(n_kernel + index)
+        };
+        Self {
+            dimensions,
+            tensors: [
+                (0..n_kernel).map(kernel).collect(),
+                (0..n_likelihood).map(logit).collect(),
+                vec![0.0; n_initial],
+            ],
+        }
+    }
+
+    pub fn zeros(dimensions: Dimensions) -> Self {
+        let tensors = dimensions.lengths().map(|length| vec![0.0; length]);
+        Self {
+            dimensions,
+            tensors,
+        }
+    }
+
+    pub fn tables(&self) -> Tables {
+        let [kernel, _, initial] = &self.tensors;
+        let cast = |numbers: Vec<f64>| numbers.into_iter().map(|number| number as f32).collect();
+        let weight = |&free: &f32| softplus(f64::from(free)) as f32;
+        Tables {
+            dimensions: self.dimensions,
+            kernel: kernel.iter().map(weight).collect(),
+            likelihood: cast(self.likelihood()),
+            initial: cast(softmax(initial)),
+        }
+    }
+
+    /// `P(y | x)`, shape `[S, O]`.
+    pub fn likelihood(&self) -> Vec<f64> {
+        let rows = self.tensors[1].chunks_exact(self.dimensions.n_observations);
+        rows.flat_map(softmax).collect()
+    }
+
+    /// Gradients by the free numbers from gradients by the tables.
+    pub fn chain(&self, by_tables: &[Vec<f64>; 3]) -> Self {
+        let [kernel, likelihood, initial] = &self.tensors;
+        let [by_kernel, by_likelihood, by_initial] = by_tables;
+        let slope = |(&free, by): (&f32, &f64)| (by / (1.0 + (-f64::from(free)).exp())) as f32;
+        let n_observations = self.dimensions.n_observations;
+        let rows = likelihood
+            .chunks_exact(n_observations)
+            .zip(by_likelihood.chunks_exact(n_observations));
+        Self {
+            dimensions: self.dimensions,
+            tensors: [
+                kernel.iter().zip(by_kernel).map(slope).collect(),
+                rows.flat_map(|(free, by)| softmax_gradient(free, by))
+                    .collect(),
+                softmax_gradient(initial, by_initial),
+            ],
+        }
+    }
+
+    /// The first tensor that holds a number that is not finite.
+    pub fn not_finite(&self) -> Option<&'static str> {
+        let tensors = Self::NAMES.into_iter().zip(&self.tensors);
+        let wrong = |(_, numbers): &(&str, &Vec<f32>)| !numbers.iter().all(|x| x.is_finite());
+        tensors.into_iter().find(wrong).map(|(name, _)| name)
+    }
+
+    pub fn bound(&mut self) {
+        for number in self.tensors.iter_mut().flatten() {
+            *number = number.clamp(-BOUND, BOUND);
+        }
+    }
+}
+
+impl Tables {
+    /// The learned belief before the first frame, in every cell.
+    pub fn prior(&self, shape: Shape) -> Belief {
+        Belief::everywhere(&self.initial, shape)
+    }
+
+    /// A model's own parameters: what learning would have to find. Without its bias: beliefs sum to
+    /// one, so away from the edges a bias is equal weights of all states.
+    pub fn of_model(model: &Model) -> Self {
+        let cast = |value: &f64| *value as f32;
+        let (_, _, height, width) = model.kernel().dim();
+        Self {
+            dimensions: Dimensions {
+                n_states: model.n_states(),
+                n_observations: model.n_observations(),
+                kernel: (height, width),
+                sees_own_state: model.sees_own_state(),
+            },
+            kernel: model.kernels().iter().flatten().map(cast).collect(),
+            likelihood: model.likelihood().iter().map(cast).collect(),
+            initial: model.initial().iter().map(cast).collect(),
+        }
+    }
+
+    /// `P(y | x)` as an array of shape `[S, O]`.
+    pub fn likelihood_array(&self) -> Array2<f64> {
+        let numbers = self.likelihood.iter().map(|&p| f64::from(p));
+        let dim = (self.dimensions.n_states, self.dimensions.n_observations);
+        Array2::from_shape_vec(dim, numbers.collect()).expect("invariant: S x O numbers")
+    }
+}
+
+fn first_weight(dimensions: Dimensions, index: usize) -> f64 {
+    let (height, width) = dimensions.kernel;
+    let n_taps = height * width;
+    let (pair, tap) = (index / n_taps, index % n_taps);
+    let (to, from) = (pair / dimensions.n_states, pair % dimensions.n_states);
+    let is_own = to % dimensions.n_states == from;
+    let is_centre = tap == n_taps / 2;
+    let near = if is_centre {
+        OWN_WEIGHT
+    } else {
+        NEIGHBOUR_WEIGHT
+    };
+    near * if is_own { 1.0 } else { OTHER_STATE }
+}
+
+fn softplus(free: f64) -> f64 {
+    free.max(0.0) + (-free.abs()).exp().ln_1p()
+}
+
+fn softmax(logits: &[f32]) -> Vec<f64> {
+    let largest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let exponentials = logits.iter().map(|&x| f64::from(x - largest).exp());
+    let exponentials: Vec<f64> = exponentials.collect();
+    let sum: f64 = exponentials.iter().sum();
+    exponentials.into_iter().map(|x| x / sum).collect()
+}
+
+fn softmax_gradient(logits: &[f32], by: &[f64]) -> Vec<f32> {
+    let p = softmax(logits);
+    let mean: f64 = p.iter().zip(by).map(|(p, by)| p * by).sum();
+    let gradient = p.iter().zip(by).map(|(p, by)| (p * (by - mean)) as f32);
+    gradient.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dimensions() -> Dimensions {
+        Dimensions {
+            n_states: 3,
+            n_observations: 4,
+            kernel: (3, 1),
+            sees_own_state: false,
+        }
+    }
+
+    #[test]
+    fn tables_are_distributions_and_weights() {
+        let tables = Parameters::first(dimensions(), 7).tables();
+        for row in tables.likelihood.chunks_exact(4).chain([&*tables.initial]) {
+            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
+        }
+        assert!(tables.kernel.iter().all(|&w| w > 0.0));
+        assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
+    }
+
+    #[test]
+    fn the_chain_rule_agrees_with_differences() {
+        let parameters = Parameters::first(dimensions(), 3);
+        // Any smooth function of the tables: a sum with arbitrary factors.
+        let factors: [Vec<f64>; 3] = dimensions().lengths().map(|length| {
+            let factor = |index| (index as f64 * 0.7).sin();
+            (0..length).map(factor).collect()
+        });
+        let value = |parameters: &Parameters| -> f64 {
+            let tables = parameters.tables();
+            let all = [tables.kernel, tables.likelihood, tables.initial];
+            let products = all.iter().flatten().zip(factors.iter().flatten());
+            let product = |(&table, factor): (&f32, &f64)| f64::from(table) * factor;
+            products.map(product).sum()
+        };
+        let gradient = parameters.chain(&factors);
+        for tensor in 0..3 {
+            for index in 0..parameters.tensors[tensor].len() {
+                let moved = |by: f32| {
+                    let mut moved = parameters.clone();
+                    moved.tensors[tensor][index] += by;
+                    let by = moved.tensors[tensor][index] - parameters.tensors[tensor][index];
+                    (value(&moved), f64::from(by))
+                };
+                let ((above, up), (below, down)) = (moved(1e-2), moved(-1e-2));
+                let difference = (above - below) / (up - down);
+                let got = f64::from(gradient.tensors[tensor][index]);
+                assert!(
+                    (got - difference).abs() < 1e-4,
+                    "{tensor} {index}: {got} {difference}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn dimensions_out_of_range_are_named() {
+        let check = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = dimensions();
+            change(&mut dimensions);
+            let error = dimensions.check().expect_err(words).to_string();
+            assert!(error.contains(words), "{error}");
+        };
+        check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
+        check(|it| it.n_observations = 65, "got 65");
+        check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
+    }
+}

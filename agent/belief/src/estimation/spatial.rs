@@ -1,0 +1,147 @@
+//! A Bayes filter whose corrections reach the neighbours of visited cells.
+//!
+//! The filter of eqs. 5 and 6 takes cells as independent given the frames, and corrects visited cells only. States are
+//! strongly correlated in space. Here the innovation of each visited cell is spread to its neighbourhood with learned
+//! [`Correlations`], as optimal interpolation does (Gandin 1963); the prediction stays eq. 6, and no covariance is
+//! kept from step to step.
+
+use crate::estimation::bayes::ZeroEvidence;
+use crate::estimation::belief::Belief;
+use crate::estimation::correlations::{Ages, Correlations, Evidence};
+use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
+use crate::estimation::filter::BayesFilter;
+use crate::estimation::innovation::Innovation;
+use crate::estimation::spread::Spread;
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+use ndarray::Array2;
+use protocol::Frame;
+use std::borrow::Cow;
+
+/// How ages and sums are written. The limit is more than any grid's.
+const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
+    .with_fixed_int_encoding()
+    .with_limit();
+
+/// A filter of one world whose cells inform each other.
+#[derive(Debug, Clone)]
+pub struct SpatialFilter {
+    filter: BayesFilter,
+    state: usize,
+    correlations: Correlations,
+    ages: Ages,
+    spread: Spread,
+}
+
+impl SpatialFilter {
+    /// Spreads the probability of `state`, the one that pays, with correlations learned before, or from nothing.
+    ///
+    /// # Panics
+    /// If there is no such state.
+    pub fn new(filter: BayesFilter, state: usize, correlations: Correlations) -> Self {
+        let n_states = filter.belief().n_states();
+        assert!(state < n_states, "state: expected less than {n_states}");
+        Self {
+            state,
+            correlations,
+            ages: Ages::new(filter.belief().shape().n_cells()),
+            spread: Spread::new(filter.belief().shape(), state),
+            filter,
+        }
+    }
+
+    /// Takes in what was seen at some cells, by index, one after the other; each cell once.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`]; the belief is then as it was.
+    pub fn correct_in_order(
+        &mut self,
+        seen: impl Iterator<Item = (usize, u8)>,
+    ) -> Result<(), ZeroEvidence> {
+        let (belief, likelihood) = self.filter.parts();
+        self.spread
+            .begin(belief, &self.ages, seen, &self.correlations);
+        for index in 0..self.spread.n_seen() {
+            let (cell, observed, mut states) = self.spread.prior(index, belief);
+            let innovation = Innovation::of(&states, likelihood, self.state, observed);
+            let innovation = innovation.ok_or_else(|| ZeroEvidence {
+                cell,
+                observed,
+                belief: states.iter().map(|&p| p as f32).collect(),
+            })?;
+            let seen_as = likelihood.column(usize::from(observed));
+            let all = states.iter_mut().zip(seen_as);
+            all.for_each(|(p, b)| *p *= b / innovation.evidence);
+            self.spread.spread(index, &innovation, states);
+        }
+        self.spread.end(self.filter.belief_mut(), &mut self.ages);
+        Ok(())
+    }
+}
+
+impl Estimator for SpatialFilter {
+    /// # Panics
+    /// If the frame is of another grid.
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
+        assert_eq!(dim, expected, "frame: expected the belief's grid");
+        let (belief, likelihood) = self.filter.parts();
+        let evidence = Evidence::of(frame, belief, likelihood, self.state, &self.ages);
+        self.correct_in_order(frame.observed())?;
+        self.correlations.learn(&evidence);
+        Ok(())
+    }
+
+    fn predict(&mut self) {
+        self.filter.predict();
+        self.ages.grow();
+    }
+
+    fn belief(&self) -> &Belief {
+        self.filter.belief()
+    }
+
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        self.filter.likelihood()
+    }
+
+    fn handover(&self) -> Option<&dyn Handover> {
+        Some(self)
+    }
+
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
+        Some(self)
+    }
+}
+
+impl Handover for SpatialFilter {
+    fn kind(&self) -> String {
+        let (filter, state) = (self.filter.kind(), self.state);
+        format!("spatial {filter}, ages and sums of state {state} as bincode")
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let own = bincode::serde::encode_to_vec((&self.ages, &self.correlations), FORM);
+        let own = own.expect("invariant: numbers can be encoded");
+        [self.filter.to_bytes(), own].concat()
+    }
+
+    fn restore(&mut self, bytes: &[u8]) -> bool {
+        let n_bytes = 4 * self.belief().as_slice().len();
+        let Some((belief, own)) = bytes.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let decoded = bincode::serde::decode_from_slice::<(Ages, Correlations), _>(own, FORM);
+        let Ok(((ages, correlations), n_read)) = decoded else {
+            return false;
+        };
+        let fits = n_read == own.len() && ages.as_slice().len() == self.ages.as_slice().len();
+        let is_taken = fits && self.filter.restore(belief);
+        if is_taken {
+            (self.ages, self.correlations) = (ages, correlations);
+        }
+        is_taken
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,17 @@
+//! Beliefs about a grid of hidden states that robots see in part, and plans on them. Pure: frames, seeds and
+//! steps come as arguments; no clock, no files, no logging.
+//!
+//! - [`estimation`]: from frames to a belief about every cell (paper sections III.A to III.C)
+//! - [`planning`]: from a belief to a path (paper section III.D)
+//! - [`merit`], [`brier`]: how good a run and a belief were
+
+#![allow(missing_docs, reason = "filled in below, item by item")]
+
+pub mod brier;
+pub mod estimation;
+pub mod merit;
+pub mod planning;
+
+pub use estimation::belief::{Belief, BeliefError, EntropyKind};
+pub use estimation::{BayesFilter, Estimator, EstimatorError, SpatialFilter};
+pub use planning::{Objective, Plan, Planner, PlanningProblem};

@@ -1,0 +1,104 @@
+//! What a robot remembers beside its belief: how long ago it saw each cell, and what its paths brought.
+
+use protocol::{Frame, Grid, Shape};
+use serde::{Deserialize, Serialize};
+
+/// Steps in which what is known of a cell fades to `1/e`.
+const FADING_STEPS: f32 = 300.0;
+
+/// Share of the latest reward in the running mean.
+const LATEST_SHARE: f32 = 0.2;
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    /// `exp(-age / 300)` of each cell, by the steps since it was seen; 0 before.
+    freshness: Grid<f32>,
+    pub recent: Recent,
+}
+
+/// What a robot's paths brought.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Recent {
+    /// Reward per move of the last path.
+    pub last_reward: f32,
+    /// Its running mean.
+    pub mean_reward: f32,
+    /// Paths flown.
+    pub n_paths: u64,
+}
+
+impl Memory {
+    /// Before the first frame.
+    pub fn new(shape: Shape) -> Self {
+        Self {
+            freshness: Grid::zeros(shape.dim()),
+            recent: Recent::default(),
+        }
+    }
+
+    /// Takes in the frame of the next step.
+    pub fn see(&mut self, frame: &Frame) {
+        let fading = (-1.0 / FADING_STEPS).exp();
+        self.freshness.mapv_inplace(|fresh| fresh * fading);
+        let cells = self.freshness.as_slice_mut();
+        let cells = cells.expect("invariant: grids are row-major");
+        for (cell, _) in frame.observed() {
+            cells[cell] = 1.0;
+        }
+    }
+
+    /// Takes in the reward of a path.
+    pub fn earn(&mut self, reward: f64, n_moves: usize) {
+        let recent = &mut self.recent;
+        recent.last_reward = reward as f32 / n_moves as f32;
+        recent.mean_reward += LATEST_SHARE * (recent.last_reward - recent.mean_reward);
+        recent.n_paths += 1;
+    }
+
+    /// How new each cell would be, shape `[H, W]`: 0 if it was just seen, 1 if never.
+    pub fn novelty(&self) -> Grid<f32> {
+        self.freshness.mapv(|fresh| 1.0 - fresh)
+    }
+
+    /// Whether all of it is possible on a grid.
+    pub fn is_of(&self, shape: Shape) -> bool {
+        let rewards = [self.recent.last_reward, self.recent.mean_reward];
+        self.freshness.dim() == shape.dim()
+            && self
+                .freshness
+                .iter()
+                .all(|fresh| (0.0..=1.0).contains(fresh))
+            && rewards.iter().all(|reward| reward.is_finite())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_is_new_again_as_its_visit_ages() {
+        let shape = Shape::new(1, 2).expect("test shape");
+        let mut memory = Memory::new(shape);
+        memory.see(&Frame::from_bytes(shape, 2, &[0, 255]).expect("a frame"));
+        assert_eq!(memory.novelty().as_slice(), Some(&[0.0, 1.0][..]));
+        for _ in 0..300 {
+            memory.see(&Frame::empty(shape));
+        }
+        let novelty = memory.novelty();
+        assert!((novelty[[0, 0]] - (1.0 - (-1.0_f32).exp())).abs() < 1e-4);
+        assert_eq!(novelty[[0, 1]], 1.0);
+        assert!(memory.is_of(shape));
+        assert!(!memory.is_of(Shape::new(2, 1).expect("test shape")));
+    }
+
+    #[test]
+    fn rewards_are_remembered_per_move() {
+        let mut memory = Memory::new(Shape::new(1, 1).expect("test shape"));
+        memory.earn(6.0, 12);
+        memory.earn(0.0, 12);
+        let recent = memory.recent;
+        assert_eq!((recent.last_reward, recent.n_paths), (0.0, 2));
+        assert!((recent.mean_reward - 0.08).abs() < 1e-6);
+    }
+}

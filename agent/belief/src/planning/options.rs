@@ -1,0 +1,396 @@
+//! What a high-level decision chooses among (paper section III.E): options, each a whole plan, described by what it
+//! promises. Pure.
+//!
+//! A new option is a line of [`OPTIONS`].
+
+use crate::planning::beam::BeamSearch;
+use crate::planning::objective::{BEAM_BONUS, CellValues};
+use crate::planning::outlook::{Layer, Outlook, distance};
+use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use protocol::path::fly;
+use protocol::{Cell, Grid};
+
+/// What a path is for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PathOption {
+    /// Its name in tables and files.
+    pub name: &'static str,
+    /// What a distinct cell is worth by itself, by the probability of what pays most, by its entropy, by its novelty.
+    worth: [f32; 4],
+    /// Paths that the plan looks ahead, at least 1; only the first is flown.
+    n_paths: usize,
+    /// Whose best region draws the path.
+    goal: Option<Layer>,
+}
+
+const EXPLOIT: PathOption = PathOption {
+    name: "exploit",
+    worth: [BEAM_BONUS, 1.0, 0.0, 0.0],
+    n_paths: 1,
+    goal: None,
+};
+
+/// All options, in the order of a decision's numbers.
+pub const OPTIONS: [PathOption; 8] = [
+    EXPLOIT,
+    exploit_and("exploit_entropy_0.1", 0.1),
+    exploit_and("exploit_entropy_0.3", 0.3),
+    explore("entropy", [0.0, 0.0, 1.0, 0.0]),
+    explore("coverage", [0.0, 0.0, 0.0, 1.0]),
+    PathOption {
+        name: "exploit_ahead_3",
+        n_paths: 3,
+        ..EXPLOIT
+    },
+    towards("best_region", Layer::Surplus),
+    towards("unseen_region", Layer::Novelty),
+];
+
+/// Numbers that describe an option: see [`feature_names`].
+pub const N_FEATURES: usize = 18 + OPTIONS.len();
+
+/// Number of the option that exploits, and of the one that flies to the best region.
+const EXPLOITS: usize = 0;
+const GOES: usize = 6;
+
+/// Rise in a cell's worth per cell nearer to the goal: more than any cell is worth, so the robot goes there by the way
+/// that promises most.
+const SLOPE: f32 = 0.3;
+
+/// Rows and columns around the goal's centre between which nothing draws the robot.
+const GOAL_RADIUS: usize = 2;
+
+/// Share of a region's promise that is left after a path's way there.
+pub const KEPT_PER_PATH: f32 = 0.8;
+
+/// Sums over regions are divided by these, in the order of [`Layer::ALL`].
+const REGION_SCALES: [f32; 4] = [25.0, 12.0, 169.0, 169.0];
+
+/// Mean probability of what pays over the grid, as a share of this.
+const MEAN_SCALE: f32 = 0.1;
+
+/// Steps after which no more is made of a robot's age.
+const MOST_STEPS: u64 = 200;
+
+const fn exploit_and(name: &'static str, entropy: f32) -> PathOption {
+    PathOption {
+        name,
+        worth: [BEAM_BONUS, 1.0, entropy, 0.0],
+        ..EXPLOIT
+    }
+}
+
+const fn explore(name: &'static str, worth: [f32; 4]) -> PathOption {
+    PathOption {
+        name,
+        worth,
+        ..EXPLOIT
+    }
+}
+
+const fn towards(name: &'static str, goal: Layer) -> PathOption {
+    PathOption {
+        name,
+        goal: Some(goal),
+        ..EXPLOIT
+    }
+}
+
+/// What an option would do, and what that promises.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Proposal {
+    pub plan: Plan,
+    pub features: [f32; N_FEATURES],
+}
+
+/// Plans options by beam search.
+#[derive(Debug)]
+pub struct OptionPlanner(BeamSearch);
+
+impl OptionPlanner {
+    /// `width` of the beam, at least one.
+    pub fn new(width: usize) -> Self {
+        Self(BeamSearch::new(width))
+    }
+
+    /// All options for a robot, in the order of [`OPTIONS`].
+    pub fn propose(&mut self, outlook: &Outlook, robot: Cell) -> Vec<Proposal> {
+        let facts = outlook.facts(robot);
+        let proposals = OPTIONS.iter().enumerate().map(|(index, option)| {
+            let goal = option.goal_on(outlook, robot);
+            let plan = self.plan_to(option, outlook, robot, goal);
+            let features = features(index, outlook, robot, (&plan, goal), &facts);
+            Proposal { plan, features }
+        });
+        proposals.collect()
+    }
+
+    /// The path of one option.
+    pub fn plan(&mut self, option: &PathOption, outlook: &Outlook, robot: Cell) -> Plan {
+        let goal = option.goal_on(outlook, robot);
+        self.plan_to(option, outlook, robot, goal)
+    }
+
+    fn plan_to(
+        &mut self,
+        option: &PathOption,
+        outlook: &Outlook,
+        robot: Cell,
+        goal: Option<Cell>,
+    ) -> Plan {
+        let mut plan = self.0.plan(&PlanningProblem {
+            start: robot,
+            n_moves: outlook.n_moves * option.n_paths,
+            values: &option.values(outlook, goal),
+            seed: 0,
+            step: 0,
+        });
+        plan.moves.truncate(outlook.n_moves);
+        plan
+    }
+}
+
+impl PathOption {
+    /// The number of an option.
+    pub fn index(name: &str) -> Option<usize> {
+        OPTIONS.iter().position(|option| option.name == name)
+    }
+
+    fn goal_on(&self, outlook: &Outlook, robot: Cell) -> Option<Cell> {
+        let best = |layer| outlook.best_region(layer, robot, KEPT_PER_PATH);
+        self.goal.map(best)
+    }
+
+    /// What the cells are worth on the way to a goal.
+    fn values(&self, outlook: &Outlook, goal: Option<Cell>) -> CellValues {
+        let [bonus, probability, entropy, novelty] = self.worth;
+        let mut value: Grid<f32> = outlook.layer(Layer::Probability) * probability;
+        for (weight, layer) in [(entropy, Layer::Entropy), (novelty, Layer::Novelty)] {
+            if weight != 0.0 {
+                value.scaled_add(weight, outlook.layer(layer));
+            }
+        }
+        if let Some(goal) = goal {
+            let (height, width) = value.dim();
+            for ((row, col), value) in value.indexed_iter_mut() {
+                let away = |at: usize, goal: usize| at.abs_diff(goal).saturating_sub(GOAL_RADIUS);
+                let away = away(row, goal.row) + away(col, goal.col);
+                *value += SLOPE * (height + width - away) as f32;
+            }
+        }
+        CellValues::new(value, bonus)
+    }
+}
+
+impl Outlook {
+    /// What of a moment holds for all options.
+    fn facts(&self, robot: Cell) -> [f32; 6] {
+        let surplus = |centre| self.around(Layer::Surplus, centre) / REGION_SCALES[1];
+        let best = self.centres().map(surplus).fold(0.0, f32::max);
+        let mean = self.total(Layer::Probability) / self.shape().n_cells() as f32;
+        [
+            best,
+            surplus(robot),
+            mean / MEAN_SCALE,
+            self.recent.last_reward,
+            self.recent.mean_reward,
+            self.recent.n_paths.min(MOST_STEPS) as f32 / MOST_STEPS as f32,
+        ]
+    }
+}
+
+/// What an option's path promises, from a robot's cell to its end and its goal.
+fn features(
+    index: usize,
+    outlook: &Outlook,
+    robot: Cell,
+    (plan, goal): (&Plan, Option<Cell>),
+    facts: &[f32; 6],
+) -> [f32; N_FEATURES] {
+    let flight = fly(outlook.shape(), robot, &plan.moves);
+    let on_path = [Layer::Probability, Layer::Entropy, Layer::Novelty].map(|layer| {
+        let cells = outlook.layer(layer).as_slice();
+        let cells = cells.expect("invariant: grids are row-major");
+        let sum: f32 = flight.visited.iter().map(|&cell| cells[cell]).sum();
+        sum / outlook.n_moves as f32
+    });
+    let goal = goal.unwrap_or(flight.end);
+    let region =
+        |at| Layer::ALL.map(|layer| outlook.around(layer, at) / REGION_SCALES[layer as usize]);
+    let (height, width) = outlook.shape().dim();
+    let distance = robot.row.abs_diff(goal.row) as f32 / height as f32
+        + robot.col.abs_diff(goal.col) as f32 / width as f32;
+    let mut features = [0.0; N_FEATURES];
+    let numbers = on_path
+        .into_iter()
+        .chain(region(flight.end))
+        .chain(region(goal));
+    let numbers = numbers.chain([distance]).chain(facts.iter().copied());
+    features
+        .iter_mut()
+        .zip(numbers)
+        .for_each(|(feature, number)| *feature = number);
+    features[N_FEATURES - OPTIONS.len() + index] = 1.0;
+    features
+}
+
+/// A name for each number: means over the path's distinct cells of probability of what pays, entropy and novelty;
+/// sums over the regions at its end and at its goal; the way to the goal in sides of the grid; the best region, the
+/// robot's own, the grid's mean; the last reward per move, its running mean, paths flown; which option it is.
+pub fn feature_names() -> Vec<String> {
+    let layers = ["probability", "surplus", "entropy", "novelty"];
+    let path = ["probability", "entropy", "novelty"].map(|layer| format!("path_{layer}"));
+    let regions = ["end", "goal"].into_iter();
+    let regions = regions.flat_map(|at| layers.map(|layer| format!("{at}_{layer}")));
+    let facts = [
+        "goal_distance",
+        "best_surplus",
+        "own_surplus",
+        "mean_probability",
+        "last_reward",
+        "mean_reward",
+        "n_paths",
+    ];
+    let options = OPTIONS.iter().map(|option| format!("is_{}", option.name));
+    let names = path.into_iter().chain(regions);
+    names
+        .chain(facts.map(String::from))
+        .chain(options)
+        .collect()
+}
+
+/// A rule by hand: the best region if it promises more, less its way, than what is around the robot; else exploits.
+pub fn choose_by_rule(outlook: &Outlook, robot: Cell) -> &'static PathOption {
+    let goal = outlook.best_region(Layer::Surplus, robot, KEPT_PER_PATH);
+    let n_paths = distance(robot, goal) as f32 / outlook.n_moves as f32;
+    let away = outlook.around(Layer::Surplus, goal) * KEPT_PER_PATH.powf(n_paths);
+    let here = outlook.around(Layer::Surplus, robot);
+    &OPTIONS[if away > here { GOES } else { EXPLOITS }]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::belief::Belief;
+    use crate::planning::memory::Memory;
+    use protocol::randomness::split_mix;
+    use protocol::{Frame, Move, Probabilities, Shape};
+
+    fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
+        let shape = Shape::new(height, width).expect("test shape");
+        let number = |at: usize| (split_mix(5, at as u64) % 1000) as f32 / 1000.0;
+        let fire = |row, col| number(row * width + col).powi(3);
+        let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
+            if state == 1 {
+                fire(row, col)
+            } else {
+                1.0 - fire(row, col)
+            }
+        });
+        let belief = Belief::from_probabilities(numbers).expect("valid");
+        let mut memory = Memory::new(shape);
+        let mut frame = Frame::empty(shape);
+        (0..shape.n_cells())
+            .step_by(3)
+            .for_each(|cell| frame.observe(cell, 0));
+        memory.see(&frame);
+        memory.earn(3.0, n_moves);
+        Outlook::new(&belief, 1, &memory, n_moves)
+    }
+
+    /// The best score of all paths.
+    fn best_of_all(values: &CellValues, start: Cell, n_moves: usize) -> f32 {
+        let paths = (0..4_u64.pow(n_moves as u32)).map(|code| {
+            let moves = (0..n_moves).map(|at| Move::from_low_bits(code >> (2 * at)));
+            values.score(start, &moves.collect::<Vec<_>>())
+        });
+        paths.fold(f32::NEG_INFINITY, f32::max)
+    }
+
+    #[test]
+    fn each_option_flies_the_best_of_all_paths() {
+        let mut planner = OptionPlanner::new(2000);
+        for (height, width) in [(1, 4), (5, 3), (30, 40)] {
+            let outlook = outlook(height, width, 3);
+            let robot = Cell {
+                row: height / 2,
+                col: 1,
+            };
+            for option in &OPTIONS {
+                let goal = option.goal_on(&outlook, robot);
+                let values = option.values(&outlook, goal);
+                let plan = planner.plan(option, &outlook, robot);
+                assert_eq!(plan.moves.len(), 3);
+                let best = best_of_all(&values, robot, 3 * option.n_paths.min(2));
+                let is_best = (plan.score - best).abs() < 1e-3 * best.abs().max(1.0);
+                assert!(
+                    is_best || option.n_paths > 2 && plan.score > best,
+                    "{}",
+                    option.name
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn goals_draw_the_robot_whatever_lies_on_its_way() {
+        let mut planner = OptionPlanner::new(30);
+        let (outlook, robot) = (outlook(40, 40, 6), Cell { row: 20, col: 20 });
+        for option in OPTIONS.iter().filter(|option| option.goal.is_some()) {
+            let goal = option.goal_on(&outlook, robot).expect("a goal");
+            let plan = planner.plan(option, &outlook, robot);
+            let end = fly(outlook.shape(), robot, &plan.moves).end;
+            let left = distance(robot, goal).saturating_sub(6 + 2 * GOAL_RADIUS);
+            assert!(
+                distance(end, goal) <= left + 2 * GOAL_RADIUS,
+                "{}: {end} {goal}",
+                option.name
+            );
+            assert!(distance(robot, goal) > 3);
+        }
+    }
+
+    #[test]
+    fn every_feature_has_a_name_and_is_of_its_path() {
+        let names = feature_names();
+        let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
+        assert_eq!((names.len(), distinct.len()), (N_FEATURES, N_FEATURES));
+        assert_eq!(N_FEATURES, 26);
+        let (outlook, robot) = (outlook(20, 30, 5), Cell { row: 3, col: 4 });
+        let proposals = OptionPlanner::new(30).propose(&outlook, robot);
+        for (index, proposal) in proposals.iter().enumerate() {
+            let feature = |name: &str| {
+                let at = names.iter().position(|known| known == name);
+                proposal.features[at.expect(name)]
+            };
+            let flight = fly(outlook.shape(), robot, &proposal.plan.moves);
+            let novelty = flight.visited.iter().filter(|cell| *cell % 3 != 0).count();
+            assert!((feature("path_novelty") - novelty as f32 / 5.0).abs() < 1e-3);
+            let end = outlook.around(Layer::Entropy, flight.end) / 169.0;
+            assert_eq!(feature("end_entropy"), end);
+            let option = &OPTIONS[index];
+            let goal = option.goal_on(&outlook, robot).unwrap_or(flight.end);
+            let away = robot.row.abs_diff(goal.row) as f32 / 20.0;
+            let away = away + robot.col.abs_diff(goal.col) as f32 / 30.0;
+            assert!((feature("goal_distance") - away).abs() < 1e-6);
+            assert_eq!(feature("last_reward"), 0.6);
+            assert!(feature("best_surplus") >= feature("own_surplus"));
+            let chosen: Vec<f32> = proposal.features[18..].to_vec();
+            assert_eq!(chosen.iter().sum::<f32>(), 1.0);
+            assert_eq!(feature(&format!("is_{}", option.name)), 1.0);
+        }
+    }
+
+    #[test]
+    fn the_rule_leaves_for_a_better_region_only() {
+        let shape = Shape::new(40, 40).expect("test shape");
+        let choice = |row: usize| {
+            let mut states = Grid::zeros((40, 40));
+            states[[row, 5]] = 1;
+            let belief = Belief::from_states(&states, 2).expect("valid states");
+            let outlook = Outlook::new(&belief, 1, &Memory::new(shape), 6);
+            choose_by_rule(&outlook, Cell { row: 3, col: 5 }).name
+        };
+        assert_eq!([choice(4), choice(35)], ["exploit", "best_region"]);
+    }
+}

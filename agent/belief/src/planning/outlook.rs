@@ -1,0 +1,215 @@
+//! What each cell of the grid promises a robot, and each region around a cell.
+
+use crate::estimation::belief::{Belief, EntropyKind};
+use crate::planning::memory::{Memory, Recent};
+use ndarray::Zip;
+use protocol::{Cell, Grid, Shape};
+
+/// A region is the cells within so many rows and columns of its centre, cut at the grid's edge.
+pub const REGION_RADIUS: usize = 6;
+
+/// Rows and columns from one region's centre to the next, where regions are compared.
+const CENTRE_STRIDE: usize = 4;
+
+/// Probability of the state that pays beyond which a cell counts as worth flying to.
+const LIKELY: f32 = 0.3;
+
+/// What of a cell counts, from 0 to 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Layer {
+    /// Probability of the state that pays most.
+    Probability,
+    /// What that exceeds .3 by.
+    Surplus,
+    /// Entropy of the belief, as a share of the greatest.
+    Entropy,
+    /// [`Memory::novelty`].
+    Novelty,
+}
+
+impl Layer {
+    pub const ALL: [Self; 4] = [
+        Self::Probability,
+        Self::Surplus,
+        Self::Entropy,
+        Self::Novelty,
+    ];
+}
+
+/// The layers of a moment, with their sums over regions.
+#[derive(Debug, Clone)]
+pub struct Outlook {
+    shape: Shape,
+    layers: [Grid<f32>; 4],
+    sums: [Sums; 4],
+    /// Paths are this long.
+    pub n_moves: usize,
+    /// What the robot's paths brought.
+    pub recent: Recent,
+}
+
+/// Sums over all rectangles from the top left cell (a summed-area table), shape `[H + 1, W + 1]`.
+#[derive(Debug, Clone)]
+struct Sums(Grid<f64>);
+
+impl Outlook {
+    /// `target`: the state that pays most.
+    pub fn new(belief: &Belief, target: usize, memory: &Memory, n_moves: usize) -> Self {
+        let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
+        let probability = belief.probability(target).to_owned();
+        let surplus = probability.mapv(|p| (p - LIKELY).max(0.0));
+        let entropy = belief.entropy(EntropyKind::Sum) / greatest;
+        let layers = [probability, surplus, entropy, memory.novelty()];
+        Self {
+            shape: belief.shape(),
+            sums: layers.each_ref().map(Sums::of),
+            layers,
+            n_moves,
+            recent: memory.recent,
+        }
+    }
+
+    /// The same, with nothing to gain at cells that another robot visits.
+    pub fn without(mut self, taken: &[usize]) -> Self {
+        for layer in &mut self.layers {
+            let cells = layer.as_slice_mut();
+            let cells = cells.expect("invariant: grids are row-major");
+            taken.iter().for_each(|&cell| cells[cell] = 0.0);
+        }
+        self.sums = self.layers.each_ref().map(Sums::of);
+        self
+    }
+
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// A layer's cells, shape `[H, W]`.
+    pub fn layer(&self, layer: Layer) -> &Grid<f32> {
+        &self.layers[layer as usize]
+    }
+
+    /// The sum of a layer over the grid.
+    pub fn total(&self, layer: Layer) -> f32 {
+        let (height, width) = self.shape.dim();
+        self.sums[layer as usize].0[[height, width]] as f32
+    }
+
+    /// The sum of a layer over the region around a cell.
+    pub fn around(&self, layer: Layer, centre: Cell) -> f32 {
+        let (height, width) = self.shape.dim();
+        let first = |at: usize| at.saturating_sub(REGION_RADIUS);
+        let end = |at: usize, side: usize| (at + REGION_RADIUS + 1).min(side);
+        let (top, left) = (first(centre.row), first(centre.col));
+        let (bottom, right) = (end(centre.row, height), end(centre.col, width));
+        let sums = &self.sums[layer as usize].0;
+        let sum = sums[[bottom, right]] - sums[[top, right]] - sums[[bottom, left]];
+        (sum + sums[[top, left]]).max(0.0) as f32
+    }
+
+    /// Centres of the regions that are compared.
+    pub fn centres(&self) -> impl Iterator<Item = Cell> + use<> {
+        let (height, width) = self.shape.dim();
+        let along = |side: usize| ((CENTRE_STRIDE / 2).min(side - 1)..side).step_by(CENTRE_STRIDE);
+        along(height).flat_map(move |row| along(width).map(move |col| Cell { row, col }))
+    }
+
+    /// The centre of the best region beyond half a path, where each path of the way there costs a share; the robot's
+    /// own cell if none promises anything.
+    pub fn best_region(&self, layer: Layer, robot: Cell, kept_per_path: f32) -> Cell {
+        let mut best = (0.0, robot);
+        for centre in self.centres() {
+            let distance = distance(robot, centre);
+            if distance <= self.n_moves / 2 {
+                continue;
+            }
+            let n_paths = distance as f32 / self.n_moves as f32;
+            let promise = self.around(layer, centre) * kept_per_path.powf(n_paths);
+            if promise > best.0 {
+                best = (promise, centre);
+            }
+        }
+        best.1
+    }
+}
+
+/// Moves from one cell to another.
+pub fn distance(from: Cell, to: Cell) -> usize {
+    from.row.abs_diff(to.row) + from.col.abs_diff(to.col)
+}
+
+impl Sums {
+    fn of(layer: &Grid<f32>) -> Self {
+        let (height, width) = layer.dim();
+        let mut sums = Grid::zeros((height + 1, width + 1));
+        let mut above = vec![0.0; width];
+        for (row, cells) in layer.rows().into_iter().enumerate() {
+            let mut sum = 0.0;
+            let below = sums.slice_mut(ndarray::s![row + 1, 1..]);
+            Zip::from(below)
+                .and(&cells)
+                .and(&mut above[..])
+                .for_each(|below, &cell, above| {
+                    sum += f64::from(cell);
+                    *above += sum;
+                    *below = *above;
+                });
+        }
+        Self(sums)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outlook(height: usize, width: usize) -> Outlook {
+        let shape = Shape::new(height, width).expect("test shape");
+        let random =
+            |(row, col)| (protocol::randomness::split_mix(row as u64, col as u64) % 3) as u8;
+        let states = Grid::from_shape_fn((height, width), random);
+        let belief = Belief::from_states(&states, 3).expect("valid states");
+        Outlook::new(&belief, 2, &Memory::new(shape), 12)
+    }
+
+    #[test]
+    fn sums_around_a_cell_are_those_of_its_region() {
+        for (height, width) in [(1, 1), (3, 20), (20, 15), (64, 64)] {
+            let outlook = outlook(height, width);
+            let cells = |layer| outlook.layer(layer).indexed_iter();
+            for centre in outlook.centres().chain([outlook.shape().cell(0)]) {
+                let near = |(row, col): (usize, usize)| {
+                    row.abs_diff(centre.row) <= 6 && col.abs_diff(centre.col) <= 6
+                };
+                for layer in Layer::ALL {
+                    let region = cells(layer).filter(|(at, _)| near(*at));
+                    let expected: f32 = region.map(|(_, value)| value).sum();
+                    let got = outlook.around(layer, centre);
+                    assert!((got - expected).abs() < 1e-3, "{centre}: {got} {expected}");
+                }
+            }
+            let total: f32 = cells(Layer::Probability).map(|(_, value)| value).sum();
+            assert!((outlook.total(Layer::Probability) - total).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn the_best_region_is_away_and_worth_its_way() {
+        let shape = Shape::new(64, 64).expect("test shape");
+        let mut states = Grid::zeros((64, 64));
+        // Two fires: one cell near, two cells two paths further away.
+        for (row, col) in [(2, 20), (40, 50), (41, 50)] {
+            states[[row, col]] = 2;
+        }
+        let belief = Belief::from_states(&states, 3).expect("valid states");
+        let outlook = Outlook::new(&belief, 2, &Memory::new(shape), 12);
+        let robot = Cell { row: 2, col: 2 };
+        let best = |kept| outlook.best_region(Layer::Surplus, robot, kept);
+        assert!(distance(best(1.0), Cell { row: 40, col: 50 }) <= 12);
+        assert!(distance(best(0.5), Cell { row: 2, col: 20 }) <= 12);
+        assert_eq!(outlook.best_region(Layer::Entropy, robot, 1.0), robot);
+        let there = Cell { row: 40, col: 50 };
+        let left = outlook.without(&[40 * 64 + 50, 41 * 64 + 50]);
+        assert!(distance(left.best_region(Layer::Surplus, robot, 1.0), there) > 12);
+    }
+}

@@ -1,0 +1,203 @@
+//! Random shooting: the best of N uniformly random move sequences (the end of paper section III.D).
+
+use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use crate::planning::reach::Reach;
+use protocol::grid::{Cell, Shape};
+use protocol::path::Move;
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+use serde::{Deserialize, Serialize};
+
+/// The paper's N: 2048 samples.
+pub const PAPER_SAMPLES: usize = 2048;
+
+/// Moves in one word of random bits.
+const MOVES_PER_WORD: usize = 32;
+
+/// Samples whose positions are computed side by side: two SSE registers of `i16`.
+const LANES: usize = 16;
+
+/// Row and column that each [`Move`] adds, in the order of its wire value.
+const OFFSETS: [(i32, i32); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
+
+/// How a sample's moves become cells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Integration {
+    /// Each move is clamped to the grid on its own: what the robot does.
+    #[default]
+    ClampEachMove,
+    /// The moves are added up without regard to the grid and each sum is clamped, as in the authors'
+    /// code. A sample that leaves the grid by five cells stays at the border until it has come back
+    /// five; the robot is sent against the border instead, to the same cells.
+    ClampSum,
+}
+
+/// Random shooting; ties go to the sample drawn first.
+#[derive(Debug)]
+pub struct Shooting {
+    n_samples: usize,
+    integration: Integration,
+    reach: Reach,
+    slots: Vec<Slot>,
+    stamp: u32,
+    /// Random bits of [`LANES`] samples, sample by sample.
+    words: Vec<u64>,
+    /// The cells that these samples visit, move by move.
+    cells: Vec<[(i16, i16); LANES]>,
+}
+
+/// A cell of the reach, with all that a visit reads or writes in one place.
+#[derive(Debug, Clone, Copy)]
+struct Slot {
+    /// As in [`Reach::gains`].
+    gains: [f32; 2],
+    /// The sample that was last here.
+    stamp: u32,
+}
+
+impl Integration {
+    /// The moves that take the robot, which clamps each move, over the cells of a sample.
+    ///
+    /// Clamped sums follow each other at a distance of one cell or none. Where there is none the sum
+    /// is beyond a border, so the robot flies against that border to stay in place.
+    pub fn as_flown(self, shape: Shape, start: Cell, sampled: &[Move]) -> Vec<Move> {
+        if self == Self::ClampEachMove {
+            return sampled.to_vec();
+        }
+        let (bottom, right) = (shape.height() as i32 - 1, shape.width() as i32 - 1);
+        let clamp = |(row, col): (i32, i32)| (row.clamp(0, bottom), col.clamp(0, right));
+        let mut sum = (start.row as i32, start.col as i32);
+        let fly = |&step: &Move| {
+            let before = clamp(sum);
+            let offset = OFFSETS[step as usize];
+            sum = (sum.0 + offset.0, sum.1 + offset.1);
+            match step {
+                _ if clamp(sum) != before => step,
+                Move::Up | Move::Down if before.0 == 0 => Move::Up,
+                Move::Up | Move::Down => Move::Down,
+                Move::Left | Move::Right if before.1 == 0 => Move::Left,
+                Move::Left | Move::Right => Move::Right,
+            }
+        };
+        sampled.iter().map(fly).collect()
+    }
+}
+
+impl Shooting {
+    /// Shooting with `n_samples` samples, at least one.
+    pub fn new(n_samples: usize, integration: Integration) -> Self {
+        assert!(n_samples > 0, "shooting: expected at least one sample");
+        Self {
+            n_samples,
+            integration,
+            reach: Reach::default(),
+            slots: Vec::new(),
+            stamp: 0,
+            words: Vec::new(),
+            cells: Vec::new(),
+        }
+    }
+
+    /// What the authors' code does: 2048 samples, clamped after the sum. Its objective is
+    /// [`super::Objective::paper`].
+    pub fn paper() -> Self {
+        Self::new(PAPER_SAMPLES, Integration::ClampSum)
+    }
+
+    fn prepare(&mut self, problem: &PlanningProblem<'_>) {
+        self.reach.look_at(problem);
+        let slot = |&gains| Slot { gains, stamp: 0 };
+        self.slots.clear();
+        self.slots.extend(self.reach.gains.iter().map(slot));
+        self.stamp = 0;
+        self.words.clear();
+        self.words
+            .resize(LANES * problem.n_moves.div_ceil(MOVES_PER_WORD), 0);
+        self.cells.clear();
+        self.cells.resize(problem.n_moves, [(0, 0); LANES]);
+    }
+
+    /// Fills in the cells of [`LANES`] samples, two bits a move from the low end of each word.
+    ///
+    /// All lanes do the same arithmetic on `i16`, which the compiler turns into vector instructions.
+    fn integrate<const CLAMP_SUM: bool>(&mut self) {
+        let Reach {
+            rows, cols, start, ..
+        } = self.reach;
+        let (bottom, right) = (rows as i16 - 1, cols as i16 - 1);
+        let (mut row, mut col) = ([start.0 as i16; LANES], [start.1 as i16; LANES]);
+        let n_words = self.words.len() / LANES;
+        let mut bits = [0_u16; LANES];
+        for (t, cells) in self.cells.iter_mut().enumerate() {
+            if t % 8 == 0 {
+                let (word, shift) = (t / MOVES_PER_WORD, 2 * (t % MOVES_PER_WORD));
+                bits =
+                    std::array::from_fn(|lane| (self.words[lane * n_words + word] >> shift) as u16);
+            }
+            for lane in 0..LANES {
+                // The offsets of `OFFSETS`: -1 or 1, to the row if the higher bit is zero.
+                let offset = 2 * (bits[lane] & 1) as i16 - 1;
+                let along_rows = (bits[lane] >> 1 & 1) as i16 - 1;
+                bits[lane] >>= 2;
+                row[lane] += offset & along_rows;
+                col[lane] += offset & !along_rows;
+                let inside = (row[lane].max(0).min(bottom), col[lane].max(0).min(right));
+                if !CLAMP_SUM {
+                    (row[lane], col[lane]) = inside;
+                }
+                cells[lane] = inside;
+            }
+        }
+    }
+
+    /// Score of the sample in one lane.
+    ///
+    /// Whether a cell is new is as random as the moves, so it must not become a branch (3.5 times as
+    /// slow, measured), which the compiler makes of an `if` or a mask here: it is an index.
+    fn score(&mut self, lane: usize) -> f32 {
+        self.stamp += 1;
+        let mut score = 0.0;
+        for cells in &self.cells {
+            let (row, col) = cells[lane];
+            let slot = &mut self.slots[row as usize * self.reach.cols + col as usize];
+            score += slot.gains[usize::from(slot.stamp == self.stamp)];
+            slot.stamp = self.stamp;
+        }
+        score
+    }
+
+    /// The random bits of the best sample, and its score.
+    fn best<const CLAMP_SUM: bool>(&mut self, problem: &PlanningProblem<'_>) -> (Vec<u64>, f32) {
+        let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
+        let n_words = self.words.len() / LANES;
+        let (mut best, mut best_score) = (vec![0; n_words], f32::NEG_INFINITY);
+        for first in (0..self.n_samples).step_by(LANES) {
+            self.words.fill_with(|| rng.next_u64());
+            self.integrate::<CLAMP_SUM>();
+            for lane in 0..LANES.min(self.n_samples - first) {
+                let score = self.score(lane);
+                if score > best_score {
+                    best_score = score;
+                    best.copy_from_slice(&self.words[lane * n_words..][..n_words]);
+                }
+            }
+        }
+        (best, best_score)
+    }
+}
+
+impl Planner for Shooting {
+    fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
+        self.prepare(problem);
+        let (words, score) = match self.integration {
+            Integration::ClampEachMove => self.best::<false>(problem),
+            Integration::ClampSum => self.best::<true>(problem),
+        };
+        let bits = |t: usize| words[t / MOVES_PER_WORD] >> (2 * (t % MOVES_PER_WORD));
+        let sampled = (0..problem.n_moves).map(|t| Move::from_low_bits(bits(t)));
+        let (shape, sampled) = (problem.values.shape(), sampled.collect::<Vec<_>>());
+        let moves = self.integration.as_flown(shape, problem.start, &sampled);
+        Plan { moves, score }
+    }
+}

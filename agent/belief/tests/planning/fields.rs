@@ -1,0 +1,91 @@
+//! Random problems.
+
+use emberwatch_belief::Belief;
+use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
+use proptest::prelude::*;
+use protocol::randomness::split_mix;
+use protocol::{Cell, Move, Probabilities, Shape};
+
+/// Seed and step of the planners' random numbers.
+pub const RANDOM: (u64, u64) = (3, 5);
+
+/// A belief of random numbers about two states, and where the robots start.
+#[derive(Debug, Clone)]
+pub struct Field {
+    pub belief: Belief,
+    pub starts: Vec<Cell>,
+    pub n_moves: usize,
+}
+
+impl Field {
+    pub fn new(shape: Shape, starts: Vec<Cell>, n_moves: usize, seed: u64) -> Self {
+        let (height, width) = shape.dim();
+        let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
+            let index = shape.index(Cell { row, col }) as u64;
+            let p = (split_mix(seed, index) >> 40) as f32 / (1 << 24) as f32;
+            if state == 0 { p } else { 1.0 - p }
+        });
+        Self {
+            belief: Belief::from_probabilities(numbers).expect("on the simplex"),
+            starts,
+            n_moves,
+        }
+    }
+
+    pub fn values(&self) -> CellValues {
+        Objective::new(Target::State(0)).values(&self.belief)
+    }
+
+    /// That of the first robot.
+    pub fn problem<'a>(&self, values: &'a CellValues) -> PlanningProblem<'a> {
+        PlanningProblem {
+            start: self.starts[0],
+            n_moves: self.n_moves,
+            values,
+            seed: RANDOM.0,
+            step: RANDOM.1,
+        }
+    }
+}
+
+pub fn fields(
+    max_side: usize,
+    max_moves: usize,
+    max_robots: usize,
+) -> impl Strategy<Value = Field> {
+    let sides = (1..=max_side, 1..=max_side);
+    let sized = sides.prop_flat_map(move |(height, width)| {
+        let start = (0..height, 0..width).prop_map(|(row, col)| Cell { row, col });
+        let starts = prop::collection::vec(start, 1..=max_robots);
+        (Just((height, width)), starts, 0..=max_moves, any::<u64>())
+    });
+    sized.prop_map(|((height, width), starts, n_moves, seed)| {
+        let shape = Shape::new(height, width).expect("valid sides");
+        Field::new(shape, starts, n_moves, seed)
+    })
+}
+
+pub fn objectives() -> impl Strategy<Value = Objective> {
+    let targets = prop_oneof![
+        Just(Target::State(0)),
+        Just(Target::Entropy),
+        Just(Target::Coverage),
+    ];
+    let objectives = (targets, any::<bool>(), 0.0..2.0_f32);
+    objectives.prop_map(|(target, revisits, coverage_bonus)| Objective {
+        revisits,
+        coverage_bonus,
+        ..Objective::new(target)
+    })
+}
+
+/// All paths of so many moves.
+pub fn paths(n_moves: usize) -> Vec<Vec<Move>> {
+    let path = |code: u64| {
+        let moves = 0..n_moves;
+        moves
+            .map(|t| Move::from_low_bits(code >> (2 * t)))
+            .collect()
+    };
+    (0..1_u64 << (2 * n_moves)).map(path).collect()
+}

@@ -1,0 +1,58 @@
+//! Connections of this program, and what a server tells on one without a lease.
+
+use crate::client::errors::is_away;
+use protocol::Connection;
+use protocol::channels::Instance;
+use protocol::client::STEP_TIMEOUT;
+use protocol::connection::{ConnectionError, unexpected};
+use protocol::control::{Reply, Request};
+use std::time::{Duration, Instant};
+
+/// How long to wait between attempts to reach a server that is away.
+pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
+
+pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
+    let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
+    Connection::open(instance, name, STEP_TIMEOUT)
+}
+
+/// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
+/// one: not once `is_over`.
+pub fn wait_for_server(
+    instance: &Instance,
+    limit: Duration,
+    is_over: impl Fn() -> bool,
+) -> Result<bool, ConnectionError> {
+    let (start, mut is_told) = (Instant::now(), false);
+    while !is_over() {
+        match connect(instance) {
+            Ok(_) => return Ok(true),
+            Err(error) if is_away(&error) && start.elapsed() < limit => {
+                if !is_told {
+                    tracing::info!("{error}; waiting for it, {limit:?} at most");
+                }
+                is_told = true;
+            }
+            Err(error) => return Err(error),
+        }
+        let left = limit.saturating_sub(start.elapsed());
+        std::thread::sleep(RETRY_INTERVAL.min(left));
+    }
+    Ok(false)
+}
+
+/// Whether a belief of a kind was left for a robot's agent about its world as it stands; needs no lease.
+pub fn is_belief_left(
+    instance: &Instance,
+    robot: u32,
+    kind: &str,
+) -> Result<bool, ConnectionError> {
+    let mut connection = connect(instance)?;
+    let request = Request::Belief { robot, offset: 0 };
+    match connection.control(&request, STEP_TIMEOUT) {
+        Ok(Reply::Belief { info, .. }) => Ok(info.kind == kind),
+        Ok(other) => Err(unexpected("belief", &other)),
+        Err(ConnectionError::Refused { .. }) => Ok(false),
+        Err(error) => Err(error),
+    }
+}

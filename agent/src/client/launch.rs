@@ -1,0 +1,177 @@
+//! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
+
+use anyhow::{Context, Result, bail, ensure};
+use protocol::channels::Instance;
+use protocol::connection::Connection;
+use std::collections::hash_map::RandomState;
+use std::hash::BuildHasher;
+use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
+use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// How long a server may take to answer its first hello.
+const START_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// How long it may take to stop before it is killed.
+const STOP_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// A running server of ours; dropping it stops it.
+pub struct OwnServer {
+    instance: Instance,
+    program: OwnProgram,
+}
+
+/// A running dashboard of ours; dropping it stops it.
+pub struct OwnDashboard {
+    url: String,
+    _program: OwnProgram,
+}
+
+/// A child process; dropping it stops it.
+struct OwnProgram(Child);
+
+impl OwnServer {
+    /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
+    /// it answers. It ends with this process, however that ends.
+    pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self> {
+        // A process of this number may have one in another container that shares /dev/shm.
+        let random = RandomState::new().hash_one(0);
+        let instance = Instance::new(&format!("private-{}-{random:016x}", std::process::id()))?;
+        let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
+        command
+            .args(["--instance", instance.name()])
+            .args(arguments);
+        let program = OwnProgram::start(&mut command)?;
+        let mut server = Self { instance, program };
+        server.wait_until_it_answers()?;
+        Ok(server)
+    }
+
+    pub fn instance(&self) -> &Instance {
+        &self.instance
+    }
+
+    fn wait_until_it_answers(&mut self) -> Result<()> {
+        let deadline = Instant::now() + START_TIMEOUT;
+        loop {
+            match Connection::open(
+                &self.instance,
+                "emberwatch-agent (starting)",
+                Duration::from_secs(1),
+            ) {
+                Ok(connection) => {
+                    let (instance, pid) = (self.instance.name(), connection.info().pid);
+                    let expected = self.program.0.id();
+                    ensure!(
+                        pid == expected,
+                        "instance {instance}: expected the server that was started, pid {expected}, got pid {pid}"
+                    );
+                    return Ok(());
+                }
+                Err(error) if Instant::now() > deadline => return Err(error.into()),
+                Err(_) => std::thread::sleep(Duration::from_millis(10)),
+            }
+            if let Ok(Some(status)) = self.program.0.try_wait() {
+                bail!("the server ended with {status} before it served");
+            }
+        }
+    }
+}
+
+impl OwnDashboard {
+    /// Starts `emberwatch-dashboard` for an instance; browsers reach its page at `address`. It ends with this
+    /// process, however that ends.
+    pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self> {
+        let mut command = private(beside_this("emberwatch-dashboard"));
+        let address = address.to_string();
+        command
+            .args([
+                "--instance",
+                instance.name(),
+                "--listen",
+                &address,
+                "--open",
+            ])
+            .stdout(Stdio::piped());
+        let mut program = OwnProgram::start(&mut command)?;
+        let url = program.first_line(START_TIMEOUT);
+        match url.trim() {
+            "" => match program.0.try_wait() {
+                Ok(Some(status)) => bail!("the dashboard ended with {status} before it served"),
+                _ => bail!("the dashboard: nothing to say for {START_TIMEOUT:?}"),
+            },
+            url => Ok(Self {
+                url: url.into(),
+                _program: program,
+            }),
+        }
+    }
+
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+}
+
+impl OwnProgram {
+    fn start(command: &mut Command) -> Result<Self> {
+        let child = command.spawn();
+        let program = command.get_program().display();
+        Ok(Self(child.with_context(|| format!("start {program}"))?))
+    }
+
+    /// The first line that it writes to its standard output; empty if it ends or takes too long.
+    fn first_line(&mut self, timeout: Duration) -> String {
+        let (tell, told) = std::sync::mpsc::channel();
+        if let Some(out) = self.0.stdout.take() {
+            std::thread::spawn(move || {
+                let mut line = String::new();
+                let _ = BufReader::new(out).read_line(&mut line);
+                let _ = tell.send(line);
+            });
+        }
+        told.recv_timeout(timeout).unwrap_or_default()
+    }
+}
+
+impl Drop for OwnProgram {
+    fn drop(&mut self) {
+        if let Some(pid) = rustix::process::Pid::from_raw(self.0.id() as i32) {
+            // A program that has ended already is what we want.
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+        }
+        let deadline = Instant::now() + STOP_TIMEOUT;
+        while matches!(self.0.try_wait(), Ok(None)) {
+            if Instant::now() > deadline {
+                let _ = self.0.kill();
+                let _ = self.0.wait();
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+/// A program that ends with this one, and is quiet unless asked.
+fn private(program: PathBuf) -> Command {
+    let mut command = Command::new(program);
+    command
+        .args(["--exit-with", &std::process::id().to_string()])
+        // A terminal's Ctrl-C is for this program, which still needs the other then.
+        .process_group(0);
+    if std::env::var_os("RUST_LOG").is_none() {
+        command.env("RUST_LOG", "warn");
+    }
+    command
+}
+
+fn beside_this(name: &str) -> PathBuf {
+    let beside = std::env::current_exe()
+        .ok()
+        .and_then(|path| Some(path.parent()?.join(name)));
+    beside
+        .filter(|path| path.exists())
+        .unwrap_or_else(|| name.into())
+}

@@ -1,0 +1,10 @@
+//! What learns while it acts, as [`crate::learning::train`] drives it. Pure: frames in, paths out.
+
+mod base;
+pub mod decisions;
+pub mod filter;
+pub mod network;
+#[cfg(test)]
+mod tests;
+
+pub use self::base::{Learner, Worlds};

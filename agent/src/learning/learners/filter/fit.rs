@@ -1,0 +1,359 @@
+//! What learns a model while an agent acts: replay in, parameters out. Pure.
+
+mod neighbours;
+
+pub use self::neighbours::Neighbours;
+
+use crate::config::{AgentConfig, LearningConfig};
+use crate::learning::checkpoint::{Contents, check, check_counts};
+use crate::learning::filter::{Optimiser, Update};
+use crate::learning::replay::Replay;
+use crate::learning::reward::{RewardEstimate, met};
+use ::network::NamedTensor;
+use anyhow::Result;
+use emberwatch_belief::estimation::Correlations;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use protocol::{Frame, Shape};
+use serde::{Deserialize, Serialize};
+
+pub const KIND: &str = "learned_filter";
+
+/// The same where kernels see the cell's own state.
+pub const OWN_KIND: &str = "learned_own_filter";
+
+/// Names of tensors end so: parameters, means and means of squares.
+const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
+
+/// More updates than a step of all worlds earns.
+const MAX_EARNED: f64 = 2e6;
+
+/// What was learned: all that acting on it needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LearnedModel {
+    /// The free numbers, and what they stand for.
+    pub parameters: Parameters,
+    pub tables: Tables,
+    pub target: usize,
+    /// How much that state of one cell says of its neighbours'.
+    pub correlations: Correlations,
+}
+
+impl LearnedModel {
+    pub fn new(parameters: Parameters, target: usize, correlations: Correlations) -> Self {
+        Self {
+            tables: parameters.tables(),
+            parameters,
+            target,
+            correlations,
+        }
+    }
+}
+
+/// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct FilterFit {
+    pub optimiser: Optimiser,
+    pub reward: RewardEstimate,
+    /// World steps seen, of all worlds together.
+    pub world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    pub earned: f64,
+    replay: Replay,
+    neighbours: Neighbours,
+}
+
+impl FilterFit {
+    /// Before the first frame.
+    pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
+        let parameters = Parameters::first(dimensions, config.seed);
+        Self {
+            optimiser: Optimiser::new(parameters, shape, config.learning, config.seed),
+            reward: RewardEstimate::new(dimensions.n_states),
+            world_steps: 0,
+            earned: 0.0,
+            replay: replay(&config.learning),
+            neighbours: Neighbours::default(),
+        }
+    }
+
+    /// A world's track begins, for the first time or again.
+    pub fn begin(&mut self, world: u32) {
+        self.replay.begin(world);
+        self.neighbours
+            .begin(world, self.optimiser.cut().0.n_cells());
+    }
+
+    pub fn has_track(&self, world: u32) -> bool {
+        self.replay.has_track(world)
+    }
+
+    /// A world's next frame, the belief before it unless it is the first, and what was known then.
+    pub fn see(
+        &mut self,
+        world: u32,
+        frame: &Frame,
+        predictor: Option<&Belief>,
+        learned: &LearnedModel,
+    ) {
+        self.replay.push(world, frame, predictor);
+        let (tables, target) = (&learned.tables, learned.target);
+        self.neighbours.see(world, frame, predictor, tables, target);
+    }
+
+    /// The reward of a path that visited some cells, with the belief after its frame.
+    pub fn reward(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
+        let met = met(posterior, visited.iter().copied());
+        self.reward.add(&met, reward);
+        self.world_steps += 1;
+        self.earned += self.optimiser.config().updates_per_step;
+    }
+
+    /// Makes the updates that the steps since the last call have earned.
+    ///
+    /// # Errors
+    /// For numbers that are not finite; the parameters are those before.
+    pub fn learn(&mut self) -> Result<Vec<Update>> {
+        let mut updates = Vec::new();
+        let target = self.reward.target();
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            updates.extend(self.optimiser.update(&mut self.replay, target)?);
+        }
+        Ok(updates)
+    }
+
+    /// Forgets all frames, and every world's track; what was learned from them stays.
+    pub fn forget(&mut self) {
+        self.replay = replay(self.optimiser.config());
+        self.optimiser.leave_replay();
+        self.earned = 0.0;
+        self.neighbours.forget_worlds();
+    }
+
+    pub fn learned(&self) -> LearnedModel {
+        let parameters = self.optimiser.parameters();
+        let last = parameters.dimensions.n_states - 1;
+        let target = self.reward.target().unwrap_or(last);
+        let correlations = self.neighbours.correlations_of(target);
+        LearnedModel::new(parameters.clone(), target, correlations)
+    }
+
+    pub fn kind(&self) -> &'static str {
+        if self.optimiser.dimensions().sees_own_state {
+            OWN_KIND
+        } else {
+            KIND
+        }
+    }
+
+    pub fn n_updates(&self) -> u64 {
+        self.optimiser.adam.n_steps
+    }
+
+    /// Parameters and moments by name.
+    pub fn named_tensors(&self) -> Vec<NamedTensor> {
+        let adam = &self.optimiser.adam;
+        let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
+        let named = |(suffix, part): (&str, &Parameters)| {
+            let shapes = part.dimensions.shapes();
+            [0, 1, 2].map(|at| {
+                let name = format!("{}{suffix}", Parameters::NAMES[at]);
+                (name, shapes[at].clone(), part.tensors[at].clone())
+            })
+        };
+        SUFFIXES.into_iter().zip(parts).flat_map(named).collect()
+    }
+
+    /// Takes the tensors of a checkpoint that it is of, as those of given dimensions.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
+        let counts = [
+            ("n_updates", self.n_updates()),
+            ("world_steps", self.world_steps),
+        ];
+        check_counts(&counts)?;
+        let part = |suffix: &str| -> Result<Parameters> {
+            let mut part = Parameters::zeros(dimensions);
+            for (at, shape) in dimensions.shapes().iter().enumerate() {
+                let name = format!("{}{suffix}", Parameters::NAMES[at]);
+                part.tensors[at] = contents.tensor(&name, shape)?;
+            }
+            Ok(part)
+        };
+        let [parameters, first, second] = SUFFIXES.map(part);
+        self.optimiser.set_parameters(parameters?);
+        (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
+        contents.check_squares()?;
+        self.reward.check(dimensions.n_states)
+    }
+
+    /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
+    /// than the settings say.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn resume(
+        mut saved: Self,
+        contents: &Contents,
+        dimensions: Dimensions,
+        shape: Shape,
+        config: &AgentConfig,
+    ) -> Result<Self> {
+        saved.load(contents, dimensions)?;
+        let mut fit = Self::new(dimensions, shape, config);
+        if saved.optimiser.cut() == fit.optimiser.cut() {
+            let fits = (0.0..MAX_EARNED).contains(&saved.earned);
+            check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
+            fit.earned = saved.earned;
+            let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
+            let replay = &mut fit.replay;
+            replay.resume(saved.replay, shape, n_states, n_observations)?;
+            let n_cells = shape.n_cells();
+            let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+            check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
+        } else {
+            saved.neighbours.forget_worlds();
+        }
+        fit.optimiser.resume(saved.optimiser)?;
+        fit.reward = saved.reward;
+        fit.neighbours = saved.neighbours;
+        fit.world_steps = saved.world_steps;
+        Ok(fit)
+    }
+}
+
+fn replay(config: &LearningConfig) -> Replay {
+    Replay::new(config.window * config.block_windows, config.replay_frames)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_belief::estimation::belief::Belief;
+
+    const DIMENSIONS: Dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 2,
+        kernel: (1, 3),
+        sees_own_state: false,
+    };
+
+    fn shape() -> Shape {
+        Shape::new(1, 3).expect("test shape")
+    }
+
+    fn config() -> AgentConfig {
+        let mut config = AgentConfig::default();
+        config.learning.window = 2;
+        config.learning.block_windows = 1;
+        config.learning.streams = 2;
+        config
+    }
+
+    fn see(fit: &mut FilterFit, values: &[u8]) {
+        let belief = Belief::uniform(3, shape());
+        for &value in values {
+            let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
+            let learned = fit.learned();
+            fit.see(4, &frame, Some(&belief), &learned);
+            let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
+            fit.reward(&belief, &visited, 0.3);
+            fit.learn().expect("finite");
+        }
+    }
+
+    fn fit() -> FilterFit {
+        let mut fit = FilterFit::new(DIMENSIONS, shape(), &config());
+        fit.begin(4);
+        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
+        fit
+    }
+
+    fn contents(fit: &FilterFit) -> Contents {
+        Contents::new(fit.named_tensors(), fit)
+    }
+
+    fn resume(
+        contents: &Contents,
+        dimensions: Dimensions,
+        config: &AgentConfig,
+    ) -> Result<FilterFit, String> {
+        let fit = contents
+            .state()
+            .and_then(|saved| FilterFit::resume(saved, contents, dimensions, shape(), config));
+        fit.map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_learner_resumes_alike_unless_its_replay_is_cut_otherwise() {
+        let mut fit = fit();
+        assert!(fit.n_updates() > 0);
+        let stored = contents(&fit);
+        let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
+        assert!(same.has_track(4) && contents(&same) == stored);
+        let later = |fit: &mut FilterFit| see(fit, &[1, 0, 0, 1, 1]);
+        later(&mut fit);
+        later(&mut same);
+        assert!(contents(&same) == contents(&fit) && contents(&same) != stored);
+        let mut config = config();
+        config.learning.streams = 3;
+        let other = resume(&stored, DIMENSIONS, &config).expect("whole");
+        assert!(!other.has_track(4), "an empty replay");
+        assert_eq!(contents(&other).tensors, stored.tensors);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_by_name() {
+        let other = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = DIMENSIONS;
+            change(&mut dimensions);
+            let error = resume(&contents(&fit()), dimensions, &config()).expect_err(words);
+            assert_eq!(error, words);
+        };
+        other(
+            |dimensions| dimensions.kernel = (3, 3),
+            "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]",
+        );
+        other(
+            |dimensions| dimensions.n_observations = 4,
+            "likelihood: expected shape [3, 4], got [3, 2]",
+        );
+        let forged = |change: fn(&mut Contents, &mut FilterFit), words: &str| {
+            let (mut contents, mut saved) = (contents(&fit()), fit());
+            change(&mut contents, &mut saved);
+            contents.set_state(&saved);
+            let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
+            assert!(error.starts_with(words), "{error}");
+        };
+        forged(
+            |contents, _| drop(contents.tensors.remove("initial.first_moment")),
+            "initial.first_moment: expected shape [3], got none",
+        );
+        forged(
+            |contents, _| {
+                let tensor = contents.tensors.get_mut("kernel.second_moment");
+                tensor.expect("a moment").numbers[2] = -0.5;
+            },
+            "kernel.second_moment: expected numbers from 0 on, got -0.5",
+        );
+        forged(
+            |_, saved| saved.earned = 1e300,
+            "earned: expected 0 to 2000000, got 1",
+        );
+        forged(
+            |_, saved| saved.reward.rewards[1] = f64::NAN,
+            "reward.rewards: expected 3 finite numbers, got NaN",
+        );
+        forged(
+            |_, saved| saved.optimiser.adam.n_steps = u64::MAX,
+            "n_updates: expected at most",
+        );
+        forged(
+            |_, saved| saved.optimiser.streams.clear(),
+            "streams: expected 2, got 0",
+        );
+    }
+}

@@ -1,0 +1,222 @@
+//! Which belief learners plan on.
+
+use crate::config::AgentConfig;
+use crate::learning::checkpoint::Contents;
+use crate::learning::learners::decisions::{Base, DecisionsLearner};
+use crate::learning::learners::filter::FilterLearner;
+use crate::learning::learners::filter::fit::FilterFit;
+use crate::learning::learners::network::{NetworkLearner, Progress};
+use crate::learning::learners::{Learner, Worlds};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_belief::planning::{
+    BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
+};
+use protocol::client::Observation;
+use protocol::message::{RobotResult, WorldResult};
+use protocol::randomness::split_mix;
+use protocol::{Cell, Frame, Model, Move, Shape};
+
+const ROBOT: Cell = Cell { row: 4, col: 4 };
+
+fn worlds() -> Worlds {
+    Worlds {
+        shape: Shape::new(8, 9).expect("test shape"),
+        n_observations: 3,
+        n_moves: 6,
+        numbers: 0..1,
+    }
+}
+
+fn config(belief: BasisKind) -> AgentConfig {
+    let mut config = AgentConfig {
+        beam_width: 8,
+        shooting_samples: 64,
+        ..AgentConfig::default()
+    };
+    config.objective.belief = belief;
+    config
+}
+
+fn observation(step: u64) -> Observation {
+    let mut frame = Frame::empty(worlds().shape);
+    for cell in 0..worlds().shape.n_cells() {
+        let bits = split_mix(step, cell as u64);
+        if bits.is_multiple_of(4) {
+            frame.observe(cell, (bits >> 32) as u8 % 3);
+        }
+    }
+    let (row, col) = (ROBOT.row as u32, ROBOT.col as u32);
+    Observation {
+        world: WorldResult {
+            step,
+            ..WorldResult::default()
+        },
+        robot: RobotResult {
+            row,
+            col,
+            ..RobotResult::default()
+        },
+        frame,
+    }
+}
+
+fn learned_beam() -> Policy {
+    let target = Target::State(0);
+    Policy::new(
+        "learned_beam",
+        EstimatorKind::Learned,
+        PlannerKind::Beam,
+        target,
+    )
+}
+
+/// The path that a policy's planner finds for an objective.
+fn path(
+    config: &AgentConfig,
+    policy: &Policy,
+    objective: Objective,
+    belief: &Belief,
+    step: u64,
+) -> Vec<Move> {
+    let problem = PlanningProblem {
+        start: ROBOT,
+        n_moves: worlds().n_moves,
+        values: &objective.values(belief),
+        seed: config.planner_seed(0),
+        step,
+    };
+    config.planner(policy).plan(&problem).moves
+}
+
+/// One step: the path, and the posterior after its frame.
+fn fly(learner: &mut impl Learner, step: u64) -> (Vec<Move>, Belief) {
+    let path = learner.plan().remove(0);
+    learner.see(vec![observation(step)]).expect("possible");
+    let posterior = learner.rollout(0).agent.belief().clone();
+    learner.predict();
+    (path, posterior)
+}
+
+/// A frozen learner must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
+/// a state pays most, at a step.
+fn check(
+    mut learner: impl Learner,
+    basis: BasisKind,
+    paths: impl Fn(&Belief, usize, u64) -> Vec<Vec<Move>>,
+) {
+    learner.freeze();
+    learner.attach(vec![observation(0)]).expect("possible");
+    let (mut all, mut before) = ([true; 2], None);
+    for step in 1..9 {
+        let (path, estimate) = fly(&mut learner, step);
+        let (predictor, target) = learner.belief().expect("a belief");
+        let now = [&estimate, predictor].map(|belief| paths(belief, target, step));
+        let Some(paths) = before.replace(now) else {
+            continue;
+        };
+        for (all, paths) in all.iter_mut().zip(&paths) {
+            *all &= paths.contains(&path);
+        }
+    }
+    let expected = match basis {
+        BasisKind::Estimate => [true, false],
+        BasisKind::Predictor => [false, true],
+    };
+    assert_eq!(all, expected, "{}, {basis:?}", learner.kind());
+}
+
+#[test]
+fn learners_plan_on_the_belief_that_settings_say() {
+    for basis in [BasisKind::Predictor, BasisKind::Estimate] {
+        let config = &config(basis);
+        let dimensions = Dimensions {
+            n_states: 3,
+            n_observations: 3,
+            kernel: (3, 3),
+            sees_own_state: false,
+        };
+        let learner = FilterLearner::new(dimensions, worlds(), config);
+        check(learner, basis, |belief, target, step| {
+            let policy = learned_beam();
+            let objective = Objective {
+                target: Target::State(target),
+                ..config.objective(&policy)
+            };
+            vec![path(config, &policy, objective, belief, step)]
+        });
+        let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
+        let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
+        check(learner, basis, |belief, _, step| {
+            let choices = Policy::network_choices(3);
+            let path = |choice| path(config, choice, config.objective(choice), belief, step);
+            choices.iter().map(path).collect()
+        });
+        let model = Model::wildfire();
+        let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
+        let base = Base::known(EstimatorKind::KnownModel, filter, &model);
+        let learner = DecisionsLearner::new(base, None, worlds(), config).expect("new");
+        // The robot remembers what every step showed, and never earns.
+        let memory = |step: u64| {
+            let mut memory = Memory::new(worlds().shape);
+            (0..step).for_each(|step| {
+                memory.see(&observation(step).frame);
+                if step > 0 {
+                    memory.earn(0.0, worlds().n_moves);
+                }
+            });
+            memory
+        };
+        check(learner, basis, |belief, target, step| {
+            let outlook = Outlook::new(belief, target, &memory(step + 1), worlds().n_moves);
+            let mut planner = OptionPlanner::new(config.decisions.beam_width);
+            let paths = planner.propose(&outlook, ROBOT).into_iter();
+            paths.map(|proposal| proposal.plan.moves).collect()
+        });
+    }
+}
+
+/// What a checkpoint of decisions holds after so many steps in a row.
+fn learn(learner: &mut DecisionsLearner, steps: std::ops::Range<u64>) -> Contents {
+    for step in steps {
+        fly(learner, step);
+        learner.learn().expect("finite");
+    }
+    learner.contents().expect("whole")
+}
+
+#[test]
+fn decisions_resume_bit_for_bit() {
+    let mut config = config(BasisKind::Estimate);
+    (
+        config.decisions.learning.batch,
+        config.decisions.updates_per_step,
+    ) = (4, 1.0);
+    for kind in [EstimatorKind::LearnedOwn, EstimatorKind::LearnedSpatial] {
+        let dimensions = Dimensions {
+            n_states: 3,
+            n_observations: 3,
+            kernel: (3, 3),
+            sees_own_state: kind.sees_own_state(),
+        };
+        let learned = FilterFit::new(dimensions, worlds().shape, &config).learned();
+        let base = Base::learned(kind, learned, worlds().shape);
+        let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
+        learner.attach(vec![observation(0)]).expect("possible");
+        let left = learn(&mut learner, 1..20);
+        let base = Base::saved(&left, worlds().shape)
+            .expect("whole")
+            .expect("a filter");
+        let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
+        let mut resumed = resumed.expect("its own");
+        let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
+        assert_eq!(n_gone_on, 1);
+        let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 20..40));
+        assert!(
+            contents[0] == contents[1] && learner.n_updates() > 20,
+            "{kind:?}"
+        );
+    }
+}

@@ -1,0 +1,109 @@
+//! Which learner the settings ask for.
+
+use crate::config::{AgentConfig, LearnerKind};
+use crate::estimation::first_belief::first_belief;
+use crate::learning::checkpoint::Contents;
+use crate::learning::learners::decisions::{Base, DecisionsLearner};
+use crate::learning::learners::filter::FilterLearner;
+use crate::learning::learners::network::{self, NetworkLearner};
+use crate::learning::learners::{Learner, Worlds};
+use crate::learning::train::spec::TrainingSpec;
+use anyhow::{Context, Result, bail, ensure};
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::parameters::Dimensions;
+use protocol::control::{CoverageRule, ServerInfo};
+use protocol::{Client, Model, Shape};
+use std::path::Path;
+
+/// What the settings say that learns, going on from a checkpoint's contents if there are any.
+pub fn learner(
+    spec: &TrainingSpec,
+    client: &Client,
+    contents: Option<&Contents>,
+    place: &Path,
+) -> Result<Box<dyn Learner>> {
+    let (info, config) = (client.info(), &spec.config);
+    let worlds = Worlds {
+        shape: client.shape(),
+        n_observations: info.n_observations,
+        n_moves: info.n_moves,
+        numbers: client.robots(),
+    };
+    let of_file = || format!("checkpoint {}", place.display());
+    Ok(match config.learner {
+        LearnerKind::Filter | LearnerKind::OwnFilter => {
+            let dimensions = dimensions(config, worlds.n_observations)?;
+            Box::new(match contents {
+                Some(contents) => FilterLearner::resume(contents, dimensions, worlds, config)
+                    .with_context(of_file)?,
+                None => FilterLearner::new(dimensions, worlds, config),
+            })
+        }
+        LearnerKind::Autoencoder => {
+            let mut progress = network::Progress::first(&worlds, config, &spec.device)?;
+            if let Some(contents) = contents {
+                progress.load(contents).with_context(of_file)?;
+            }
+            let full_frames = config.autoencoder.full_frames;
+            let wants = progress.position.iterations < full_frames && !spec.freeze;
+            if wants && info.coverage == CoverageRule::Path {
+                bail!(
+                    "autoencoder.full_frames: {full_frames} frames that show every cell need a server with \
+                     --coverage client or full, or the setting 0"
+                );
+            }
+            Box::new(NetworkLearner::new(progress, worlds, config))
+        }
+        LearnerKind::Decisions => {
+            let saved = contents.map(|contents| Base::saved(contents, worlds.shape));
+            let base = match saved.transpose().with_context(of_file)?.flatten() {
+                Some(base) => base,
+                None => base(spec, info, worlds.shape)?,
+            };
+            let learner = DecisionsLearner::new(base, contents, worlds, config);
+            Box::new(learner.with_context(of_file)?)
+        }
+    })
+}
+
+/// What keeps the beliefs that decisions are learned on: a filter that was learned, or that of the server's model.
+fn base(spec: &TrainingSpec, info: &ServerInfo, shape: Shape) -> Result<Base> {
+    let (kind, config) = (spec.config.decisions.estimator, &spec.config);
+    if kind.is_learned() {
+        let filter = spec.learned.filter(kind);
+        let filter = filter.context("decisions: expected a checkpoint of a filter, got none")?;
+        let (expected, got) = (info.n_observations, filter.tables.dimensions.n_observations);
+        ensure!(
+            got == expected,
+            "checkpoint: expected {expected} observations as the world's, got {got}"
+        );
+        return Ok(Base::learned(kind, filter.clone(), shape));
+    }
+    let model = info.model.as_deref().with_context(|| {
+        format!(
+            "decisions on the belief of {} need the server's model: start it with --reveal-model true, not with \
+             --states",
+            kind.label()
+        )
+    })?;
+    let model = Model::from_toml(model)?;
+    let prior = first_belief(config.prior(info.burn_in), &model, shape, config.seed)?;
+    let filter = BayesFilter::known(&model, prior)?;
+    Ok(Base::known(kind, filter, &model))
+}
+
+fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions> {
+    let learning = config.learning;
+    let n_states = match learning.states {
+        0 => n_observations,
+        states => states,
+    };
+    let kernel = (learning.kernel[0], learning.kernel[1]);
+    let dimensions = Dimensions {
+        n_states,
+        n_observations,
+        kernel,
+        sees_own_state: config.learner == LearnerKind::OwnFilter,
+    };
+    Ok(dimensions.check()?)
+}

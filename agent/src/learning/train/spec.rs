@@ -1,0 +1,123 @@
+//! What to train on, and why that ended early.
+
+use crate::config::{AgentConfig, LearnerKind};
+use crate::learning::checkpoint::{self, Contents};
+use crate::learning::learned::Learned;
+use crate::learning::learners::filter::SavedFilter;
+use crate::learning::learners::filter::fit;
+use crate::learning::learners::{Learner, decisions, network};
+use ::network::Device;
+use anyhow::{Context, Result, anyhow, bail, ensure};
+use protocol::connection::ConnectionError;
+use protocol::control::ServerInfo;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// The checkpoint's name in the folder of a training.
+pub const CHECKPOINT: &str = "checkpoint.safetensors";
+
+#[derive(Debug, Clone)]
+pub struct TrainingSpec {
+    /// The worlds, with all their robots.
+    pub worlds: Range<u32>,
+    pub takeover: bool,
+    /// World steps to act for, of all worlds together; 0: until stopped.
+    pub steps: u64,
+    /// Time to act for; `None`: until stopped.
+    pub time_limit: Option<Duration>,
+    pub out: PathBuf,
+    pub resume: bool,
+    pub freeze: bool,
+    pub device: Device,
+    pub config: AgentConfig,
+    /// What was learned before, for decisions on it.
+    pub learned: Learned,
+}
+
+impl TrainingSpec {
+    /// Checks folder and number of worlds, before a server is held or started for them; returns the
+    /// contents of the checkpoint to go on from.
+    pub fn check(&self) -> Result<Option<Contents>> {
+        let place = self.out.join(CHECKPOINT);
+        ensure!(
+            self.resume || !place.exists(),
+            "--out {}: expected --resume or a folder without a checkpoint, got one with it",
+            self.out.display()
+        );
+        let n_worlds = self.worlds.len();
+        let kind = match self.config.learner {
+            LearnerKind::Filter => fit::KIND,
+            LearnerKind::OwnFilter => fit::OWN_KIND,
+            LearnerKind::Autoencoder if n_worlds != 1 => {
+                bail!(
+                    "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"
+                )
+            }
+            LearnerKind::Autoencoder => network::KIND,
+            LearnerKind::Decisions => decisions::KIND,
+        };
+        if !self.resume {
+            return Ok(None);
+        }
+        let (_, contents) = checkpoint::read(&place, &[kind])?;
+        if toml::to_string(&self.config)? != contents.settings {
+            tracing::warn!(
+                "settings: other than the checkpoint was trained with; these hold from here on"
+            );
+        }
+        Ok(Some(contents))
+    }
+
+    /// The training of the filter whose belief decisions are learned on, in a folder within this one's; `None` if there
+    /// is nothing more to learn of it.
+    pub fn of_filter(&self) -> Result<Option<Self>> {
+        let decisions = &self.config.decisions;
+        let mut filter = self.clone();
+        filter.out = self.filter_folder();
+        filter.config.learner = if decisions.estimator.sees_own_state() {
+            LearnerKind::OwnFilter
+        } else {
+            LearnerKind::Filter
+        };
+        filter.resume = self.resume && filter.out.join(CHECKPOINT).exists();
+        let learned = match filter.check()? {
+            Some(contents) => contents.state::<SavedFilter>()?.fit.world_steps,
+            None => 0,
+        };
+        filter.steps = decisions.filter_steps.saturating_sub(learned);
+        Ok((filter.steps > 0).then_some(filter))
+    }
+
+    /// Where [`Self::of_filter`] leaves its checkpoint.
+    pub fn filter_folder(&self) -> PathBuf {
+        self.out.join("filter")
+    }
+
+    /// The numbers of the robots on a server.
+    pub(super) fn robots(&self, info: &ServerInfo) -> Result<Range<u32>> {
+        let team = info.n_robots;
+        if self.config.learner == LearnerKind::Autoencoder {
+            ensure!(
+                team == 1,
+                "the autoencoder follows one robot: expected a server with --robots 1, got {team}"
+            );
+        }
+        let number = |world: u32| world.checked_mul(team);
+        let ends = number(self.worlds.start).zip(number(self.worlds.end));
+        let (first, end) = ends.context("--world: expected a world that the server has")?;
+        Ok(first..end)
+    }
+
+    /// The error for a learner that cannot go on; what it learned is saved when training ends.
+    pub(super) fn stopped(&self, problem: anyhow::Error, learner: &dyn Learner) -> anyhow::Error {
+        if problem.is::<ConnectionError>() {
+            return problem;
+        }
+        anyhow!(
+            "after {} world steps: {problem:#}; what was learned before is in {}",
+            learner.world_steps(),
+            self.out.join(CHECKPOINT).display()
+        )
+    }
+}

@@ -1,0 +1,106 @@
+//! What each policy does, in a line.
+
+use super::named::{Choice, EstimatorKind, PlannerKind, Policy};
+use emberwatch_belief::planning::objective::Target;
+use emberwatch_belief::planning::options::OPTIONS;
+use protocol::Model;
+
+/// All policies of a model, a line each: name, planner, objective, belief; those of single options together.
+pub fn list(model: &Model) -> String {
+    let mut policies = Policy::all(model);
+    policies.retain(|policy| !policy.is_option());
+    let width = policies.iter().map(|policy| policy.name.len()).max();
+    let width = width.unwrap_or(0);
+    let lines = policies.iter().map(|policy| {
+        let (name, words) = (&policy.name, description(policy, model));
+        format!("  {name:width$}  {words}\n")
+    });
+    lines.collect::<String>() + &options()
+}
+
+/// How the policies of single options are called.
+fn options() -> String {
+    let beliefs = EstimatorKind::FAMILIES.map(|(family, _)| family).join(", ");
+    let names = OPTIONS.map(|option| option.name).join(", ");
+    format!(
+        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}; \
+         rule: the best region if it promises more, else exploit\n"
+    )
+}
+
+fn description(policy: &Policy, model: &Model) -> String {
+    let planner = match policy.planner {
+        PlannerKind::RandomWalk => return "random moves, the paper's baseline".into(),
+        PlannerKind::Shooting => "best of random paths",
+        PlannerKind::Beam => "beam search",
+        PlannerKind::BeamAhead => "beam search six paths ahead",
+    };
+    let belief = match policy.estimator {
+        EstimatorKind::KnownModel if policy.is_decided() => ", needs --checkpoint",
+        EstimatorKind::None | EstimatorKind::KnownModel => "",
+        EstimatorKind::Spatial => "; corrections reach neighbours",
+        EstimatorKind::Learned => "; learned filter, needs --checkpoint",
+        EstimatorKind::LearnedSpatial => "; learned, reaches neighbours, needs --checkpoint",
+        EstimatorKind::LearnedOwn => "; learned, by own state, needs --checkpoint",
+        EstimatorKind::LearnedOwnSpatial => "; by own state and neighbours, needs --checkpoint",
+        EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint",
+        EstimatorKind::Truth => "; told the states, needs --publish-truth",
+        EstimatorKind::NextTruth => "; told the next states, only in `compare`",
+    };
+    format!("{planner} for {}{belief}", goal(policy, model))
+}
+
+fn goal(policy: &Policy, model: &Model) -> String {
+    match policy.choice {
+        Choice::Network => return "what a learned DQN chooses".into(),
+        Choice::Scorer => return "the option that a learned DQN values most".into(),
+        Choice::Rule => return "the best region if it promises more than here".into(),
+        Choice::Option(option) => return format!("the option {}, always", option.name),
+        Choice::Objective => (),
+    }
+    let is_learned = policy.estimator.is_learned();
+    let goal = match policy.objective.target {
+        Target::Coverage => return "new cells".into(),
+        Target::Entropy => "the belief's entropy".into(),
+        Target::State(_) if is_learned => "what pays most".into(),
+        Target::State(state) if state == model.target_state() => {
+            format!("{}, which pays most", model.file().states[state].name)
+        }
+        Target::State(state) => model.file().states[state].name.clone(),
+    };
+    if policy.objective.coverage_bonus > 0.0 {
+        goal
+    } else {
+        format!("{goal}, and nothing else")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_has_a_line_for_every_policy() {
+        let model = Model::wildfire();
+        let list = list(&model);
+        let (lines, options) = list.split_once("  BELIEF_OPTION").expect("options");
+        assert!(options.contains("best_region") && options.contains("learned_spatial"));
+        let named: Vec<&str> = lines
+            .lines()
+            .filter_map(|line| line.split_whitespace().next())
+            .collect();
+        let policies = Policy::all(&model).into_iter();
+        let policies = policies.filter(|policy| !policy.is_option());
+        let names = policies.map(|policy| policy.name);
+        assert_eq!(named, names.collect::<Vec<_>>());
+        let line = |name: &str| list.lines().find(|line| line.trim().starts_with(name));
+        assert_eq!(
+            line("clairvoyant_beam").map(str::trim),
+            Some(
+                "clairvoyant_beam              beam search for fire, which pays most; told the next \
+                 states, only in `compare`"
+            )
+        );
+        assert!(list.lines().all(|line| line.len() <= 160), "{list}");
+    }
+}

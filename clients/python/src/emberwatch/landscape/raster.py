@@ -1,0 +1,122 @@
+"""GeoTIFF and ESRI ASCII grids as layers, read by GDAL through rasterio."""
+
+import contextlib
+import warnings
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.landscape.grid import LIKE, Place
+from emberwatch.landscape.layers import (
+    Choice,
+    Layer,
+    check_cells,
+    choose_bands,
+    is_missing,
+    library,
+)
+from emberwatch.landscape.schedule import Clock
+from emberwatch.paths import utf8
+
+#: First words of the lines before an ESRI ASCII grid's numbers.
+_ASCII_HEADER: Final = frozenset(
+    "ncols nrows xllcorner yllcorner xllcenter yllcenter cellsize dx dy nodata_value".split()
+)
+
+
+def read(file: Path, choice: Choice) -> Generator[Layer]:
+    """The bands; the file is open until the last of them, or until closed."""
+    if choice.variable is not None:
+        raise invalid(
+            "--variable", f"none for {file}, which has no variables", f"'{choice.variable}'"
+        )
+    is_ascii = file.suffix.lower() == ".asc"
+    driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
+    rasterio, errors = library("rasterio", file), library("rasterio.errors", file)
+    # What has no place is a grid without one; GDAL's other warnings are of no use to people.
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            with rasterio.open(Path(utf8("file", file.absolute())), driver=driver) as source:
+                place = _place(file, source)
+                for band in choose_bands(file, source.count, choice):
+                    if is_ascii:
+                        values = _ascii(file, place.shape, choice.nodata)
+                    else:
+                        values = _values(file, source, band, choice.nodata)
+                    yield Layer(
+                        name=f"{file}, band {band}" if source.count > 1 else str(file),
+                        values=values,
+                        place=place,
+                        clock=Clock(source.units[band - 1] or ""),
+                    )
+        except errors.RasterioError as error:
+            words = error.__cause__ or error
+            raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
+
+
+def _place(file: Path, source: Any) -> Place:
+    """Where the cells are; a file that does not say so has the identity as its transform."""
+    check_cells(file, source.height, source.width)
+    (height, width), transform, crs = source.shape, source.transform, source.crs
+    if transform.is_identity:
+        return Place(shape=source.shape)
+    # Over the whole extent: rotations by tiny angles are rounding.
+    skewed = abs(transform.b) * height, abs(transform.d) * width
+    if skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e):
+        raise invalid(file, "rows from west to east", "a rotated grid")
+    far = transform * (width, height)
+    return Place(
+        shape=source.shape,
+        corner=(min(transform.c, far[0]), max(transform.f, far[1])),
+        cell=(abs(transform.a), abs(transform.e)),
+        projection=crs.to_wkt() if crs else None,
+        is_in_degrees=bool(crs and crs.is_geographic),
+        metres=crs.linear_units_factor[1] if crs and crs.is_projected else 1.0,
+    )
+
+
+def _values(file: Path, source: Any, band: int, nodata: Sequence[float]) -> NDArray[np.float64]:
+    dtype = source.dtypes[band - 1]
+    if dtype.startswith("complex"):
+        raise invalid(file, "real numbers", dtype)
+    stored: Any = source.read(band, masked=True)
+    values = stored.data.astype(np.float64) * source.scales[band - 1] + source.offsets[band - 1]
+    values[stored.mask | is_missing(stored.data, nodata)] = np.nan
+    southward, eastward = source.transform.e < 0, source.transform.a > 0
+    if source.transform.is_identity:  # the first row is the first
+        return values
+    return values[:: 1 if southward else -1, :: 1 if eastward else -1].copy()
+
+
+def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArray[np.float64]:
+    """The numbers of an ASCII grid; GDAL fills up or cuts them, and takes words as 0."""
+    rows, never = list[NDArray[np.float64]](), ""
+    with file.open(encoding="ascii", errors="replace") as lines:
+        for line in lines:
+            words = line.lower().replace(",", ".").split()
+            if words and words[0] in _ASCII_HEADER and not rows:
+                never = words[-1] if words[0] == "nodata_value" else never
+            elif words:
+                rows.append(np.array([_number(file, word, never) for word in words]))
+    values = np.concatenate(rows) if rows else np.empty(0)
+    if values.size != shape[0] * shape[1]:
+        wanted = f"{shape[0] * shape[1]} numbers for {shape[0]} x {shape[1]} cells"
+        raise invalid(file, wanted, values.size)
+    with contextlib.suppress(ValueError):
+        nodata = (*nodata, float(never))
+    with np.errstate(over="ignore"):  # as 32 bits, of which the header may have fewer digits
+        values[is_missing(values.astype(np.float32), nodata)] = np.nan
+    return values.reshape(shape)
+
+
+def _number(file: Path, word: str, never: str) -> float:
+    try:
+        return np.nan if word == never else float(word)
+    except ValueError:
+        raise invalid(
+            file, "numbers", f"'{word[:40]}'; NODATA_value names a word for no value"
+        ) from None

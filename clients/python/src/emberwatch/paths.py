@@ -1,0 +1,28 @@
+"""Paths as they are outside Python, where they are bytes."""
+
+import os
+import sys
+
+from emberwatch.errors import invalid
+
+
+def utf8(subject: str, path: str | os.PathLike[str]) -> str:
+    """A path as programs, messages and GDAL take it: in UTF-8, whatever the locale is."""
+    try:
+        text = os.fsencode(path).decode()
+    except UnicodeError:
+        text = "\0"
+    if "\0" in text:
+        expected = "UTF-8, and a locale that has its letters, such as LC_ALL=C.UTF-8"
+        raise invalid(subject, expected, ascii(os.fspath(path)))
+    return text
+
+
+def shown(text: str) -> str:
+    """The text with escapes for what standard output cannot write, such as paths of other bytes."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        text.encode(encoding, sys.stdout.errors or "strict")
+    except UnicodeEncodeError:
+        return text.encode(encoding, "backslashreplace").decode(encoding)
+    return text

@@ -1,0 +1,158 @@
+"""What callers hand in: arrays of any library, seeds, options; and keywords as JSON has them."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES, SMALL, WILDFIRE, assert_same, closed_later, make, make_vec
+from environments import rollout as rolled
+from failures import refuses
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+
+import emberwatch
+from emberwatch.model import Model
+from emberwatch.wrappers import BeliefObservation
+
+PATH = np.zeros(4, np.int64)
+
+
+class Elsewhere:
+    """An array that NumPy cannot read, such as a tensor on a GPU or one with gradients."""
+
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise self._error
+
+    def __repr__(self) -> str:
+        raise self._error
+
+
+ELSEWHERE = [
+    TypeError("use Tensor.cpu()"),
+    RuntimeError("use tensor.detach()"),
+    NotImplementedError("no data"),
+    OSError("the cluster is gone"),
+]
+
+#: Environments, with a path or a move of each.
+ENVIRONMENTS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Any]] = {
+    "path": (make, lambda path: path, PATH),
+    "move": (lambda: make(MOVES), lambda move: move, PATH[0]),
+    "paths": (lambda: make_vec(2), lambda path: [path, path], PATH),
+    "moves": (lambda: make_vec(2, MOVES), lambda move: [move, move], PATH[0]),
+    "team": (
+        lambda: closed_later(emberwatch.parallel_env(robots=2, action="path", **SMALL)),
+        lambda path: {"robot_0": path, "robot_1": path},
+        PATH,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ENVIRONMENTS)
+def test_an_array_that_cannot_be_read_is_named_in_its_own_words(kind: str) -> None:
+    maker, action, _ = ENVIRONMENTS[kind]
+    env = maker()
+    env.reset(seed=1)
+    for error in ELSEWHERE:
+        with refuses(f"action.*: expected .*, got .*: {error}"):
+            env.step(action(Elsewhere(error)))
+
+
+@pytest.mark.parametrize("kind", ENVIRONMENTS)
+def test_masked_values_are_not_flown(kind: str) -> None:
+    maker, action, given = ENVIRONMENTS[kind]
+    env = maker()
+    env.reset(seed=1)
+    with refuses(r"action.*: expected .*, got (masked values|.*masked element.*)"):
+        env.step(action(np.ma.array(given, mask=True)))
+    env.step(action(np.ma.array(given)))
+
+
+def test_seeds_of_any_library_are_alike() -> None:
+    expected = make().reset(seed=5)
+    for seed in (np.int64(5), np.uint8(5), np.array(5), np.array(5, ">i8")):
+        assert_same(make().reset(seed=seed), expected)
+        assert_same(make_vec(1).reset(seed=[seed])[0]["frame"], expected[0]["frame"][np.newaxis])
+
+
+def test_what_is_no_seed_is_refused_alike() -> None:
+    team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
+    no_seeds = 5.0, np.array(5.0), np.array([5.0, 6.0]), "ab", np.ma.array(5, mask=True), {5, 6}
+    for env in (make(), make(MOVES), make_vec(2), team):
+        for seed in (*no_seeds, np.ma.array([5, 6], mask=[True, False]), Elsewhere(ELSEWHERE[0])):
+            with refuses("seed: expected (an integer|integers)"):
+                env.reset(seed=seed)
+
+
+def test_seeds_of_a_lease_are_one_for_each_world() -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    lease = env._session._lease
+    for seeds in (5, np.array(5)):
+        with refuses("seeds: expected one for each world, got"):
+            lease.reset(seeds)
+    assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
+
+
+@pytest.mark.parametrize("options", ["resume", ["resume"], 5, {"resume"}], ids=repr)
+def test_options_are_a_dictionary(options: Any) -> None:
+    team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
+    for env in (make(), make_vec(2), team):
+        with refuses(r"options: expected a dictionary such as \{'resume': True\}, or None, got"):
+            env.reset(options=options)
+
+
+KEYWORDS: list[dict[str, Any]] = [
+    {"model": Path(LIVELY)},
+    {"height": np.int64(7), "width": np.uint8(5), "burn_in": np.array(50)[()]},
+    {"truth": np.bool_(True), "timeout": np.float32(5)},
+    {"observation": np.array(["frame", "age"])},
+    {"observation": ("frame", "robot")},
+]
+
+
+@pytest.mark.parametrize("keywords", KEYWORDS, ids=str)
+def test_a_specification_is_json_that_makes_the_same_environment(keywords: Any) -> None:
+    env = make(**keywords)
+    text = env.spec.to_json()
+    again = closed_later(gymnasium.make(EnvSpec.from_json(text)))
+    assert_same(rolled(again, 2, seed=5), rolled(env, 2, seed=5))
+
+
+def test_that_of_a_vector_is_json_too() -> None:
+    mode = AutoresetMode.SAME_STEP
+    keywords = {"model": Path(LIVELY), "autoreset_mode": mode, "max_episode_steps": np.int64(3)}
+    text = make_vec(np.int64(2), MOVES, **keywords).spec.to_json()
+    again = closed_later(gymnasium.make_vec(EnvSpec.from_json(text)))
+    assert again.num_envs == 2 and again.autoreset_mode is mode
+    assert str(SMALL["height"]) in text and os.fspath(LIVELY) in text
+
+
+def test_that_of_a_wrapper_is_json_too() -> None:
+    prior = np.full((3, 7, 5), 1 / 3, np.float32)
+    for model in (Model.named(LIVELY), Path(LIVELY), LIVELY, None):
+        wrapped = BeliefObservation(make(), prior=prior, model=model)
+        again = closed_later(gymnasium.make(EnvSpec.from_json(wrapped.spec.to_json())))
+        assert_same(rolled(again, 2, seed=5), rolled(wrapped, 2, seed=5))
+
+
+def test_a_prior_that_is_no_array_is_refused() -> None:
+    with refuses(r"prior: expected an array of shape \(3, 7, 5\), got Elsewhere: no data"):
+        BeliefObservation(make(), prior=Elsewhere(ELSEWHERE[2]))
+    with refuses(r"prior: expected shape \(3, 7, 5\), got \(2,\)"):
+        BeliefObservation(make(), prior=[0.5, 0.5])
+
+
+def test_modules_are_there_as_the_documents_write_them() -> None:
+    assert emberwatch.wrappers.BeliefObservation is BeliefObservation
+    assert callable(emberwatch.planning.beam_search) and callable(emberwatch.benchmark.evaluate)
+    with pytest.raises(AttributeError, match="'emberwatch' has no attribute 'wrapers'"):
+        emberwatch.wrapers  # noqa: B018
+    assert WILDFIRE in gymnasium.registry

@@ -1,0 +1,270 @@
+"""Ctrl-C, and signal handlers that raise, at every moment of a call of an environment."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import (
+    MOVES,
+    OBJECTIVE,
+    assert_same,
+    closed_later,
+    make,
+    make_vec,
+    private_pid,
+    rollout,
+    serving,
+)
+from failures import fails
+from processes import at_once, eventually, is_running, server
+
+import emberwatch
+from emberwatch import ports
+from emberwatch.wrappers import BeliefObservation
+
+PATH = ("frame", "robot", "age", "belief")
+MOVE = ("frame", "visited", "robot", "move", "age", "belief", "local", "recent")
+
+#: Environments of each kind: all that they remember is observed.
+KINDS: dict[str, Callable[[], Any]] = {
+    "path": lambda: make(observation=PATH, truth=True),
+    "moves": lambda: make(MOVES, observation=MOVE, reward="move"),
+    "wrapped": lambda: closed_later(BeliefObservation(make(), keep=True)),
+    "paths": lambda: make_vec(3, observation=PATH, max_episode_steps=2, autoreset_mode="SameStep"),
+    "many moves": lambda: make_vec(2, MOVES, observation=MOVE, max_episode_steps=3),
+    "team": lambda: closed_later(
+        emberwatch.parallel_env(height=7, width=5, n_moves=4, burn_in=50, observation=MOVE)
+    ),
+    "objective": lambda: make(OBJECTIVE),
+}
+
+#: Of these a step may be refused, with these words.
+REFUSALS = emberwatch.EmberwatchError, gymnasium.error.ResetNeeded
+
+
+class Alarm(Exception):
+    """What a signal's handler may raise instead of `KeyboardInterrupt`."""
+
+
+class Signal:
+    """Raises where Python handles signals: the n-th begin of a function, or end of one in C."""
+
+    def __init__(self, n: int, kind: type[BaseException]) -> None:
+        self.n_seen, self._n, self._kind = 0, n, kind
+
+    def __call__(self, _frame: FrameType, event: str, _argument: object) -> None:
+        if event in ("call", "c_return"):
+            self.n_seen += 1
+            if self.n_seen == self._n:
+                sys.setprofile(None)
+                raise self._kind
+
+
+def places(call: Callable[[], object]) -> int:
+    """At how many places a signal may interrupt a call."""
+    watched = Signal(0, Alarm)
+    sys.setprofile(watched)
+    try:
+        call()
+    finally:
+        sys.setprofile(None)
+    return watched.n_seen
+
+
+def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
+    """Interrupts a call at a place; its error has a traceback, which notebooks keep."""
+    kind = (KeyboardInterrupt, Alarm)[n & 1]
+    sys.setprofile(Signal(n, kind))
+    try:
+        call()
+    except (kind, emberwatch.EmberwatchError) as error:
+        return error
+    finally:
+        sys.setprofile(None)
+    return None
+
+
+def action(env: Any, seed: int) -> Any:
+    """A random action, or one of each robot."""
+    agents: dict[str, Any] = getattr(env, "action_spaces", {})
+    for space in agents.values() or [env.action_space]:
+        space.seed(seed)
+    if agents:
+        return {agent: space.sample() for agent, space in agents.items()}
+    return env.action_space.sample()
+
+
+@pytest.fixture(params=KINDS)
+def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
+    """Two environments of one kind: one to be interrupted, one to compare with."""
+    return KINDS[request.param](), KINDS[request.param]()
+
+
+def begun(env: Any, n_steps: int = 3, seed: int = 1000) -> Any:
+    """An environment in an episode; a vector's has gone over into the next."""
+    env.reset(seed=seed)
+    for k in range(n_steps):
+        env.step(action(env, k))
+    return env
+
+
+def test_a_step_that_was_interrupted_is_never_taken_for_the_next(pair: tuple[Any, Any]) -> None:
+    env, other = pair
+    first, second = action(env, 10), action(env, 11)
+    begun(other)
+    n_places = places(lambda: other.step(first))
+    lone, both = begun(other).step(second), (begun(other).step(first), other.step(second))[1]
+    fresh = [other.reset(seed=5), other.step(first), other.step(second)]
+    kept, n_refused = [], 0
+    for n in range(1, n_places, max(1, n_places // 25)):
+        begun(env)
+        kept.append(interrupted(lambda: env.step(first), n))
+        try:
+            outcome = env.step(second)
+        except REFUSALS as refusal:
+            assert getattr(refusal, "code", "interrupted") == "interrupted"
+            n_refused += 1
+        else:
+            assert_same(outcome, both if same(outcome, both) else lone)
+        assert_same([env.reset(seed=5), env.step(first), env.step(second)], fresh)
+    assert n_refused > 12
+
+
+def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, Any]) -> None:
+    env, other = pair
+    first = action(env, 10)
+    n_places = places(lambda: other.reset(seed=7))
+    fresh = [other.reset(seed=5), other.step(first)]
+    outcomes = [begun(other).step(first), (other.reset(seed=7), other.step(first))[1]]
+    kept = []
+    for n in range(1, n_places, max(1, n_places // 12)):
+        begun(env)
+        kept.append(interrupted(lambda: env.reset(seed=7), n))
+        try:
+            outcome = env.step(first)
+        except REFUSALS:
+            _, info = env.reset(options={"resume": True})
+            told = info.get("robot_0", info)["step"]
+            assert np.all(np.isin(told, range(4)))
+        else:
+            assert_same(outcome, outcomes[same(outcome, outcomes[1])])
+        assert_same([env.reset(seed=5), env.step(first)], fresh)
+
+
+def same(left: object, right: object) -> bool:
+    try:
+        assert_same(left, right)
+    except AssertionError:
+        return False
+    return True
+
+
+def test_the_first_reset_may_be_interrupted_anywhere() -> None:
+    expected = rollout(make(), 2, seed=5)
+    env = make()
+    n_places = places(lambda: env.reset(seed=5))
+    kept = []
+    for n in range(1, n_places, n_places // 8):
+        env.close()
+        kept.append(interrupted(lambda: env.reset(seed=7), n))
+        assert_same(rollout(env, 2, seed=5), expected)
+
+
+def test_a_close_that_was_interrupted_is_closed_again() -> None:
+    kept = []
+    for n in (1, 5, 20, 40, 80, 160):
+        env = begun(make(truth=True))
+        pid = private_pid(env)
+        kept.append(interrupted(env.close, n))
+        env.close()
+        assert eventually(lambda: not is_running(pid))  # noqa: B023
+
+
+def test_an_unfinished_step_asks_for_a_reset_of_all_worlds() -> None:
+    envs = begun(make_vec(3, autoreset_mode="Disabled"))
+    actions = action(envs, 1)
+    assert interrupted(lambda: envs.step(actions), 60)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="expected all worlds, as an earlier"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+    with fails("interrupted", match=r"did not finish .* reset\(options={'resume': True}\)"):
+        envs.step(actions)
+    envs.reset(options={"resume": True})
+    envs.reset(options={"reset_mask": np.array([True, False, False])})
+
+
+def test_a_refused_step_is_not_an_unfinished_one() -> None:
+    with serving(max_steps=1) as instance:
+        env = make(instance=instance)
+        env.reset(seed=1)
+        env.step([0, 0, 0, 0])
+        for _ in range(2):
+            with fails("episode_over"):
+                env.step([0, 0, 0, 0])
+
+
+def test_a_lone_robot_is_never_late() -> None:
+    env = begun(make())
+    env.unwrapped._session._lease._steps[:] = 0  # as if a step had gone unseen
+    with fails("late"):
+        env.step([0, 0, 0, 0])
+    with fails("interrupted"):
+        env.step([0, 0, 0, 0])
+    assert env.reset(options={"resume": True})[1]["step"] == 3
+    assert env.step([0, 0, 0, 0])[4]["step"] == 4
+
+
+@pytest.mark.parametrize("seed", [5, None])
+def test_a_reset_waits_for_the_one_that_was_interrupted(
+    monkeypatch: pytest.MonkeyPatch, seed: int | None
+) -> None:
+    started = server(burn_in=50_000)
+    env = closed_later(emberwatch.WildfireEnv(instance=started.instance))
+    env.reset(seed=1)
+    env.step([1] * 6)
+    wait = ports.Peer.wait
+
+    def interrupt(*_: object) -> None:
+        monkeypatch.setattr(ports.Peer, "wait", wait)
+        assert eventually(lambda: started.status().worlds[0].resetting)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ports.Peer, "wait", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        env.reset(seed=7)
+    if seed is None:
+        env.reset(options={"resume": True})
+    else:
+        env.reset(seed=seed)
+    assert started.status().worlds[0].seed == (seed or 7)
+    assert env.step([1] * 6)[4]["step"] == 1
+
+
+def test_a_path_that_waits_for_others_is_taken_back_by_ctrl_c() -> None:
+    started = server(robots=2)
+    env = closed_later(emberwatch.WildfireEnv(instance=started.instance, robot=0))
+    env.reset()
+    mate = started.connect().acquire(1)
+
+    def interrupt() -> None:
+        assert eventually(lambda: started.status().worlds[0].n_paths == 1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    with pytest.raises(KeyboardInterrupt) as kept:
+        thread.start()
+        env.step([1] * 6)
+    thread.join()
+    with fails("interrupted"):
+        env.step([3] * 6)
+    env.reset()
+    (_, _, _, _, info), _ = at_once(lambda: env.step([3] * 6), lambda: mate.step([3] * 6))
+    assert kept is not None
+    assert (info["step"], info["n_missed"]) == (1, 0)
+    assert env._answer.result().robot.cell == (0, 6)

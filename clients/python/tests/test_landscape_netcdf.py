@@ -1,0 +1,488 @@
+"""What CF says of NetCDF variables and their coordinates is applied, or refused by name."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import netCDF4
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import ArrayLike, NDArray
+from rasters import geotiff
+
+from emberwatch.landscape.__main__ import main
+
+#: Seconds until each cell begins to burn: the fire begins in the north-west.
+ARRIVAL = np.array([[0, 60, 120, 180], [60, 120, 180, 240], [120, 180, 240, 300]])
+MASKS = np.array([ARRIVAL <= 60 * k for k in range(4)], "u1")
+KIND = {2: ("--kind=arrival",), 3: ("--kind=mask",)}
+
+
+class Variable(NamedTuple):
+    """What is written of a variable."""
+
+    values: ArrayLike
+    kind: str
+    over: tuple[str, ...] = ()
+    given: dict[str, Any] = {}  # noqa: RUF012
+
+    def told(self, **given: Any) -> "Variable":
+        return self._replace(given=self.given | given)
+
+
+X = Variable(500_015 + 30.0 * np.arange(4), "f8", ("x",), {"units": "m", "axis": "X"})
+Y = Variable(4_000_075 - 30.0 * np.arange(3), "f8", ("y",), {"units": "m", "axis": "Y"})
+LON = Variable(0.1 * np.arange(4) - 0.1, "f8", ("lon",), {"units": "degrees_east"})
+LAT = Variable(0.2 - 0.1 * np.arange(3), "f8", ("lat",), {"units": "degrees_north"})
+TIME = Variable(np.arange(4.0), "f8", ("time",), {"units": "minutes since 2020-08-01"})
+TIMES = Variable(MASKS, "u1", ("time", "y", "x"))
+ONE = Variable(ARRIVAL, "i2", ("y", "x"), {"units": "s"})
+
+
+def written(path: Path, group: str = "", /, **variables: Variable) -> Path:
+    """A file of these variables, in a group of it; dimensions are as large as they need."""
+    with netCDF4.Dataset(path, "w") as root:
+        file = root.createGroup(group) if group else root
+        for name, (values, kind, over, given) in variables.items():
+            values = np.asarray(values)
+            for dimension, size in zip(over, values.shape, strict=True):
+                if dimension not in root.dimensions:
+                    root.createDimension(dimension, size)
+            fill = given.get("_FillValue")
+            variable = file.createVariable(name.replace("__", ":"), kind, over, fill_value=fill)
+            variable.set_auto_maskandscale(False)
+            variable.setncatts({key: told for key, told in given.items() if key != "_FillValue"})
+            variable[...] = values
+    return path
+
+
+def imported(file: Path, n_dimensions: int, *flags: str) -> NDArray[np.uint8]:
+    out = file.with_suffix(".npz")
+    burning = () if "--kind=states" in flags else ("--burning=9",)
+    kind = () if "--kind=states" in flags else KIND[n_dimensions]
+    main([str(file), *kind, "--step=1 min", *burning, f"--out={out}", "--force", *flags])
+    with np.load(out) as world:
+        return world["states_000"]
+
+
+def steps(arrival: NDArray[Any]) -> NDArray[np.uint8]:
+    """The states of these times, of which -1 is never."""
+    n_steps = int(arrival.max()) // 60 + 1
+    return np.array([(arrival >= 0) & (arrival <= 60 * k) for k in range(n_steps)], np.uint8)
+
+
+FIRE = steps(ARRIVAL)
+WITHOUT_FIRST = steps(np.where(ARRIVAL < 60, -1, ARRIVAL - 60))
+WITHOUT_LAST = steps(np.where(ARRIVAL > 240, -1, ARRIVAL))
+
+Variables = dict[str, Variable]
+
+
+def grid(variable: Variable, **coordinates: Variable) -> Variables:
+    return {"y": Y, "x": X, **coordinates, "v": variable}
+
+
+def packed(values: Any = ARRIVAL * 10, **given: Any) -> Variables:
+    return grid(ONE._replace(values=values).told(scale_factor=0.1, **given))
+
+
+def timed(kind: str, values: ArrayLike, **given: Any) -> Variables:
+    return grid(TIMES, time=TIME._replace(kind=kind, values=values).told(**given))
+
+
+def bounded(axis: Variable, name: str, half: float = 15.0) -> Variables:
+    """Coordinates at the first edges of cells, whose bounds tell the truth."""
+    values = np.asarray(axis.values)
+    edges = np.stack([values - half, values + half], axis=1)
+    (dimension,) = axis.over
+    bounds = Variable(edges, "f8", (dimension, "two"))
+    return {name: axis._replace(values=edges[:, 0]).told(bounds="edges"), "edges": bounds}
+
+
+HIGH, LOW = np.int16(2400), np.int16(600)
+
+#: What a file says, and the states of the fire in it.
+APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
+    "nothing": (grid(ONE), FIRE),
+    # Numbers.
+    "scale": (packed(), FIRE),
+    "scale and offset of 32 bits": (
+        grid(
+            ONE._replace(values=ARRIVAL // 60).told(
+                scale_factor=np.float32(60), add_offset=np.float32(6)
+            )
+        ),
+        FIRE,
+    ),
+    "limit as packed": (packed(valid_max=HIGH), WITHOUT_LAST),
+    "limit as unpacked": (packed(valid_max=1500.0), FIRE),
+    "lower limit as packed": (packed(valid_min=LOW), WITHOUT_FIRST),
+    "lower limit as unpacked": (packed(valid_min=60.0), WITHOUT_FIRST),
+    "limit that is rounded": (
+        grid(
+            ONE._replace(values=ARRIVAL // 60).told(
+                scale_factor=np.float32(1 / 60), units="h", valid_max=np.float32(3 / 60)
+            )
+        ),
+        steps(np.where(ARRIVAL > 180, -1, ARRIVAL)),
+    ),
+    "range as packed": (packed(valid_range=np.array([0, 2400], "i2")), WITHOUT_LAST),
+    "range as unpacked": (packed(valid_range=[60.0, 300.0]), WITHOUT_FIRST),
+    "limits beyond an offset": (
+        grid(
+            ONE._replace(values=ARRIVAL // 60).told(
+                scale_factor=60.0, add_offset=600.0, valid_min=600.0, valid_max=840.0
+            )
+        ),
+        WITHOUT_LAST,
+    ),
+    "limit of plain integers": (grid(ONE.told(valid_min=np.int16(60))), WITHOUT_FIRST),
+    "limit of plain numbers of 32 bits": (
+        grid(ONE._replace(values=ARRIVAL / 3600, kind="f4").told(units="h", valid_max=240 / 3600)),
+        WITHOUT_LAST,
+    ),
+    "two limits": (
+        grid(ONE.told(valid_min=np.int16(60), valid_max=np.int16(300))),
+        WITHOUT_FIRST,
+    ),
+    "missing and fill value": (
+        grid(
+            ONE._replace(
+                values=np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL))
+            ).told(missing_value=np.int16(-1), _FillValue=-2)
+        ),
+        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60)),
+    ),
+    "several missing values": (
+        grid(
+            ONE._replace(
+                values=np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL))
+            ).told(missing_value=np.array([-1, -2], "i2"))
+        ),
+        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60)),
+    ),
+    "never written": (
+        grid(ONE._replace(values=np.where(ARRIVAL == 300, -32767, ARRIVAL))),
+        WITHOUT_LAST,
+    ),
+    "unsigned": (
+        grid(
+            Variable((ARRIVAL // 2 + 100).astype("u1").view("i1"), "i1", ("y", "x")).told(
+                units="s",
+                _Unsigned="true",
+                scale_factor=2.0,
+                valid_max=np.int8(-36),
+            )
+        ),
+        WITHOUT_LAST,
+    ),
+    # Time.
+    "time": (timed("f8", [0, 1, 2, 3]), FIRE[:4]),
+    "scale of time": (timed("i2", [0, 2, 4, 6], scale_factor=0.5), FIRE[:4]),
+    "offset of time": (timed("i2", [-9, -8, -7, -6], add_offset=9.0), FIRE[:4]),
+    "both of time": (
+        timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
+        FIRE[:4],
+    ),
+    "milliseconds": (
+        timed("i4", [0, 60_000, 180_000, 240_000], units="msec"),
+        FIRE[[0, 1, 1, 2, 3]],
+    ),
+    "nanoseconds": (
+        timed("i8", np.array([0, 1, 3, 4]) * 60 * 10**9, units="nanoseconds since 2020-08-01"),
+        FIRE[[0, 1, 1, 2, 3]],
+    ),
+    "time beside its dimension": (
+        grid(
+            TIMES._replace(over=("n", "y", "x")).told(coordinates="when"),
+            when=TIME._replace(values=[0, 1, 3, 4], over=("n",)),
+        ),
+        FIRE[[0, 1, 1, 2, 3]],
+    ),
+    # Axes.
+    "columns before rows": (grid(ONE._replace(values=ARRIVAL.T, over=("x", "y"))), FIRE),
+    "columns before rows by standard names": (
+        {
+            "a": Variable(X.values, "f8", ("a",), {"standard_name": "projection_x_coordinate"}),
+            "b": Variable(Y.values, "f8", ("b",), {"standard_name": "projection_y_coordinate"}),
+            "v": ONE._replace(values=ARRIVAL.T, over=("a", "b")),
+        },
+        FIRE,
+    ),
+    "columns before rows by units": (
+        {
+            "a": LON._replace(over=("a",)),
+            "b": LAT._replace(over=("b",)),
+            "v": ONE._replace(values=ARRIVAL.T, over=("a", "b")),
+        },
+        FIRE,
+    ),
+    "columns before rows by names": (
+        {"v": ONE._replace(values=ARRIVAL.T[:, ::-1], over=("lon", "lat"))},
+        FIRE,
+    ),
+    "rows by an axis alone": (
+        {"b": Y._replace(over=("b",)), "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))},
+        FIRE,
+    ),
+    "time last": (
+        grid(TIMES._replace(values=np.moveaxis(MASKS, 0, 2), over=("y", "x", "time")), time=TIME),
+        FIRE[:4],
+    ),
+    "other names": ({"v": ONE._replace(values=ARRIVAL[::-1], over=("south", "west"))}, FIRE),
+    "rising rows": (
+        grid(ONE._replace(values=ARRIVAL[::-1]), y=Y._replace(values=np.asarray(Y.values)[::-1])),
+        FIRE,
+    ),
+    "falling columns": (
+        grid(
+            ONE._replace(values=ARRIVAL[:, ::-1]), x=X._replace(values=np.asarray(X.values)[::-1])
+        ),
+        FIRE,
+    ),
+    "packed coordinates": (
+        grid(ONE, x=Variable([0, 1, 2, 3], "i2", ("x",), {**X.given, "scale_factor": 30.0})),
+        FIRE,
+    ),
+    "coordinates of 32 bits": (
+        grid(ONE, x=X._replace(kind="f4", values=8_000_015 + 30.3 * np.arange(4))),
+        FIRE,
+    ),
+    "kilometres": (
+        grid(ONE, x=X._replace(values=np.asarray(X.values) / 1000).told(units="km")),
+        FIRE,
+    ),
+    "longitudes across 360": (
+        {
+            "lat": LAT,
+            "lon": LON._replace(values=np.asarray(LON.values) % 360),
+            "v": ONE._replace(over=("lat", "lon")),
+        },
+        FIRE,
+    ),
+    "bounds across 360": (
+        {
+            "lat": LAT,
+            "lon": LON._replace(values=np.asarray(LON.values) % 360).told(bounds="edges"),
+            "edges": Variable(
+                [[359.85, 359.95], [359.95, 0.05], [0.05, 0.15], [0.15, 0.25]], "f8", ("lon", "2")
+            ),
+            "v": ONE._replace(over=("lat", "lon")),
+        },
+        FIRE,
+    ),
+    "bounds": ({**bounded(X, "x"), "y": Y, "v": ONE}, FIRE),
+}
+
+
+@pytest.mark.parametrize("case", APPLIED)
+def test_what_a_file_says_is_applied(case: str, tmp_path: Path) -> None:
+    variables, expected = APPLIED[case]
+    file = written(tmp_path / "fire.nc", **variables)
+    states = imported(file, len(variables["v"].over), "--oblong")
+    np.testing.assert_array_equal(states, expected)
+
+
+@pytest.mark.parametrize("name", ['a"b', "a'b", "a:b", "a#b", "a b", "\udce9"])
+def test_any_name_of_a_file_is_read(name: str, tmp_path: Path) -> None:
+    file = written(tmp_path / "plain.nc", **grid(ONE)).rename(tmp_path / f"{name}.nc")
+    np.testing.assert_array_equal(imported(file, 2, "--name=fire"), FIRE)
+
+
+def test_variables_have_colons_and_groups(tmp_path: Path) -> None:
+    other = ONE._replace(values=ARRIVAL * 2)
+    file = written(tmp_path / "a.nc", y=Y, x=X, at__s=ONE, other=other)
+    np.testing.assert_array_equal(imported(file, 2, "--variable=at:s"), FIRE)
+    file = written(tmp_path / "b.nc", **grid(ONE))
+    with netCDF4.Dataset(file, "a") as root:
+        inner = root.createVariable("model/run:1/at", "i2", ("x", "y"))
+        inner[:], inner.units = 2 * ARRIVAL.T, "s"
+    assert len(imported(file, 2, "--variable=v")) == 6
+    doubled = imported(file, 2, "--variable=model/run:1/at")
+    np.testing.assert_array_equal(doubled > 0, steps(2 * ARRIVAL) > 0)
+
+
+def layer_files(folder: Path, first: Variables, second: Variables) -> NDArray[np.uint8]:
+    """Two masks of one sequence, each in a file of its own."""
+    (folder / "fire").mkdir()
+    for k, variables in enumerate((first, second)):
+        mask = Variable(MASKS[2 * k], "u1", ("y", "x"), variables.pop("v").given)
+        written(folder / "fire" / f"{k}.nc", **variables, v=mask)
+    return imported(folder / "fire", 3, "--oblong")
+
+
+def test_scalar_times_are_those_of_layers(tmp_path: Path) -> None:
+    mask = ONE._replace(given={"coordinates": "run when"})
+    files = [
+        grid(
+            mask,
+            run=Variable(0, "f8", (), {"standard_name": "forecast_reference_time", "units": "h"}),
+            when=Variable(minutes, "f8", (), TIME.given),
+        )
+        for minutes in (7, 10)
+    ]
+    np.testing.assert_array_equal(layer_files(tmp_path, *files), MASKS[[0, 0, 0, 2]])
+
+
+def test_the_date_has_the_offset_of_packed_times(tmp_path: Path) -> None:
+    imported(written(tmp_path / "a.nc", **timed("i2", [-9, -8, -7, -6], add_offset=99.0)), 3)
+    text = (tmp_path / "a.toml").read_text("utf-8")
+    assert "# states_000 begins at 2020-08-01 01:30:00 UTC" in text
+
+
+def test_bounds_say_where_cells_are(tmp_path: Path) -> None:
+    edged = {**bounded(X, "x"), "y": Y, "v": ONE}
+    np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
+
+
+def test_longitudes_of_360_degrees_are_those_of_180(tmp_path: Path) -> None:
+    west, east = (
+        {
+            "y": Variable(LAT.values, "f8", ("y",), LAT.given),
+            "x": Variable(np.asarray(LON.values) + shift, "f8", ("x",), LON.given),
+            "v": ONE,
+        }
+        for shift in (-120, 240)
+    )
+    np.testing.assert_array_equal(layer_files(tmp_path, west, east), MASKS[[0, 2]])
+
+
+def test_a_grid_mapping_is_the_projection(tmp_path: Path) -> None:
+    folder = tmp_path / "both"
+    folder.mkdir()
+    place = {"corner": (500_000, 4_000_090)}
+    wkt = rasterio.open(geotiff(folder / "0.tif", MASKS[0], nodata=None, **place)).crs.to_wkt()
+    mapping = Variable(0, "i4", (), {"grid_mapping_name": "transverse_mercator", "crs_wkt": wkt})
+    other = Variable(0, "i4", (), {"grid_mapping_name": "latitude_longitude"})
+    mask = Variable(MASKS[2], "u1", ("y", "x"), {"grid_mapping": "other: lat lon crs: x y"})
+    written(folder / "1.nc", **grid(mask), crs=mapping, other=other)
+    np.testing.assert_array_equal(imported(folder, 3), MASKS[[0, 2]])
+
+
+CURVED = Variable(np.zeros((3, 4)), "f8", ("y", "x"), {"units": "degrees_north"})
+
+#: What a file says, flags, and words of the refusal.
+REFUSED: dict[str, tuple[Variables, tuple[str, ...], str]] = {
+    "uneven columns": (
+        grid(ONE, x=X._replace(values=[15, 45, 75, 165])),
+        (),
+        "a.nc, x: expected cells of one size side by side, got some of 30 and some of 90",
+    ),
+    "uneven bounds": (
+        {**bounded(X, "x", half=10.0), "y": Y, "v": ONE},
+        (),
+        "a.nc, x: expected cells of one size side by side, got some of 20 and some of 30",
+    ),
+    "coordinates that stand still": (
+        grid(ONE, x=X._replace(values=[15, 15, 15, 15])),
+        (),
+        "a.nc, x: expected cells of one size side by side, got some of 0 and some of 0",
+    ),
+    "missing coordinate": (
+        grid(ONE, x=X._replace(values=[15, 45, -1, 105]).told(missing_value=-1.0)),
+        (),
+        "a.nc, x: expected cells of one size side by side, got some of nan",
+    ),
+    "endless coordinate": (
+        grid(ONE, x=X._replace(values=[-np.inf, 45, 75, np.inf])),
+        (),
+        "a.nc, x: expected cells of one size side by side, got some of 30 and some of inf",
+    ),
+    "bounds of nothing": (
+        grid(ONE, x=X.told(bounds="edges")),
+        (),
+        "a.nc, x, bounds: expected two for each cell, got 'edges'",
+    ),
+    "coordinates of words": (
+        grid(ONE, x=X.told(units="furlongs")),
+        (),
+        "a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'",
+    ),
+    "degrees and metres": (
+        grid(ONE, x=X.told(units="degrees_east")),
+        (),
+        "a.nc: expected rows and columns in one unit, got degrees and metres",
+    ),
+    "two columns": (
+        grid(ONE, y=Y.told(axis="X")),
+        (),
+        "a.nc: expected a variable of time, rows and columns, got it over y, x",
+    ),
+    "an axis with two names": (
+        grid(ONE, y=Y.told(standard_name="longitude")),
+        (),
+        "a.nc, y: expected one axis, got X and Y",
+    ),
+    "heights": (
+        grid(
+            TIMES._replace(over=("z", "y", "x")),
+            z=Variable(np.arange(4), "f8", ("z",), {"axis": "Z"}),
+        ),
+        (),
+        "a.nc: expected a variable of time, rows and columns, got it over z",
+    ),
+    "curved rows": (
+        {"lat": CURVED, "v": ONE.told(coordinates="lat lon")},
+        (),
+        "a.nc: expected coordinates of one dimension, got lat over y, x; reproject it",
+    ),
+    "no cells": (
+        {"v": Variable(np.zeros((0, 3, 4)), "u1", ("time", "y", "x"))},
+        (),
+        "a.nc: expected cells, got 0 x 3 x 4",
+    ),
+    "scale in words": (
+        grid(ONE.told(scale_factor="0.1")),
+        (),
+        "a.nc, scale_factor: expected a number, got 0.1",
+    ),
+    "range of one number": (
+        grid(ONE.told(valid_range=np.int16(3))),
+        (),
+        "a.nc, valid_range: expected two numbers, got 3",
+    ),
+    "limit of another type": (
+        packed(valid_max=np.float32(1500)),
+        (),
+        "a.nc, valid_max: expected the type of the numbers, int16, or of scale_factor, float64, "
+        "got float32",
+    ),
+    "months": (
+        timed("f8", [0, 1, 2, 3], units="months since 2020-08-01"),
+        (),
+        "expected times in days or smaller units, got 'months since 2020-08-01'; --unit says",
+    ),
+    "a time that is missing": (
+        timed("f8", [0, 1, -1, 3], missing_value=-1.0),
+        (),
+        "a.nc, band 3: expected a time, got nan",
+    ),
+    "years put together": (
+        timed("f8", [0, 1, 2, 3], climatology="edges"),
+        (),
+        "a.nc, time: expected no climatology, got 'edges'",
+    ),
+    "codes that mean something else": (
+        grid(TIMES.told(flag_values=np.array([0, 1, 2], "u1"), flag_meanings="burnt fire unburnt")),
+        ("--kind=states",),
+        "flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes say",
+    ),
+    "a mask of what has not burnt": (
+        grid(TIMES.told(flag_values=np.array([0, 1], "u1"), flag_meanings="burned unburned")),
+        (),
+        "flag_meanings: expected 0 to mean unburnt, got 'burned'; --kind and --codes say",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_applied_is_refused_by_name(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    variables, flags, words = REFUSED[case]
+    file = written(tmp_path / "a.nc", **variables)
+    with pytest.raises(SystemExit):
+        imported(file, len(variables["v"].over), *flags)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert list(tmp_path.iterdir()) == [file], "nothing is written"

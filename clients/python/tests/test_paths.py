@@ -1,0 +1,121 @@
+"""Paths with letters that the locale, or UTF-8, does not have."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import LIVELY, RECORDED, SMALL, WILDFIRE, serving
+from failures import refuses
+from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, netcdf
+
+import emberwatch
+from emberwatch.model import Model
+
+#: A locale of ASCII alone, and one of UTF-8 whose output takes nothing else.
+PLAIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+STRICT = {"LC_ALL": "C.UTF-8", "PYTHONIOENCODING": "utf-8:strict"}
+LATIN = os.fsdecode(b"fire \xe9")
+EXPECTED = "expected UTF-8, and a locale that has its letters, such as LC_ALL=C.UTF-8, got "
+
+USE = """
+import sys, gymnasium, emberwatch
+from emberwatch.model import Model
+folder, instance = sys.argv[1:]
+Model.named(f"{folder}/m.toml")
+for keywords in ({"states": f"{folder}/fire.npz"}, {"model": f"{folder}/m.toml", "height": 7}):
+    gymnasium.make("emberwatch/Wildfire-v0", **keywords).close()
+with emberwatch.connect(instance) as client, client.acquire(takeover=True) as lease:
+    client.snapshot(f"{folder}/a.snapshot")
+    lease.restore(f"{folder}/a.snapshot")
+try:
+    gymnasium.make("emberwatch/Wildfire-v0", states=f"{folder}/none.npz")
+except emberwatch.EmberwatchError as error:
+    print(ascii(str(error)))
+"""
+
+
+def run(locale: dict[str, str], *arguments: object) -> tuple[int, str, str]:
+    """What a Python of this locale returns and says."""
+    command = [sys.executable, *map(os.fsencode, map(str, arguments))]
+    done = subprocess.run(command, env=os.environ | locale, capture_output=True)
+    return done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr)
+
+
+def filled(folder: Path) -> Path:
+    folder.mkdir()
+    np.savez(folder / "fire.npz", states=np.eye(4, dtype=np.uint8)[None].repeat(3, axis=0))
+    shutil.copy(RECORDED, folder / "fire.toml")
+    shutil.copy(LIVELY, folder / "m.toml")
+    return folder
+
+
+def test_worlds_come_from_any_folder_in_any_locale(tmp_path: Path) -> None:
+    folder = filled(tmp_path / "fire \xe9")
+    with serving() as instance:
+        for locale in (PLAIN, STRICT):
+            code, out, err = run(locale, "-c", USE, folder, instance)
+            assert (code, err) == (0, "")
+            assert "/fire \\xe9/none.npz: No such file" in out
+
+
+def test_rasters_come_from_any_folder_in_any_locale(tmp_path: Path) -> None:
+    folder = tmp_path / "fire \xe9"
+    folder.mkdir()
+    np.save(folder / "a.npy", np.where(ARRIVAL == NEVER, np.inf, ARRIVAL))
+    geotiff(folder / "a.tif"), ascii_grid(folder / "a.asc"), netcdf(folder / "a.nc", at=ARRIVAL)
+    flags = ("--kind=arrival", "--unit=min", "--step=10 min", "--burning=2", "--force")
+    for locale in (PLAIN, STRICT):
+        for ending in ("npy", "tif", "asc", "nc"):
+            out = folder / "fire \xe9.npz"
+            called = ("-m", "emberwatch.landscape", folder / f"a.{ending}", *flags, "--out", out)
+            code, told, err = run(locale, *called)
+            assert (code, err) == (0, "") and str(out) in told
+            assert 'name = "fire \xe9"' in out.with_suffix(".toml").read_text("utf-8")
+
+
+@pytest.mark.parametrize("locale", [PLAIN, STRICT], ids=["plain", "strict"])
+def test_rasters_of_other_letters_are_read_or_refused(
+    locale: dict[str, str], tmp_path: Path
+) -> None:
+    folder = tmp_path / LATIN
+    folder.mkdir()
+    geotiff(tmp_path / "a.tif").rename(folder / "a.tif")
+    netcdf(tmp_path / "a.nc", at=ARRIVAL).rename(folder / "a.nc")
+    flags = ("--kind=arrival", "--unit=min", "--step=10 min", "--burning=2", "--out")
+    call = ("-m", "emberwatch.landscape")
+    code, _, err = run(locale, *call, folder / "a.nc", *flags, folder / "a.npz")
+    assert (code, err) == (0, "")
+    for file, out, subject in (
+        (folder / "a.tif", folder / "b.npz", "file"),
+        (folder / "a.nc", folder / f"{LATIN}.npz", "--name"),
+    ):
+        code, _, err = run(locale, *call, file, *flags, out)
+        (line,) = err.splitlines()
+        assert (code, f": {subject}: {EXPECTED}" in line) == (2, True)
+
+
+@pytest.mark.parametrize("name", [LATIN, "a\0b"], ids=["latin", "nul"])
+def test_other_paths_of_worlds_are_refused_by_name(name: str) -> None:
+    calls: dict[str, Callable[[], Any]] = {
+        "states": lambda: gymnasium.make(WILDFIRE, states=f"{name}.npz"),
+        "model": lambda: gymnasium.make(WILDFIRE, **SMALL | {"model": Path(f"{name}.toml")}),
+        "^model": lambda: Model.named(f"{name}.toml"),
+    }
+    for subject, call in calls.items():
+        with refuses(f"{subject}: {EXPECTED}"):
+            call()
+    with (
+        serving() as instance,
+        emberwatch.connect(instance) as client,
+        client.acquire() as lease,
+    ):
+        for call in (client.snapshot, lease.restore):
+            with refuses(f"path: {EXPECTED}"):
+                call(name)

@@ -1,0 +1,13 @@
+"""The tutorial of the documentation site, as a user runs it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_the_tutorial_shows_what_it_says(tmp_path: Path) -> None:
+    command = [sys.executable, ROOT / "scripts/notebook.py", ROOT / "docs/tutorial.ipynb"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,92 @@
+//! Memory for a server's messages. There must be enough for all clients and observers before a server starts. Each gets
+//! its part when it comes, so that few clients take little, and a server writes only where there is memory.
+
+use super::ports::PortConfig;
+use anyhow::{Result, anyhow};
+use protocol::channels::{
+    ChannelError, FRAME_BUFFER, MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+    check_room,
+};
+use protocol::responder::JSON_SLICE;
+use protocol::shared_memory::MessageMemory;
+
+/// Bytes that iceoryx2 adds to each message, at most.
+const MESSAGE_OVERHEAD: usize = 512;
+
+/// Shared memory for everything of fixed size: control messages, events, tables.
+const FIXED_BYTES: u64 = 8 << 20;
+
+/// Answers to one client, as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
+const ANSWERS: usize = 2 * 3;
+
+/// Memory for the messages of a server's ports.
+pub struct Memory {
+    control: MessageMemory,
+    step: MessageMemory,
+    frames: MessageMemory,
+    truth: Option<MessageMemory>,
+}
+
+/// The ids of a server's ports.
+pub struct PortIds {
+    pub control: u128,
+    pub step: u128,
+    pub frames: u128,
+    pub truth: Option<u128>,
+}
+
+impl Memory {
+    /// That of these ports, with enough for a first client.
+    pub fn new(ids: &PortIds, config: &PortConfig) -> Result<Self, ChannelError> {
+        let n_answers = MAX_CLIENTS * ANSWERS;
+        let truth = ids.truth.map(|id| {
+            let n_truths = samples(MAX_TRUTH_READERS, TRUTH_BUFFER);
+            MessageMemory::of(id, n_truths, config.n_cells)
+        });
+        let n_frames = samples(MAX_OBSERVERS, FRAME_BUFFER);
+        let memory = Self {
+            control: MessageMemory::of(ids.control, n_answers, JSON_SLICE)?,
+            step: MessageMemory::of(ids.step, n_answers, config.answer_bytes)?,
+            frames: MessageMemory::of(ids.frames, n_frames, config.frame_bytes)?,
+            truth: truth.transpose()?,
+        };
+        memory.for_clients(1)?;
+        Ok(memory)
+    }
+
+    /// Makes memory ready for answers to so many clients.
+    pub fn for_clients(&self, n_clients: usize) -> Result<(), ChannelError> {
+        self.control.make_ready(n_clients * ANSWERS)?;
+        self.step.make_ready(n_clients * ANSWERS)
+    }
+
+    /// Makes memory ready for frames to so many observers.
+    pub fn for_observers(&self, n_observers: usize) -> Result<(), ChannelError> {
+        self.frames.make_ready(samples(n_observers, FRAME_BUFFER))
+    }
+
+    /// Makes memory ready for hidden states to so many readers.
+    pub fn for_readers(&self, n_readers: usize) -> Result<(), ChannelError> {
+        let n_truths = samples(n_readers, TRUTH_BUFFER);
+        self.truth
+            .as_ref()
+            .map_or(Ok(()), |it| it.make_ready(n_truths))
+    }
+}
+
+/// Samples in use at a time: a buffer and one that is read for each, the last and the next.
+fn samples(n_subscribers: usize, buffer: usize) -> usize {
+    n_subscribers * (buffer + 1) + 2
+}
+
+/// Checks that `/dev/shm` has enough room for all clients and observers that there may be.
+pub fn check_shared_memory(config: &PortConfig) -> Result<()> {
+    let bytes =
+        |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
+    let answers = bytes(MAX_CLIENTS * ANSWERS, config.answer_bytes);
+    let frames = bytes(samples(MAX_OBSERVERS, FRAME_BUFFER), config.frame_bytes);
+    let truth = bytes(samples(MAX_TRUTH_READERS, TRUTH_BUFFER), config.n_cells);
+    let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
+    check_room(needed)
+        .map_err(|error| anyhow!("{error}, or serve fewer worlds or robots, or a smaller grid"))
+}

@@ -1,0 +1,118 @@
+//! What ports take of the system: shared memory, files, descriptors. Who makes ports asks first, and if iceoryx2 fails
+//! all the same, the error names what is missing.
+
+use super::error::ChannelError;
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::fs::statvfs;
+use rustix::io::Errno;
+use rustix::process::{Resource, getrlimit};
+use std::fmt::Debug;
+use std::os::fd::OwnedFd;
+
+/// Where iceoryx2 keeps shared memory: a folder that every user may write to.
+pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// What to do if it is full.
+pub(super) const REMEDY: &str = "free some, or give the container more (docker: --shm-size)";
+
+/// What the ports of a client or an observer take, beside its longest messages: 190 KiB (measured).
+const PORT_BYTES: u64 = 512 << 10;
+
+/// The files of these: 25 (measured).
+const PORT_FILES: u64 = 48;
+
+/// Their descriptors.
+const PORT_DESCRIPTORS: usize = 10;
+
+/// Checks that there is room for the ports of a connection, and for a message of them.
+///
+/// # Errors
+/// If not.
+pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelError> {
+    check_room(PORT_BYTES + message_bytes as u64)
+}
+
+/// Checks that so many bytes of shared memory are free, and as many files as the ports of a connection are.
+///
+/// # Errors
+/// If not.
+pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
+    let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
+    if limit < n_bytes {
+        let (needed, limit) = (in_words(n_bytes), in_words(limit));
+        return no_room(format!(
+            "expected a limit on file sizes of at least {needed}, got {limit}; raise it (`ulimit -f`)"
+        ));
+    }
+    let Ok(found) = statvfs(SHARED_MEMORY) else {
+        return Ok(());
+    };
+    let free = found.f_bavail.saturating_mul(found.f_frsize);
+    if free < n_bytes {
+        let (needed, free) = (in_words(n_bytes), in_words(free));
+        return no_room(format!(
+            "expected {needed} free in {SHARED_MEMORY}, got {free}"
+        ));
+    }
+    // A file system without a limit says 0 of 0.
+    if found.f_files > 0 && found.f_favail < PORT_FILES {
+        let free = found.f_favail;
+        return no_room(format!(
+            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
+             nr_inodes)"
+        ));
+    }
+    Ok(())
+}
+
+pub(super) fn no_room<T>(problem: String) -> Result<T, ChannelError> {
+    Err(ChannelError::NoRoom { problem })
+}
+
+/// A number of bytes, rounded to the next KiB or MiB.
+pub(super) fn in_words(n_bytes: u64) -> String {
+    match n_bytes >> 20 {
+        0..10 => format!("{} KiB", n_bytes.div_ceil(1 << 10)),
+        _ => format!("{} MiB", n_bytes.div_ceil(1 << 20)),
+    }
+}
+
+/// Adds context to an error of iceoryx2, whose cause is asked of the system where iceoryx2 does not tell it.
+pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
+    limited_error(what, "64 processes")
+}
+
+/// As [`ipc_error`], for what there may be so many of.
+pub fn limited_error<E: Debug>(
+    what: &'static str,
+    most: &'static str,
+) -> impl Fn(E) -> ChannelError {
+    move |error| {
+        let problem = format!("{error:?}");
+        if problem.contains("ExceedsMaxSupported") || problem.contains("ExceedsMaxNumberOf") {
+            return ChannelError::NoPlace { what, most };
+        }
+        let no_descriptors = check_descriptors(what).err();
+        no_descriptors
+            .or_else(|| check_room_for_ports(0).err())
+            .unwrap_or(ChannelError::Ipc { what, problem })
+    }
+}
+
+/// Checks that descriptors are left for the ports of a connection.
+fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
+    free_descriptors().map_err(|_| ChannelError::NoDescriptors {
+        what,
+        needed: PORT_DESCRIPTORS,
+        limit: (getrlimit(Resource::Nofile).current).map_or("the system".into(), |n| n.to_string()),
+    })
+}
+
+/// Opens as many descriptors as the ports of a connection take, and closes them again.
+///
+/// # Errors
+/// The system's, if there are not as many.
+pub(super) fn free_descriptors() -> Result<(), Errno> {
+    let opened = (0..PORT_DESCRIPTORS).map(|_| eventfd(0, EventfdFlags::CLOEXEC));
+    opened.collect::<Result<Vec<OwnedFd>, Errno>>().map(drop)
+}

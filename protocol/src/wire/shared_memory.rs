@@ -1,0 +1,136 @@
+//! Memory for ports. Files in shared memory are sparse, and a write to a page for which there is no memory ends the
+//! process with SIGBUS. So programs give memory to what they may write to, before they do.
+
+use super::channel_files::ChannelFiles;
+use super::directory::directory_error;
+use super::error::{ChannelError, Ipc};
+use super::resources::{REMEDY, SHARED_MEMORY, check_room, in_words, no_room};
+use iceoryx2::node::Node;
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::io::Errno;
+use std::cell::Cell;
+use std::collections::HashSet;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// The memory of one port's messages. They lie one after the other at its end, and the first free one is taken, so
+/// memory for the first ones is enough while no more are in use.
+#[derive(Debug)]
+pub struct MessageMemory {
+    path: PathBuf,
+    file: File,
+    n_bytes: u64,
+    message_bytes: u64,
+    n_messages: u64,
+    n_ready: Cell<u64>,
+}
+
+/// Gives memory to what a node's ports and services write to, but not to messages of the server's.
+///
+/// # Errors
+/// If there is not enough.
+pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelError> {
+    let files = ChannelFiles::of_user();
+    let wrong = |error: std::io::Error| directory_error(&files.root, error.to_string());
+    let used = files
+        .used(&HashSet::from([node.id().value()]))
+        .map_err(wrong)?;
+    let services = files.service_ids(&used).map_err(wrong)?;
+    for path in files.segments().map_err(wrong)? {
+        let ids = files.ids(&path);
+        let is_ours = ids
+            .iter()
+            .any(|id| used.ids.contains(id) || services.contains(id));
+        let is_message_memory = path.extension().is_some_and(|kind| kind == "data");
+        if is_ours && (with_messages || !is_message_memory) {
+            fill_whole(&path)?;
+        }
+    }
+    Ok(())
+}
+
+impl MessageMemory {
+    /// That of a port which has at least `n_messages` of at least `message_bytes`.
+    ///
+    /// # Errors
+    /// If its file is not there.
+    pub fn of(port: u128, n_messages: usize, message_bytes: usize) -> Result<Self, ChannelError> {
+        let files = ChannelFiles::of_user();
+        let wrong =
+            |error: std::io::Error| directory_error(SHARED_MEMORY.as_ref(), error.to_string());
+        // Memory that may grow has the number of its first file in its name.
+        let ends = [format!("_{port}.data"), format!("_{port}__0.data")];
+        let is_of_port = |path: &PathBuf| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            ends.iter().any(|end| name.ends_with(end))
+        };
+        let path = files
+            .segments()
+            .map_err(wrong)?
+            .into_iter()
+            .find(is_of_port);
+        let path =
+            path.ok_or_else(|| wrong(std::io::Error::other(format!("no memory of port {port}"))))?;
+        let file = open(&path)?;
+        let found = file
+            .metadata()
+            .map_err(|error| directory_error(&path, error.to_string()))?;
+        Ok(Self {
+            n_bytes: found.len(),
+            path,
+            file,
+            message_bytes: message_bytes as u64,
+            n_messages: n_messages as u64,
+            n_ready: Cell::new(0),
+        })
+    }
+
+    /// Makes so many messages ready to be written.
+    ///
+    /// # Errors
+    /// If there is not enough memory for them.
+    pub fn make_ready(&self, n_messages: usize) -> Result<(), ChannelError> {
+        let n_messages = (n_messages as u64).min(self.n_messages);
+        let n_ready = self.n_ready.get();
+        if n_messages <= n_ready {
+            return Ok(());
+        }
+        let unused = (self.n_messages - n_messages) * self.message_bytes;
+        if n_ready > 0 {
+            check_room((n_messages - n_ready) * self.message_bytes)?;
+        }
+        fill(&self.path, &self.file, self.n_bytes.saturating_sub(unused))?;
+        self.n_ready.set(n_messages);
+        Ok(())
+    }
+}
+
+fn fill_whole(path: &Path) -> Result<(), ChannelError> {
+    let file = open(path)?;
+    let found = file
+        .metadata()
+        .map_err(|error| directory_error(path, error.to_string()))?;
+    fill(path, &file, found.len())
+}
+
+fn open(path: &Path) -> Result<File, ChannelError> {
+    let opened = File::options().write(true).open(path);
+    opened.map_err(|error| directory_error(path, error.to_string()))
+}
+
+/// Gives memory to the first bytes of a file; what is in them stays.
+fn fill(path: &Path, file: &File, n_bytes: u64) -> Result<(), ChannelError> {
+    loop {
+        match fallocate(file, FallocateFlags::empty(), 0, n_bytes.max(1)) {
+            Ok(()) | Err(Errno::OPNOTSUPP) => return Ok(()),
+            Err(Errno::INTR) => {}
+            Err(errno @ (Errno::NOSPC | Errno::NOMEM | Errno::DQUOT)) => {
+                let needed = in_words(n_bytes);
+                return no_room(format!(
+                    "expected {needed} in {SHARED_MEMORY}, got: {errno}; {REMEDY}"
+                ));
+            }
+            Err(errno) => return Err(directory_error(path, errno.to_string())),
+        }
+    }
+}

@@ -1,0 +1,127 @@
+"""Puts the pages of the documentation site into a folder: `site.py FOLDER`.
+
+They are `docs` and the repository's other documents as they are, so that nothing is written twice:
+only links become links of the site, and a notebook becomes a page.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import posixpath
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Documents outside `docs`, and their pages.
+OUTSIDE = {
+    "README.md": "index.md",
+    "ARCHITECTURE.md": "architecture.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "PROTOCOL.md": "protocol.md",
+    "REPRODUCTION.md": "reproduction.md",
+    "clients/dashboard/page/icon.svg": "assets/icon.svg",
+    "clients/python/README.md": "python.md",
+    "config/landscapes/jacksboro/README.md": "jacksboro.md",
+}
+
+#: An index for readers of the repository; the site has its navigation.
+LEFT_OUT = {"docs/README.md"}
+
+#: The home page has no list of pages at its side.
+HOME = "---\nhide: [navigation]\n---\n\n"
+
+FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
+#: What follows the language of a fence means something to tests alone.
+INFO = re.compile(r"\A(```\w+)[^\n]*")
+LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
+NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
+
+
+def pages() -> dict[str, str]:
+    """Each file that the site has, by its place in the repository: its place on the site."""
+    found = dict(OUTSIDE)
+    for path in sorted((ROOT / "docs").rglob("*")):
+        source = path.relative_to(ROOT).as_posix()
+        if path.is_file() and source not in LEFT_OUT:
+            found[source] = source.removeprefix("docs/")
+            if path.suffix == ".ipynb":
+                found[source] = found[source].removesuffix("ipynb") + "md"
+    return found
+
+
+def linked(text: str, source: str, found: dict[str, str]) -> str:
+    """A document with links of the site; a link to what the site lacks stays as its words."""
+    here, n_pictures = posixpath.dirname(found[source]) or ".", 0
+
+    def link(match: re.Match[str]) -> str:
+        nonlocal n_pictures
+        mark, words, target, anchor = match.groups()
+        n_pictures += bool(mark)
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+        if path in found:
+            # All pictures but the first are loaded when they come into sight.
+            later = "{loading=lazy}" if mark and n_pictures > 1 else ""
+            return f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
+        if (ROOT / path).exists():
+            return words
+        raise SystemExit(f"{source}: expected a file of the repository, got {target}")
+
+    def name(match: re.Match[str]) -> str:
+        page = found.get(match[1])
+        if page is None or match[1] == source:
+            return match[0]
+        return f"[{match[0]}]({posixpath.relpath(page, here)})"
+
+    parts = FENCE.split(text)
+    for index, part in enumerate(parts):
+        if part.startswith("```"):
+            parts[index] = INFO.sub(r"\1", part)
+        else:
+            parts[index] = NAMED.sub(name, LINK.sub(link, part))
+    return "".join(parts)
+
+
+def page_of(notebook: dict[str, Any], name: str) -> str:
+    """A notebook as Markdown: texts, code, and below it what it wrote and drew."""
+    parts = list[str]()
+    for cell in notebook["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        parts += [shown(output) for output in cell.get("outputs", [])]
+    return "\n\n".join([*parts, f'<a href="{name}" download>This page as a notebook</a>\n'])
+
+
+def shown(output: dict[str, Any]) -> str:
+    """What a cell wrote or drew."""
+    result = output.get("data", {"text/plain": output.get("text", "")})
+    if "image/png" in result:
+        picture = "".join(result["image/png"]).replace("\n", "")
+        return f'<img alt="What this code draws" src="data:image/png;base64,{picture}">'
+    return f"<pre><code>{html.escape(''.join(result['text/plain']))}</code></pre>"
+
+
+def main() -> None:
+    """Writes all pages."""
+    out, found = Path(sys.argv[1]), pages()
+    shutil.rmtree(out, ignore_errors=True)
+    for source, page in found.items():
+        path, place = ROOT / source, out / page
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".ipynb":
+            shutil.copy(path, place.with_suffix(".ipynb"))
+            place.write_text(page_of(json.loads(path.read_text("utf-8")), path.name), "utf-8")
+        elif path.suffix == ".md":
+            text = linked(path.read_text("utf-8"), source, found)
+            place.write_text(HOME + text if page == "index.md" else text, "utf-8")
+        else:
+            shutil.copy(path, place)
+
+
+if __name__ == "__main__":
+    main()
