@@ -96,8 +96,10 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
     let start = Instant::now();
     while !missing.is_empty() {
         let remaining = PATIENCE.saturating_sub(start.elapsed());
-        let sample = observer.receive(remaining).expect("receive");
-        let sample = sample.unwrap_or_else(|| panic!("no belief about worlds {missing:?}"));
+        let sample = observer
+            .receive(remaining)
+            .expect("receive")
+            .unwrap_or_else(|| panic!("no belief about worlds {missing:?}"));
         missing.remove(&sample.header.world);
         std::thread::sleep(Duration::from_millis(2)); // as a dashboard looks
     }

@@ -7,8 +7,9 @@ use tests::fuzz::campaign::Campaign;
 fn every_decoder_stands_ten_thousand_inputs() {
     for target in TARGETS {
         let campaign = Campaign::new(target, 1).expect("its corpus");
-        let report = campaign.run(10_000);
-        let report = report.unwrap_or_else(|failure| panic!("{failure}"));
+        let report = campaign
+            .run(10_000)
+            .unwrap_or_else(|failure| panic!("{failure}"));
         let share = report.n_accepted * 100 / report.n_inputs;
         let name = target.name;
         assert!((1..100).contains(&share), "{name}: {share} % accepted");

@@ -80,8 +80,10 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     frames_until(&observer, 2, 0);
     let restore = |flags: &str| format!("restore {file} {flags}");
     server.command(&restore("--from 0 --worlds 1")).check(0);
-    let shown = observer.receive(PATIENCE).expect("receive");
-    let shown = shown.expect("a frame");
+    let shown = observer
+        .receive(PATIENCE)
+        .expect("receive")
+        .expect("a frame");
     assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
     assert_eq!(server.observe(0), server.observe(1));
     let mut first = server.acquire(0..1);
@@ -376,11 +378,13 @@ fn with_short_burn_in(file: &Path) -> PathBuf {
     let spec = small_spec(ENDLESS);
     let snapshot = decode(&bytes).expect("a snapshot");
     let restored = snapshot.restore(&spec).expect("of that server");
-    let worlds = restored.iter().map(|world| match world {
-        SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
-        SnapshotWorld::New(new) => SnapshotWorld::New(*new),
-    });
-    let worlds: Vec<_> = worlds.collect();
+    let worlds: Vec<_> = restored
+        .iter()
+        .map(|world| match world {
+            SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
+            SnapshotWorld::New(new) => SnapshotWorld::New(*new),
+        })
+        .collect();
     let copy = file.with_extension("copy");
     let bytes = encode(&small_spec(20).settings, &worlds).expect("small");
     std::fs::write(&copy, bytes).expect("write");

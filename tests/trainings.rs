@@ -52,8 +52,8 @@ impl Place {
 
     /// The rows of the metrics.
     pub fn rows(&self, out: &str) -> Vec<Vec<String>> {
-        let text = std::fs::read_to_string(self.path(out).join("metrics.csv"));
-        let text = text.expect("the metrics");
+        let text =
+            std::fs::read_to_string(self.path(out).join("metrics.csv")).expect("the metrics");
         let mut lines = text.lines();
         assert_eq!(lines.next(), Some(self.header));
         let rows = lines.map(|line| line.split(',').map(String::from).collect());

@@ -21,7 +21,7 @@ const MAX_WORLDS: u32 = 1024;
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";
 
-/// Every setting; `config/server.toml` says what each means, and `flags.rs`.
+/// Every setting; `config/server.toml` and `flags.rs` explain each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ServerConfig {
@@ -52,12 +52,12 @@ pub struct ServerConfig {
     pub snapshot_keep: u32,
 }
 
-/// Settings that were checked, and what they name.
+/// Checked settings, with the model and the recorded worlds that they name.
 #[derive(Debug, Clone)]
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
-    /// Of recorded worlds an unchanging one.
+    /// That of recorded worlds has no changes.
     pub model: Model,
     pub shape: Shape,
     pub recorded: Option<CheckedStates>,
@@ -219,12 +219,12 @@ impl ServerConfig {
         (self.burn_in, self.model) = (0, String::new());
         let checksum = file.sequences.checksum();
         let (symmetries, offset) = (self.states_symmetries, self.states_offset);
-        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset);
-        let recorded = recorded.map_err(|most| ConfigError::Range {
-            setting: "states_offset",
-            expected: format!("0 to {most}, as the shortest sequence allows"),
-            got: offset.to_string(),
-        })?;
+        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset)
+            .map_err(|most| ConfigError::Range {
+                setting: "states_offset",
+                expected: format!("0 to {most}, as the shortest sequence allows"),
+                got: offset.to_string(),
+            })?;
         let description = toml::to_string(&file.description);
         let states = CheckedStates {
             description: description.expect("invariant: a description was read from TOML"),

@@ -95,8 +95,9 @@ impl Sequences {
             if !name.ends_with(".npy") {
                 return Err(format!("expected arrays alone, got the member {name:?}"));
             }
-            let member = archive.by_name(name);
-            let member = member.map_err(|error| format!("array {:?}: {error}", bare(name)))?;
+            let member = archive
+                .by_name(name)
+                .map_err(|error| format!("array {:?}: {error}", bare(name)))?;
             let n_bytes = member.size();
             self.add_array(bare(name), n_bytes, member)?;
         }
@@ -233,8 +234,9 @@ fn read_description(path: &Path) -> anyhow::Result<(Description, Model)> {
 /// The arrays and archives in a folder, in the order of their names.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
-    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
-    let paths: Result<Vec<PathBuf>, _> = paths.collect();
+    let paths: Result<Vec<PathBuf>, _> = entries
+        .map(|entry| entry.map(|entry| entry.path()))
+        .collect();
     let mut files = paths.map_err(|error| error.to_string())?;
     files.retain(|file| is_array(file) || is_archive(file));
     files.sort();

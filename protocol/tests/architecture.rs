@@ -1,5 +1,5 @@
 //! ARCHITECTURE.md names every room and file rightly; rooms use only those below them; no file depends on itself by
-//! way of others. The index of documents is complete.
+//! way of others. The index of documents is complete, and so are programs of several test files.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -32,11 +32,8 @@ const CRATES: [&str; 9] = [
     "tests",
 ];
 
-/// Each file with the files it depends on.
-type Graph = BTreeMap<PathBuf, BTreeSet<PathBuf>>;
-
-/// A crate's modules, from the root down, with their files.
-type Modules = BTreeMap<Vec<String>, PathBuf>;
+/// Each file of a crate, by the path of its module from the root, with the files it depends on.
+type Graph = BTreeMap<Vec<String>, BTreeSet<Vec<String>>>;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -139,6 +136,31 @@ fn the_index_of_documents_is_complete() {
 }
 
 #[test]
+fn every_test_file_is_in_its_program() {
+    for name in [
+        "agent",
+        "agent/belief",
+        "clients/dashboard",
+        "protocol",
+        "tests",
+    ] {
+        let folder = root()
+            .join(name)
+            .join(if name == "tests" { "" } else { "tests" });
+        let program = std::fs::read_to_string(folder.join("main.rs")).expect("a program");
+        let entries = std::fs::read_dir(folder).expect("a folder");
+        let names = entries.map(|entry| entry.expect("a file").file_name());
+        let names: Vec<String> = names.filter_map(|name| name.into_string().ok()).collect();
+        let stems = names.iter().filter_map(|name| name.strip_suffix(".rs"));
+        let missing: Vec<&str> = stems
+            .filter(|stem| !["main", "decoders"].contains(stem))
+            .filter(|stem| !program.contains(&format!("mod {stem};")))
+            .collect();
+        assert!(missing.is_empty(), "{name}: not in main.rs: {missing:?}");
+    }
+}
+
+#[test]
 fn the_readme_shows_the_example_of_the_crate() {
     let example = |text: &'static str| {
         let (_, rest) = text.split_once("```rust,no_run\n").expect("an example");
@@ -152,222 +174,140 @@ fn the_readme_shows_the_example_of_the_crate() {
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
     for name in ["agent", "env-server", "protocol"] {
-        let source = root().join(name).join("src");
-        let graph = graph(&source.join("lib.rs"), |path| {
-            std::fs::read_to_string(path).ok()
-        });
-        let place = |file: &PathBuf| {
-            let path = file.strip_prefix(root()).expect("below the root");
-            let room = room_of(path.to_str().expect("a name"));
-            let stem = path.with_extension("");
-            let stem = stem.to_str().expect("a name");
-            rooms.iter().position(|name| *name == room || *name == stem)
+        let place = |module: &[String]| {
+            let room = format!("{name}/src/{}", module.first()?);
+            rooms.iter().position(|name| *name == room)
         };
-        let edges = graph
-            .iter()
-            .flat_map(|(file, used)| used.iter().map(move |used| (file, used)));
-        let upward: Vec<_> = edges
-            .filter(|(file, used)| match (place(file), place(used)) {
-                (Some(from), Some(to)) => to < from,
-                _ => false,
-            })
-            .collect();
-        assert!(upward.is_empty(), "{upward:#?}");
+        for (file, used) in graph_of(name) {
+            let Some(own) = place(&file) else { continue };
+            let above = used
+                .iter()
+                .find(|used| place(used).is_some_and(|it| it < own));
+            assert!(above.is_none(), "{name}: {file:?} uses {above:?}");
+        }
     }
 }
 
 #[test]
 fn no_crate_has_a_circle_of_files() {
-    let (mut n_edges, mut circles) = (0, Vec::new());
     for name in CRATES {
-        for file in ["src/lib.rs", "src/main.rs"].map(|file| root().join(name).join(file)) {
-            if file.is_file() {
-                let graph = graph(&file, |path| std::fs::read_to_string(path).ok());
-                n_edges += graph.values().map(BTreeSet::len).sum::<usize>();
-                circles.extend(circle(&graph));
-            }
-        }
+        let graph = graph_of(name);
+        assert_eq!(circle(&graph), Vec::<Vec<String>>::new(), "{name}");
     }
-    assert!(circles.is_empty(), "{circles:#?}");
+    let n_edges: usize = graph_of("protocol").values().map(BTreeSet::len).sum();
     assert!(n_edges > 100, "{n_edges}: paths are not read");
-}
-
-#[test]
-fn the_model_does_not_know_the_wire() {
-    let source = root().join("protocol/src");
-    let graph = graph(&source.join("lib.rs"), |path| {
-        std::fs::read_to_string(path).ok()
-    });
-    let of_model = graph
-        .iter()
-        .filter(|(file, _)| file.starts_with(source.join("model")));
-    let mut used = of_model.flat_map(|(_, used)| used).peekable();
-    assert!(used.peek().is_some(), "the folder is not read");
-    let outside = used.find(|used| !used.starts_with(source.join("model")));
-    assert_eq!(outside, None);
 }
 
 #[test]
 fn a_circle_is_found() {
     let check = |child: &str, expected: &[&str]| {
-        let read = |path: &Path| match path.to_str()? {
-            "lib.rs" => Some("pub mod a;\nmod b;\n#[cfg(test)]\nmod tests;".into()),
-            "a.rs" => Some("mod c;\nuse crate::b::{self, B};".into()),
-            "b.rs" => Some("// crate::a\nuse std::fmt;".into()),
-            "a/c.rs" => Some(child.to_owned()),
-            _ => None,
-        };
-        let found = circle(&graph(Path::new("lib.rs"), read)).unwrap_or_default();
-        let found: Vec<&str> = found.iter().filter_map(|path| path.to_str()).collect();
+        let texts = [
+            ("", "pub mod a;\nmod b;\n#[cfg(test)]\nmod tests;"),
+            ("a", "mod c;\nuse crate::b::{self, B};"),
+            ("b", "// crate::a\nuse std::fmt; pub(crate) fn f() {}"),
+            ("a::c", child),
+        ];
+        let texts = texts.map(|(name, text)| (module_of(name), text.to_owned()));
+        let found: Vec<String> = circle(&graph(texts.into()))
+            .iter()
+            .map(|module| module.join("::"))
+            .collect();
         assert_eq!(found, expected, "{child}");
     };
     check("use crate::b::B;", &[]);
-    check("use super::A;", &["a/c.rs", "a.rs"]);
-    check("use crate::{b as d, a::{A, B}};", &["a/c.rs", "a.rs"]);
-    check("fn f() -> crate::X {}", &["a/c.rs", "a.rs", "lib.rs"]);
+    check("use super::A;", &["a", "a::c"]);
+    check("use crate::a::{A, B};", &["a", "a::c"]);
+    check("fn f() -> crate::X {}", &["", "a", "a::c"]);
     check("#[cfg(test)]\nmod tests { use super::super::A; }", &[]);
 }
 
-/// The files below a crate's root file, and what they depend on: child modules, and every module that a path names.
-fn graph(root: &Path, read: impl Fn(&Path) -> Option<String>) -> Graph {
-    let mut modules = Modules::from([(Vec::new(), root.to_owned())]);
-    let mut texts = Vec::new();
-    let mut unread = vec![Vec::new()];
-    while let Some(module) = unread.pop() {
-        let file = modules[&module].clone();
-        let words = words(&read(&file).expect("a readable file"));
-        for name in children(&words) {
-            let child = [&module[..], &[name.to_owned()]].concat();
-            let stem = root
-                .parent()
-                .expect("a folder")
-                .join(child.iter().collect::<PathBuf>());
-            let files = [stem.with_extension("rs"), stem.join("mod.rs")];
-            let file = files.into_iter().find(|file| read(file).is_some());
-            modules.insert(child.clone(), file.expect("a module's file"));
-            unread.push(child);
+fn module_of(name: &str) -> Vec<String> {
+    let names = name.split("::").filter(|name| !name.is_empty());
+    names.map(str::to_owned).collect()
+}
+
+/// The graph of a crate's library, without files of unit tests.
+fn graph_of(name: &str) -> Graph {
+    let source = format!("{name}/src");
+    let mut texts = BTreeMap::new();
+    for path in source_files(&source) {
+        let Some(stem) = path[source.len() + 1..].strip_suffix(".rs") else {
+            continue;
+        };
+        let module = module_of(&stem.replace('/', "::"));
+        let last = module.last().expect("a name");
+        if last == "main" || last.ends_with("tests") {
+            continue;
         }
-        texts.push((module, words));
+        let text = std::fs::read_to_string(root().join(&path)).expect("a readable file");
+        let is_root = module == ["lib"];
+        texts.insert(if is_root { Vec::new() } else { module }, text);
     }
+    graph(texts)
+}
+
+/// What files depend on: child modules, and every module that a path from `crate`, `super` or `self` names.
+fn graph(texts: BTreeMap<Vec<String>, String>) -> Graph {
+    let file_of = |path: &[String]| {
+        let mut ends = (0..=path.len()).rev().map(|end| path[..end].to_vec());
+        ends.find(|module| texts.contains_key(module))
+    };
     let mut graph = Graph::new();
-    for (module, words) in texts {
-        let mut named: Vec<Vec<String>> = paths(&words, &module);
-        named.extend(children(&words).map(|name| [&module[..], &[name.to_owned()]].concat()));
-        let file = &modules[&module];
-        let used = named.iter().map(|path| file_of(&modules, path));
-        let used = used.filter(|used| used != file).collect();
-        graph.insert(file.clone(), used);
+    for (module, text) in &texts {
+        let named = paths(text, module);
+        let mut used: BTreeSet<_> = named.iter().filter_map(|path| file_of(path)).collect();
+        let children = texts.keys().filter(|path| {
+            path.split_last()
+                .is_some_and(|(_, parent)| parent == &module[..])
+        });
+        used.extend(children.cloned());
+        used.remove(module);
+        graph.insert(module.clone(), used);
     }
     graph
 }
 
-/// The file of the module that a path leads into.
-fn file_of(modules: &Modules, path: &[String]) -> PathBuf {
-    let mut ends = (0..=path.len()).rev();
-    let file = ends.find_map(|end| modules.get(&path[..end]));
-    file.expect("the root at least").clone()
-}
-
-/// Identifiers, `::` and single characters, without comments and unit tests.
-fn words(text: &str) -> Vec<String> {
-    let code: Vec<&str> = text
-        .lines()
-        .map(|line| line.split("//").next().unwrap_or_default())
-        .collect();
-    let code = code.join("\n");
-    let code = code
-        .split("#[cfg(test)]\nmod tests")
-        .next()
-        .unwrap_or_default();
-    let mut words: Vec<String> = Vec::new();
-    let mut last = ' ';
-    for letter in code.chars() {
-        let is_word = |letter: char| letter.is_alphanumeric() || letter == '_';
-        match words.last_mut() {
-            Some(word) if is_word(last) && is_word(letter) => word.push(letter),
-            Some(word) if last == ':' && letter == ':' => word.push(letter),
-            _ if letter.is_whitespace() => {}
-            _ => words.push(letter.into()),
-        }
-        last = letter;
-    }
-    words
-}
-
-/// Names of the modules declared as files of their own.
-fn children(words: &[String]) -> impl Iterator<Item = &str> {
-    let declarations = words.windows(3);
-    let declarations = declarations.filter(|three| three[0] == "mod" && three[2] == ";");
-    declarations.map(|three| three[1].as_str())
-}
-
-/// Every path that begins with `crate`, `super` or `self`, from the crate's root.
-fn paths(words: &[String], module: &[String]) -> Vec<Vec<String>> {
+/// Every path in the code that begins with `crate`, `super` or `self`, from the crate's root, up to a brace.
+fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
+    let code = text.split("#[cfg(test)]\nmod tests").next();
+    let lines = code.unwrap_or_default().lines();
+    let lines = lines.map(|line| line.split("//").next().unwrap_or_default());
+    let is_path = |letter: char| letter.is_alphanumeric() || "_:".contains(letter);
+    let words = lines.flat_map(|line| line.split(move |letter: char| !is_path(letter)));
     let mut found = Vec::new();
-    for at in 1..words.len() {
-        let mut base = match words[at - 1].as_str() {
-            "crate" => Vec::new(),
-            "self" => module.to_vec(),
-            "super" => module[..module.len().saturating_sub(1)].to_vec(),
+    for word in words.filter(|word| word.contains("::")) {
+        let mut path = module.to_vec();
+        let mut names = word.split("::").filter(|name| !name.is_empty()).peekable();
+        match names.next() {
+            Some("crate") => path.clear(),
+            Some("super") => drop(path.pop()),
+            Some("self") => {}
             _ => continue,
-        };
-        if words[at] != "::" || (at > 1 && words[at - 2] == "::") {
-            continue;
         }
-        let mut rest = &words[at + 1..];
-        while let ["super", "::", ..] = rest.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-            base.pop();
-            rest = &rest[2..];
+        while names.next_if_eq(&"super").is_some() {
+            path.pop();
         }
-        tree(rest, &base, &mut found);
+        path.extend(names.map(str::to_owned));
+        found.push(path);
     }
     found
 }
 
-/// The paths of a `use` tree; returns how many words it has.
-fn tree(words: &[String], base: &[String], found: &mut Vec<Vec<String>>) -> usize {
-    let mut path = base.to_vec();
-    let mut at = 0;
-    while words[at] != "{" {
-        path.push(words[at].clone());
-        at += 1;
-        if words.get(at).is_none_or(|word| word != "::") {
-            found.push(path);
-            return at;
-        }
-        at += 1;
-    }
-    at += 1; // the brace
-    while at < words.len() && words[at] != "}" {
-        at += tree(&words[at..], &path, found).max(1);
-        let rest = words[at..].iter();
-        at += rest
-            .take_while(|word| ![",", "}"].contains(&word.as_str()))
-            .count(); // `as name`
-        at += usize::from(words.get(at).is_some_and(|word| word == ","));
-    }
-    at + 1
-}
-
 /// The files of one circle, if there is one.
-fn circle(graph: &Graph) -> Option<Vec<PathBuf>> {
-    let reached = |from: &PathBuf| {
+fn circle(graph: &Graph) -> Vec<Vec<String>> {
+    let reached = |from: &Vec<String>| {
         let mut reached = BTreeSet::new();
         let mut next = vec![from];
         while let Some(file) = next.pop() {
-            next.extend(
-                graph[file]
-                    .iter()
-                    .filter(|used| reached.insert((*used).clone())),
-            );
+            next.extend(graph[file].iter().filter(|used| reached.insert(*used)));
         }
         reached
     };
-    let all: BTreeMap<&PathBuf, BTreeSet<PathBuf>> =
-        graph.keys().map(|file| (file, reached(file))).collect();
-    let start = graph.keys().find(|file| all[file].contains(*file))?;
-    let in_circle = graph
-        .keys()
-        .filter(|file| all[start].contains(*file) && all[file].contains(start));
-    Some(in_circle.cloned().collect())
+    let all: BTreeMap<_, _> = graph.keys().map(|file| (file, reached(file))).collect();
+    let Some(start) = graph.keys().find(|file| all[file].contains(file)) else {
+        return Vec::new();
+    };
+    let files = graph.keys();
+    let files = files.filter(|file| all[start].contains(file) && all[file].contains(start));
+    files.cloned().collect()
 }

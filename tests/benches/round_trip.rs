@@ -62,8 +62,9 @@ fn main() {
     // cargo adds `--bench` on its own.
     let more = std::env::args()
         .skip(1)
-        .filter(|argument| argument != "--bench");
-    let more = more.collect::<Vec<String>>().join(" ");
+        .filter(|argument| argument != "--bench")
+        .collect::<Vec<String>>()
+        .join(" ");
     for (n_worlds, team) in [(1_u32, 1_u32), (64, 1), (1, 8)] {
         let server = Server::start(&format!(
             "--worlds {n_worlds} --robots {team} --burn-in 1000 {more}"

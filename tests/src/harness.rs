@@ -269,8 +269,10 @@ pub fn frames_until(
     let deadline = Instant::now() + PATIENCE;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let sample = observer.receive(left).expect("receive");
-        let sample = sample.unwrap_or_else(|| panic!("no frame of world {world} at step {step}"));
+        let sample = observer
+            .receive(left)
+            .expect("receive")
+            .unwrap_or_else(|| panic!("no frame of world {world} at step {step}"));
         let is_last = sample.header.world == world && sample.header.result.step == step;
         samples.push(sample);
         if is_last {

@@ -208,8 +208,9 @@ struct Drawn<'a> {
 impl<'a> Drawn<'a> {
     fn of(panel: &'a Panel) -> Option<Self> {
         let colored = panel.curves.iter().zip(LINES);
-        let curves = colored.filter_map(|(curve, color)| DrawnCurve::of(curve, panel.scale, color));
-        let curves: Vec<DrawnCurve> = curves.collect();
+        let curves: Vec<DrawnCurve> = colored
+            .filter_map(|(curve, color)| DrawnCurve::of(curve, panel.scale, color))
+            .collect();
         (!curves.is_empty()).then_some(Self { panel, curves })
     }
 

@@ -21,8 +21,9 @@ pub struct PngError(String);
 pub fn png(svg: &str) -> Result<Vec<u8>, PngError> {
     let tree = Tree::from_str(svg, &OPTIONS).map_err(|error| PngError(error.to_string()))?;
     let size = tree.size().to_int_size().scale_by(SCALE);
-    let pixels = size.and_then(|size| Pixmap::new(size.width(), size.height()));
-    let mut pixels = pixels.ok_or_else(|| PngError("too large".into()))?;
+    let mut pixels = size
+        .and_then(|size| Pixmap::new(size.width(), size.height()))
+        .ok_or_else(|| PngError("too large".into()))?;
     resvg::render(
         &tree,
         Transform::from_scale(SCALE, SCALE),
@@ -46,8 +47,8 @@ pub fn heat(probabilities: ArrayView2<'_, f32>) -> Result<Heat, PngError> {
     let side = LEAST_SIDE.div_ceil(height.min(width).max(1));
     let side = side.clamp(1, MOST_PIXELS_PER_CELL);
     let (height, width) = (height * side, width * side);
-    let pixels = Pixmap::new(width as u32, height as u32);
-    let mut pixels = pixels.ok_or_else(|| PngError("too large, or empty".into()))?;
+    let mut pixels = Pixmap::new(width as u32, height as u32)
+        .ok_or_else(|| PngError("too large, or empty".into()))?;
     for (at, pixel) in pixels.pixels_mut().iter_mut().enumerate() {
         let color = sequential(probabilities[[at / width / side, at % width / side]]);
         let opaque = PremultipliedColorU8::from_rgba(color.0, color.1, color.2, u8::MAX);

@@ -71,8 +71,7 @@ impl TextStyle {
              xml:space=\"preserve\">{}</svg>",
             self.element("", "", text)
         );
-        let tree = Tree::from_str(&page, &OPTIONS);
-        let tree = tree.expect("invariant: pages are SVG");
+        let tree = Tree::from_str(&page, &OPTIONS).expect("invariant: pages are SVG");
         let width = |node: &Node| match node {
             Node::Text(text) => Some(f64::from(text.bounding_box().width())),
             _ => None,

@@ -28,10 +28,10 @@ fn check(svg: &str) -> Vec<String> {
             .and_then(|text| text.parse().ok())
             .expect("a number")
     };
-    let texts = document
+    let texts: Vec<_> = document
         .descendants()
-        .filter(|node| node.has_tag_name("text"));
-    let texts: Vec<_> = texts.collect();
+        .filter(|node| node.has_tag_name("text"))
+        .collect();
     for &text in &texts {
         let (x, width) = (number(text, "x"), number(text, "textLength"));
         assert!(

@@ -7,8 +7,8 @@ use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;
 use network::variables::build;
 use network::{
-    Adam, AdamSettings, Decoder, Device, Dropout, Encoder, Gru, NetworkShape, Observation, Pass,
-    Window,
+    Adam, AdamSettings, Decoder, Device, Dropout, Encoder, Gru, NetworkShape, ObservationMatrix,
+    Pass, Window,
 };
 use protocol::{Frame, Shape};
 
@@ -17,7 +17,7 @@ struct TwoGrus {
     first: Gru,
     second: Gru,
     decoder: Decoder,
-    observation: Observation,
+    observation: ObservationMatrix,
 }
 
 impl TwoGrus {
@@ -28,7 +28,7 @@ impl TwoGrus {
             first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, false)?,
             second: Gru::new(&vb.pp("second_rnn_layer"), n, n, false)?,
             decoder: Decoder::new(&vb.pp("decoder"), shape, false)?,
-            observation: Observation::new(vb, shape.n_observations, shape.n_states)?,
+            observation: ObservationMatrix::new(vb, shape.n_observations, shape.n_states)?,
         })
     }
 

@@ -7,8 +7,8 @@ use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// What is added to moments and taken off again: where gradients are zero, moments stay at a few roundings of this
-/// instead of subnormal numbers, which take some processors a hundred times as long.
+/// Added to moments and subtracted again. Moments of zero gradients then stay at a few roundings of this and do not
+/// become subnormal numbers, with which some processors are a hundred times slower.
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
@@ -17,7 +17,7 @@ const FLUSH: f64 = 1e-30;
 pub struct AdamSettings {
     /// Step size.
     pub learning_rate: f32,
-    /// How slowly the two moments forget.
+    /// Decay rates of the two moments.
     pub betas: [f32; 2],
     /// Added to the root of the second moment.
     pub epsilon: f32,
@@ -60,8 +60,8 @@ impl Adam {
     /// One step against the gradients of a loss, which it returns.
     ///
     /// # Errors
-    /// [`NetworkError`] for a number that is not finite, with the first such tensor: a cause before what
-    /// follows from it. Nothing has changed then.
+    /// [`NetworkError`] names the first tensor with a number that is not finite, in the order of computation.
+    /// Nothing has changed then.
     pub fn update(
         &mut self,
         settings: &AdamSettings,
@@ -155,7 +155,7 @@ impl Adam {
         self.steps
     }
 
-    /// Counts other steps, whose moments are loaded.
+    /// Sets the number of steps, to go with loaded moments.
     pub(crate) fn set_steps(&mut self, steps: u64) {
         self.steps = steps;
     }

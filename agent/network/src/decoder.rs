@@ -3,7 +3,7 @@
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
-use crate::observation::Observation;
+use crate::observation_matrix::ObservationMatrix;
 use crate::ops::decoder::Layers;
 use crate::pass::Pass;
 use crate::shape::{DECODER_CHANNELS, NetworkShape};
@@ -46,8 +46,10 @@ impl Decoder {
             .get_with_hints(dims, "weight", init)?;
         let level = |level: usize| {
             let from = DECODER_CHANNELS[level];
-            let to = DECODER_CHANNELS.get(level + 1).copied();
-            let to = to.unwrap_or(shape.n_states);
+            let to = DECODER_CHANNELS
+                .get(level + 1)
+                .copied()
+                .unwrap_or(shape.n_states);
             let (dims, init) = (
                 (from, to, KERNEL, KERNEL),
                 uniform_init(to * KERNEL * KERNEL),
@@ -82,7 +84,7 @@ impl Decoder {
     pub fn loss(
         &self,
         hidden: &Tensor,
-        observation: &Observation,
+        observation: &ObservationMatrix,
         pass: &Pass<'_>,
     ) -> Result<Tensor> {
         if self.is_stock {

@@ -73,16 +73,20 @@ impl Encoder {
     }
 
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let layers = self.stages.iter().enumerate().map(|(index, stage)| {
-            Ok(Layer {
-                shape: stage.shape,
-                kernels: stage.kernels(index == 0)?,
-                bias: &stage.bias,
-                norm: stage.norm.weights(),
-                mask: pass.encoder_mask(index),
+        let layers = self
+            .stages
+            .iter()
+            .enumerate()
+            .map(|(index, stage)| {
+                Ok(Layer {
+                    shape: stage.shape,
+                    kernels: stage.kernels(index == 0)?,
+                    bias: &stage.bias,
+                    norm: stage.norm.weights(),
+                    mask: pass.encoder_mask(index),
+                })
             })
-        });
-        let layers = layers.collect::<Result<Vec<_>>>()?;
+            .collect::<Result<Vec<_>>>()?;
         encode(pass.window, &layers, pass.trains(), |index, of_window| {
             self.stages[index].norm.moments(pass, of_window)
         })

@@ -3,7 +3,7 @@
 use crate::decoder::Decoder;
 use crate::encoder::Encoder;
 use crate::gru::Gru;
-use crate::observation::Observation;
+use crate::observation_matrix::ObservationMatrix;
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
 use crate::variables::count_numbers;
@@ -51,7 +51,7 @@ pub struct Network {
     encoder: Encoder,
     gru: Gru,
     decoder: Decoder,
-    observation: Observation,
+    observation: ObservationMatrix,
 }
 
 impl Network {
@@ -63,7 +63,7 @@ impl Network {
             encoder: Encoder::new(&vb.pp("encoder"), shape, stock.encoder)?,
             gru: Gru::new(&gru, shape.encoding, shape.hidden, stock.gru)?,
             decoder: Decoder::new(&vb.pp("decoder"), shape, stock.decoder)?,
-            observation: Observation::new(vb, n_observations, n_states)?,
+            observation: ObservationMatrix::new(vb, n_observations, n_states)?,
         })
     }
 

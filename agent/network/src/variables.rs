@@ -32,8 +32,10 @@ pub fn build<M>(
     };
     let vb = VarBuilder::from_backend(Box::new(backend), dtype, device.clone());
     let model = model(vb)?;
-    let named = variables.data().lock();
-    let named = named.expect("invariant: no layer panicked");
+    let named = variables
+        .data()
+        .lock()
+        .expect("invariant: no layer panicked");
     let named = named.iter().map(|(name, var)| (name.clone(), var.clone()));
     Ok((model, named.collect()))
 }

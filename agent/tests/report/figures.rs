@@ -1,6 +1,6 @@
 //! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
 
-use crate::synthetic::{ladder, noise, run, teams};
+use super::synthetic::{ladder, noise, run, teams};
 use agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
 use agent::benchmark::report::training::{FIGURES, draw_training};
 use agent::benchmark::report::{

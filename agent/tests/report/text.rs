@@ -1,4 +1,4 @@
-use crate::synthetic::{ladder, run, teams};
+use super::synthetic::{ladder, run, teams};
 use agent::benchmark::report::added::{check_settings, read_csv};
 use agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
 

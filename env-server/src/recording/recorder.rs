@@ -25,14 +25,13 @@ use std::time::{Duration, Instant};
 /// Longest wait for a frame before the recorder checks whether to stop.
 const TICK: Duration = Duration::from_millis(50);
 
-/// How often what was written goes to the system: at least each second, also where the last record
-/// comes right before the next flush.
+/// Time between flushes: every record reaches the system within a second.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How long a server may take to answer `hello`: one that does not publishes nothing meanwhile either.
+/// Longest wait for the answer to `hello`. A server that does not answer publishes nothing either.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long to wait before asking a server again that did not answer `hello`.
+/// Pause before `hello` is sent again to a server that did not answer.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Most bytes that wait to be written: 16,000 frames of 64 x 64 cells.
@@ -74,11 +73,13 @@ pub struct RecordSummary {
 /// # Errors
 /// If the file cannot be written, or the instance not be observed; earlier records stay in the file.
 pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary> {
-    // First, as the answer takes longer than a fast agent takes to fill an observer's buffer.
+    // Before observing: a fast agent would fill an observer's buffer while this waits for the answer.
     let first_server = Connection::open(&options.instance, NAME, HELLO_TIMEOUT);
-    // In this order: every frame that is recorded has its hidden states.
-    let truths = options.truth.then(|| Observer::truth(&options.instance));
-    let truths = truths.transpose()?;
+    // The truth first, so that every recorded frame has its hidden states.
+    let truths = options
+        .truth
+        .then(|| Observer::truth(&options.instance))
+        .transpose()?;
     let frames = Observer::frames(&options.instance)?.eager();
     let file = || format!("--out {}", options.out.display());
     let created = create(&options.out, options.overwrite).with_context(file)?;
@@ -102,7 +103,7 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
     while !stop.load(Ordering::Relaxed) && recorder.goes_on() {
         recorder.run_once(&frames, truths.as_ref(), TICK)?;
     }
-    // What was published before the stop may not have been read yet. A server that goes on must not keep it busy.
+    // Reads what was published before the stop, at most one buffer: the server may go on publishing.
     for _ in 0..FRAME_BUFFER {
         if !recorder.goes_on() || !recorder.run_once(&frames, truths.as_ref(), Duration::ZERO)? {
             break;
@@ -190,7 +191,7 @@ impl Recorder<'_> {
         self.push(world, n_lost, Event::Frame(sample));
     }
 
-    /// Whether a sample's server is known; a new one is asked for its settings, which are recorded.
+    /// Whether a sample's server is known; asks a new server for its settings and records them.
     fn knows(&mut self, publisher: Option<u32>, is_new: bool) -> bool {
         if publisher.is_some() && publisher == self.server && !is_new {
             return true;
@@ -232,7 +233,7 @@ impl Recorder<'_> {
         None
     }
 
-    /// Warns of what was asked for and this server does not have.
+    /// Warns of worlds and hidden states that were asked for and that this server lacks.
     fn warn_of_gaps(&self, info: &ServerInfo) {
         if self.options.truth && !info.publish_truth {
             tracing::warn!("--truth: expected a server with --publish-truth; recording frames");
@@ -270,7 +271,7 @@ impl Recorder<'_> {
         });
     }
 
-    /// Whether there is more to record, and somebody who writes it.
+    /// Whether more is to be recorded, and the thread that writes still runs.
     fn goes_on(&self) -> bool {
         let is_done = self.options.n_steps > 0 && self.n_steps >= self.options.n_steps;
         !is_done && self.writing.is_running()
@@ -332,7 +333,7 @@ impl Writing {
         })
     }
 
-    /// Queues a record; waits while the queue is full, so that loss is the observer's, and counted.
+    /// Queues a record. Waits while the queue is full: the observer then loses samples, and counts them.
     fn push(&self, record: Record) {
         while self.n_queued_bytes.load(Ordering::Relaxed) > MAX_QUEUED_BYTES && self.is_running() {
             std::thread::sleep(Duration::from_millis(1));
@@ -394,7 +395,7 @@ fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
     file_options.write(true).mode(0o600);
     let found = path.metadata().ok().filter(|_| overwrite);
     let file = match found.map(|found| found.is_file()) {
-        // Not the old one: others may have it open, or may open it.
+        // A new file: other programs may have the old one open.
         Some(true) => path.canonicalize().and_then(|path| {
             std::fs::remove_file(&path)?;
             file_options.create_new(true).open(path)

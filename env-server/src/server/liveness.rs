@@ -107,7 +107,7 @@ impl Clients {
 fn clean_up() {
     match remove_leftovers() {
         Ok(n_files) => tracing::debug!(n_files, "removed what dead processes left"),
-        // The next program does it.
+        // The next program removes them.
         Err(error) => tracing::debug!("not removed what dead processes left: {error}"),
     }
 }

@@ -91,7 +91,7 @@ pub struct Ports {
     truth_service: Option<TruthService>,
     entries: Entries,
     _node: Node<Ipc>,
-    /// Last, so that all else is dropped within it.
+    /// Dropped last, so that everything else is removed within this turn.
     end: Option<Turn>,
 }
 
@@ -354,8 +354,9 @@ fn publish<H: Header>(
     header: H,
     bytes: &[u8],
 ) -> Result<usize, String> {
-    let sample = publisher.loan_slice_uninit(bytes.len());
-    let mut sample = sample.map_err(|error| format!("{error:?}"))?;
+    let mut sample = publisher
+        .loan_slice_uninit(bytes.len())
+        .map_err(|error| format!("{error:?}"))?;
     *sample.user_header_mut() = header;
     let sent = sample.write_from_slice(bytes).send();
     sent.map_err(|error| format!("{error:?}"))

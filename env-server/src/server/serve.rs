@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 /// How often an idle server checks for expired leases and new observers.
 const IDLE_TICK: Duration = Duration::from_millis(250);
 
-/// How often a busy server does: bounds the delay until it notices a client's death.
+/// The same for a busy server: the longest delay until it notices that a client has died.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
 /// One round in this many takes a control request before a step.
@@ -114,7 +114,7 @@ impl Server {
         let others = exit_with.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
         let woken = sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?;
-        // Now, as wake-ups that are left end the next sleep at once.
+        // Wake-ups that are left would end the next sleep at once.
         self.ports.drain()?;
         Ok(woken)
     }
@@ -169,7 +169,7 @@ impl Server {
     }
 
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
-        // The robots of a holder that died a moment ago must be free.
+        // Frees the robots of a holder that has just died.
         self.forget_ended_clients(now);
         let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
@@ -204,7 +204,7 @@ impl Server {
         self.answer_settled(now);
     }
 
-    /// What no request asks for: ended clients, finished work, expired leases, new observers.
+    /// Work without a request: ended clients, finished jobs, expired leases, new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);

@@ -1,7 +1,7 @@
 //! An instance that another server has, or that a dead one left.
 //!
-//! What a dead process left is removed in a turn of one's own, which another process may hold for a while. Until then
-//! the dead one seems to have the instance.
+//! Files of a dead process are removed in a turn (`protocol::turn`), which another process may hold for a while. Until
+//! then the dead process seems to have the instance.
 
 use anyhow::Result;
 use protocol::program::WatchedProcess;

@@ -1,4 +1,4 @@
-//! Worlds move: at once for the request that completes them, or when a deadline passes or a holder leaves. And the
+//! Moves worlds: at once for the request that completes them, or when a deadline passes or a holder leaves. Writes the
 //! answers to all requests.
 
 use super::barrier::{Barrier, Ticket, Waiter};
@@ -14,12 +14,12 @@ use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelI
 use std::ops::Range;
 use std::time::Instant;
 
-/// Cells of a batch from which on it is stepped by several threads: below it, waking them (tens of
+/// Batches of at least so many cells are stepped by several threads: for smaller ones, waking them (tens of
 /// microseconds) costs more than it saves at about 1 ns a cell.
 const PARALLEL_CELLS: usize = 1 << 17;
 
 impl Simulator {
-    /// When the next world moves without paths that are late.
+    /// The next deadline of a world that waits for paths.
     pub fn next_deadline(&self) -> Option<Instant> {
         let waiting = self.waiting_worlds.iter();
         let deadlines = waiting.filter_map(|&world| self.places[world].barrier.deadline);

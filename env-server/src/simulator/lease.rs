@@ -187,8 +187,8 @@ impl Leases {
     ) -> Result<(), Refusal> {
         let own = robots
             .clone()
-            .find(|&robot| self.holders[robot] == Some(token));
-        let own = own.unwrap_or(robots.start);
+            .find(|&robot| self.holders[robot] == Some(token))
+            .unwrap_or(robots.start);
         self.use_lease(now, token, client, &(own..own + 1))?;
         let mut holders = robots.filter_map(|robot| self.holder(robot));
         match holders.find(|holder| holder.client != client) {

@@ -31,7 +31,7 @@ pub struct PendingReply {
     pub(super) tells_lease: bool,
 }
 
-/// What a status reply tells and only the server knows.
+/// The part of a status reply that only the server knows.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ServerStats {
     pub uptime: Duration,
@@ -56,7 +56,7 @@ pub enum PendingFile {
     },
 }
 
-/// The reply to a request that is not as it must be.
+/// The reply to a malformed request.
 pub(super) fn malformed(problem: &str) -> Reply {
     let message = format!("{}: {problem}", Status::Malformed.explain(0));
     Reply::error(Status::Malformed, 0, message)

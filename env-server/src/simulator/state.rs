@@ -23,7 +23,7 @@ pub struct Simulator {
     pub(super) leases: Leases,
     /// Worlds for which requests wait.
     pub(super) waiting_worlds: Vec<usize>,
-    /// Requests that have waited, and why they are refused, if they are.
+    /// Requests whose wait is over, with the refusal of each that is refused.
     pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
     /// Worlds that moved without a request of their own.
     pub(super) moved: Vec<usize>,

@@ -111,7 +111,7 @@ impl Simulator {
             barrier.put(robots.start, n_moves, own, is_full);
             paths = rest;
         }
-        // Of several worlds nobody else holds a robot, so that none of them waits.
+        // A request for several worlds has all their robots, so that none of them waits.
         if worlds.len() > 1 || self.is_complete(now, worlds.start) {
             self.advance(now, worlds);
             return None;
@@ -181,8 +181,8 @@ impl Simulator {
         coverage.map_err(|status| Refusal::new(status, 0))
     }
 
-    /// Checks that a client leaves out no robot of its own in a world, and that nobody holds another robot of several
-    /// worlds. Only the first and the last world can have other robots.
+    /// Checks that a request names all robots that its client holds in a world, and for several worlds all of their
+    /// robots. Only the first and the last world can have others.
     fn check_whole(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         let (team, worlds) = (self.spec.rules.n_robots, self.worlds_of(robots));
         for world in [worlds.start, worlds.end - 1] {

@@ -112,8 +112,9 @@ impl Simulator {
         let worlds = self.range(first, n).map_err(refusal)?;
         let path = absolute(path)?;
         self.check_present(&worlds).map_err(refusal)?;
-        let bytes = self.snapshot(worlds.clone());
-        let bytes = bytes.map_err(|error| Reply::error(Status::BadFile, 0, error.to_string()))?;
+        let bytes = self
+            .snapshot(worlds.clone())
+            .map_err(|error| Reply::error(Status::BadFile, 0, error.to_string()))?;
         let worlds = worlds.map(|world| self.world_info(world)).collect();
         let pending = PendingFile::Saved(worlds);
         Ok(Outcome::File(Job::Save { path, bytes }, pending))

@@ -5,7 +5,7 @@ use thiserror::Error;
 /// Why a snapshot is refused; each says what was expected and what is there.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// Not the bytes of a snapshot that was written: an older file may be whole.
+    /// The file is damaged; an older one may be whole.
     #[error("{0}")]
     Damaged(String),
     /// A snapshot of other settings or another version, or one that cannot be continued.

@@ -12,7 +12,7 @@ use thiserror::Error;
 /// What is wrong with pipes, devices, folders and links.
 const NOT_A_FILE: &str = "expected a regular file, got something else";
 
-/// How the name of a file ends that is being written.
+/// Ending of the name of a file that is being written.
 pub(super) const PART: &str = ".part";
 
 /// A file that could not be written or is refused.
@@ -48,7 +48,7 @@ pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), Fi
         }
         file.sync_data()?;
         std::fs::rename(&part, path)?;
-        // So that the new name survives it, too.
+        // The folder, too, so that the new name survives a loss of power.
         let folder = path
             .parent()
             .filter(|folder| !folder.as_os_str().is_empty());

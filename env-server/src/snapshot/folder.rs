@@ -49,7 +49,7 @@ impl Folder {
         }
     }
 
-    /// Removes what a server that was killed had begun to write.
+    /// Removes unfinished files of servers that were killed.
     fn remove_parts(&self) -> io::Result<()> {
         for entry in std::fs::read_dir(&self.path)?.flatten() {
             let name = entry.file_name();

@@ -166,7 +166,7 @@ fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
     Ok(body)
 }
 
-/// Checks a header, and that so many bytes behind it are as many as it says; returns their checksum.
+/// Checks a header, with the number of bytes behind it; returns their checksum.
 pub(super) fn checked_length(header: &[u8], got: u64) -> Result<u32, SnapshotError> {
     if header.len() < HEADER_BYTES || header[..8] != MAGIC {
         let problem =

@@ -28,7 +28,7 @@ pub enum Job {
     Load { path: PathBuf, worlds: Range<usize> },
 }
 
-/// What came of a job.
+/// The result of a job.
 pub enum Done {
     /// A file was written.
     Saved { path: PathBuf, n_bytes: usize },

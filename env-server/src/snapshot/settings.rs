@@ -82,7 +82,7 @@ impl Settings {
         }
     }
 
-    /// Checks that these, of a file, are a server's own.
+    /// Checks that these settings of a file are those of a server.
     pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
         let other = |setting: &str, expected: &str, got: &str| {
             let problem = format!("{setting}: expected {expected} as this server's, got {got}");
@@ -99,8 +99,11 @@ impl Settings {
             ));
         }
         for (index, (setting, expected)) in server.others.iter().enumerate() {
-            let got = self.others.get(index).filter(|(name, _)| name == setting);
-            let got = got.map_or("nothing", |(_, value)| value);
+            let got = self
+                .others
+                .get(index)
+                .filter(|(name, _)| name == setting)
+                .map_or("nothing", |(_, value)| value);
             if got != expected {
                 return Err(other(setting, expected, got));
             }

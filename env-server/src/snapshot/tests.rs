@@ -61,11 +61,13 @@ fn what_is_read_is_what_was_written() {
     let mut restored = snapshot.restore(&spec).expect("a fit");
     let last = restored.pop().expect("three worlds");
     assert!(matches!(last, SnapshotWorld::New(NEW)));
-    let episodes = restored.into_iter().map(|world| match world {
-        SnapshotWorld::Ready(episode) => *episode,
-        SnapshotWorld::New(_) => panic!("expected a world at a step"),
-    });
-    let episodes: Vec<Episode> = episodes.collect();
+    let episodes: Vec<Episode> = restored
+        .into_iter()
+        .map(|world| match world {
+            SnapshotWorld::Ready(episode) => *episode,
+            SnapshotWorld::New(_) => panic!("expected a world at a step"),
+        })
+        .collect();
     assert_eq!(bytes(&spec.settings, &episodes), written);
 }
 

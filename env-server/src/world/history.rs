@@ -151,8 +151,8 @@ mod tests {
     #[test]
     fn the_last_frames_are_kept_as_they_were() {
         let shape = Shape::new(4, 6).expect("test shape");
-        let rules = Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner);
-        let mut rules = rules.expect("valid model");
+        let mut rules =
+            Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner).expect("valid model");
         (rules.history, rules.n_moves, rules.n_robots) = (3, 2, 3);
         let mut episode = Episode::new(&rules, 3);
         let mut frames = Vec::new();

@@ -10,7 +10,7 @@ use std::ops::RangeInclusive;
 /// those overflows or vanishes in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
-/// Words that policies are named with, as `shooting_explore` beside `shooting_<state>`.
+/// Names that no state may have, as names of policies have them: `shooting_explore` beside `shooting_<state>`.
 const RESERVED: [&str; 3] = ["exploit", "exploit_only", "explore"];
 
 /// How far a probability distribution in a model file may be from summing to one.
@@ -166,7 +166,7 @@ impl Checker<'_> {
             if std::mem::replace(&mut filled[[own, to, from]], true) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
-            // A cell's own centre is in its own state: what is said of another there means nothing.
+            // The centre of a cell's kernel is the cell itself: weights of other states there have no effect.
             let is_void =
                 |tap| entry.own.is_some() && own != from && tap == (height / 2, width / 2);
             for (row, col, weight) in self.weights(entry, file.kernel_size)? {

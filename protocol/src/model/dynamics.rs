@@ -5,12 +5,12 @@
 //! # What is drawn
 //! A kernel gives each neighbour of a cell a vote: with the neighbour under tap `t` in state `n_t`, the next state
 //! `m` has the weight `b[m] + sum_t w[m, n_t, t]` (eq. 2). A cell turns into `m` with a probability in proportion to
-//! it (eqs. 3 and 4). [`Dynamics::sum_kernels`] does exactly this, and some models need no more.
+//! it (eqs. 3 and 4). `Tables::weights` and `Dynamics::sum_kernels` do exactly this.
 //!
 //! # How it is fast
-//! Two faster ways go before it, each with the same distribution. [`bytes`] decides most cells of a whole row by one
-//! random byte each. [`parents`] draws one neighbour of the cell and the vote of this neighbour, some times over. What
-//! both leave undecided is summed: in the wildfire no cell in a million.
+//! Two faster ways go before it, each with the same distribution. `bytes.rs` decides most cells of a whole row by one
+//! random byte each. `parents.rs` draws one neighbour of a cell, and the vote of this neighbour, up to eight times. The
+//! cells that both leave undecided are summed: hardly any in the wildfire, all where a model has too many weights.
 //!
 //! # Random numbers
 //! Two words of the step's ChaCha8 stream key two SplitMix64 generators, as in the sensor: one gives the bytes, the
@@ -33,7 +33,7 @@ use kernel::{Kernel, invert, uniform};
 use lanes::{LANES, Words};
 use mixture::Mixture;
 use parents::Parents;
-use places::{OFF_GRID, Places};
+use places::{OFF_GRID, Places, centre};
 use rand::Rng;
 use std::sync::Arc;
 
@@ -101,11 +101,6 @@ impl Dynamics {
     pub fn step(&mut self, seed: u64, n: u64, states: &mut Grid<u8>) {
         assert_eq!(states.dim(), self.shape.dim(), "states: expected [H, W]");
         let cells = states.as_slice_mut().expect("states: expected row-major");
-        let largest = cells.iter().fold(0, |most, &state| state.max(most));
-        assert!(
-            usize::from(largest) < self.tables.n_states,
-            "states: expected values below S"
-        );
         let keys = keys(seed, n);
         vectorised(
             #[inline(always)]
@@ -115,6 +110,11 @@ impl Dynamics {
 
     #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     fn advance(&mut self, [byte_key, draw_key]: [u64; 2], cells: &mut [u8]) {
+        let largest = cells.iter().fold(0, |most, &state| state.max(most));
+        assert!(
+            usize::from(largest) < self.tables.n_states,
+            "states: expected values below S"
+        );
         self.places.load(cells);
         let tables = Arc::clone(&self.tables);
         let mut words = Words::new(draw_key);
@@ -184,11 +184,6 @@ impl Tables {
         }
         sums
     }
-}
-
-/// Where the cell itself lies, relative to its home.
-fn centre(offsets: &[usize]) -> usize {
-    offsets[offsets.len() / 2]
 }
 
 /// What keys the bytes and the draws of a step.

@@ -110,8 +110,11 @@ impl Model {
             let (row, col) = (kernel_height / 2, kernel_width / 2);
             least[[row, col]] = column_sums[[own, row, col]];
         }
-        let largest = kernel.iter().chain(&self.bias).copied();
-        let largest = largest.fold(f64::MIN_POSITIVE, f64::max);
+        let largest = kernel
+            .iter()
+            .chain(&self.bias)
+            .copied()
+            .fold(f64::MIN_POSITIVE, f64::max);
         // Cells further than a kernel from the edges are all alike: look at one of them.
         let distinct = |side: usize, kernel: usize| {
             (0..side).filter(move |&at| at <= kernel || at + kernel >= side)

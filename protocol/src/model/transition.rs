@@ -13,20 +13,19 @@
 //!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
 //! a margin of zeros, so no cell is special and many are computed at once. And taps that weigh alike are added up
-//! before they are multiplied ([`rows`]). Every lane does the same operations in the same order and none is fused, so
+//! before they are multiplied (`rows.rs`). Every lane does the same operations in the same order and none is fused, so
 //! results are bit-identical on every platform.
 
+mod layout;
 mod rows;
 
 use super::file::ModelError;
 use super::grid::Shape;
 use super::parameters::Model;
 use super::vectors::vectorised;
+use layout::{LANES, Layout};
 use ndarray::{Array3, Array4, NdFloat};
 use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
-
-/// Cells computed at once, four AVX2 registers of `f32`. Independent sums hide the latency of adds.
-const LANES: usize = 32;
 
 /// `Phi` for one model on one grid, with its work space: give each thread its own clone.
 ///
@@ -47,16 +46,6 @@ pub struct Transition<T = f32> {
     weights: Vec<[T; LANES]>,
     /// The same in one own state.
     own_weights: Vec<[T; LANES]>,
-}
-
-/// Where a cell of a state lies in the planes: half a kernel of margin on each side, and on the
-/// right up to a whole number of [`LANES`].
-#[derive(Debug, Clone, Copy)]
-struct Layout {
-    above: usize,
-    left: usize,
-    stride: usize,
-    plane: usize,
 }
 
 impl<T: NdFloat> Transition<T> {
@@ -181,18 +170,6 @@ impl<T: NdFloat> Transition<T> {
                 Some(cells) => *cells = lanes,
                 None => cells.copy_from_slice(&lanes[..cells.len()]),
             }
-        }
-    }
-}
-
-impl Layout {
-    fn new(shape: Shape, kernel_height: usize, kernel_width: usize) -> Self {
-        let stride = shape.width().next_multiple_of(LANES) + kernel_width - 1;
-        Self {
-            above: kernel_height / 2,
-            left: kernel_width / 2,
-            stride,
-            plane: (shape.height() + kernel_height - 1) * stride,
         }
     }
 }

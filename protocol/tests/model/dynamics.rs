@@ -1,9 +1,9 @@
 //! The world's step draws what the operator `Phi` says, whatever the model, and looks like the authors' world.
 
-use crate::models::{
+use super::models::{
     check_draws, hash_after, model, one_hot, predicted, random_model, random_states, shape,
 };
-use crate::statistics;
+use super::statistics;
 use protocol::{Dynamics, Grid, Model};
 
 /// Compares draws with `Phi` of the states, in double precision.

@@ -1,7 +1,7 @@
 //! Kernels that see the cell's own state, against their formula as it stands in docs/model-file.md, and the
 //! worlds of `wildfire-burnout` against a simulation by the formula.
 
-use crate::models::{
+use super::models::{
     assert_close, check_draws, check_predictions, chi_square, hash_after, one_hot, predicted,
     random_belief, random_model, random_own_model, random_states, shape, unit,
 };

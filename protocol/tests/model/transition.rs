@@ -1,6 +1,6 @@
 //! `Phi` on beliefs against its formula (paper eqs. 2-4), for any model and grid.
 
-use crate::models::{check_predictions, random_belief, random_model, shape};
+use super::models::{check_predictions, random_belief, random_model, shape};
 use ndarray::{Array3, Axis};
 use proptest::prelude::*;
 use protocol::{Model, Transition};

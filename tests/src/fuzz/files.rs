@@ -95,8 +95,9 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         && expected.len() == got.len()
     {
         let mut words = bytes.windows(got.len());
-        let place = words.position(|word| word == expected.as_bytes());
-        let place = place.map_or(0..0, |at| at..at + got.len());
+        let place = words
+            .position(|word| word == expected.as_bytes())
+            .map_or(0..0, |at| at..at + got.len());
         bytes.splice(place, got.bytes());
         learned = Learned::from_bytes(&bytes);
     }

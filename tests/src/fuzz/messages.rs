@@ -66,8 +66,8 @@ pub fn frame(bytes: &[u8]) -> bool {
     let Ok(robots) = split_frame_payload(&header, payload) else {
         return false;
     };
-    let shape = Shape::new(header.height as usize, header.width as usize);
-    let shape = shape.expect("its frames were split");
+    let shape =
+        Shape::new(header.height as usize, header.width as usize).expect("its frames were split");
     let is_good = |robot: &RobotSample<'_>| {
         let start = robot.result.start();
         is_frame(shape, robot.frame) && shape.contains(start) && is_path(shape, start, robot.path)

@@ -1,7 +1,10 @@
 //! Every decoder.
 
+use super::files;
+use super::messages;
+use super::requests;
 use super::target::{Kind, Seed, Target};
-use super::{files, messages, requests, worlds};
+use super::worlds;
 
 /// All of them.
 pub const TARGETS: [Target; 12] = [

@@ -1,6 +1,6 @@
 //! Planners of one robot, options and filters.
 
-use crate::fields::{Field, fields, objectives, paths};
+use super::fields::{Field, fields, objectives, paths};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{

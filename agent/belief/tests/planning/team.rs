@@ -1,6 +1,6 @@
 //! Plans of several robots.
 
-use crate::fields::{Field, RANDOM, fields, objectives, paths};
+use super::fields::{Field, RANDOM, fields, objectives, paths};
 use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
 use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,

@@ -19,8 +19,7 @@ impl Moments {
     /// From sums of values and of their squares, both before they are multiplied with `scale`.
     pub(super) fn new(sums: &Sums, scale: f32, count: usize) -> Self {
         let (scale, count) = (f64::from(scale), count as f64);
-        let mean = sums.first.iter().map(|sum| scale * sum / count);
-        let mean: Vec<f64> = mean.collect();
+        let mean: Vec<f64> = sums.first.iter().map(|sum| scale * sum / count).collect();
         let variance = sums.with_z.iter().zip(&mean);
         let variance = variance.map(|(sum, mean)| scale * scale * sum / count - mean * mean);
         Self {

@@ -145,8 +145,9 @@ fn an_update_without_dropout_reproduces_loss_gradients_and_parameters() {
         .filter(|name| !name.contains("running"));
     let gradients = gradients.map(|name| (name.clone(), gradient(name)));
     let gradients: std::collections::BTreeMap<_, _> = gradients.collect();
-    let loss = network.update_with(&window, &dropout, &hidden.to_vec());
-    let loss = loss.expect("finite");
+    let loss = network
+        .update_with(&window, &dropout, &hidden.to_vec())
+        .expect("finite");
     let expected: f64 = golden.get::<f64, ndarray::Ix0>("loss").into_scalar();
     assert!(
         (loss / expected - 1.0).abs() < 1e-4,

@@ -12,12 +12,11 @@
 //! alone, so that `f` there is the likeliest outcome, and a cell that stays as it is for certain takes its byte alone.
 
 use super::super::grid::Shape;
-use super::centre;
 use super::lanes::{
     FastOwn, FastTap, LANES, blend, blend_own, fast_taps, fill, high_bits, list_lanes, transposed,
 };
 use super::mixture::Mixture;
-use super::places::Places;
+use super::places::{Places, centre};
 use std::iter::zip;
 use std::ops::Range;
 
@@ -105,8 +104,9 @@ impl Bytes {
         let mut n_undecided = 0;
         for ((home, lanes), on_grid) in band.step_by(LANES).zip(chunks).zip(on_grid) {
             let bits = high_bits(lanes) & on_grid;
-            let to = undecided[n_undecided..].first_chunk_mut();
-            let to = to.expect("invariant: LANES more than a band has");
+            let to = undecided[n_undecided..]
+                .first_chunk_mut()
+                .expect("invariant: LANES more than a band has");
             list_lanes(bits, home as u32, to);
             n_undecided += bits.count_ones() as usize;
         }

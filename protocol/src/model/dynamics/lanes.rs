@@ -3,10 +3,12 @@
 //! Plain loops over arrays, inlined so that LLVM compiles them for their caller's vectors.
 
 use super::super::randomness::split_mix;
-use super::parents::ESCAPED;
 
 /// Cells decided at once by the first byte, and searched at once for undecided ones.
 pub(super) const LANES: usize = 64;
+
+/// Mark of a cell that its byte left to the residual distribution. Even, and its high bit is set, as in no state.
+const ESCAPED: u8 = 254;
 
 /// The byte values that stand for one tap.
 #[derive(Debug)]

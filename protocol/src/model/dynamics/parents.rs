@@ -8,17 +8,13 @@
 //! So `m` is accepted with probability `sum_t w[m, n_t, t] / C`: in proportion to its weight. After a rejection, draw
 //! again. `tests/model/dynamics.rs` compares draws with `Phi` for any models and grids.
 
-use super::centre;
 use super::lanes::Words;
 use super::mixture::Mixture;
-use super::places::{OFF_GRID, Places};
+use super::places::{OFF_GRID, Places, centre};
 
 /// Mark of a cell to be drawn again: its parent is off the grid, or has no such vote. Odd, and its high bit is set, as
 /// in no state.
 const REJECTED: u8 = OFF_GRID;
-
-/// Mark of a cell that its byte left to the residual distribution. Even; high bit set.
-pub(super) const ESCAPED: u8 = 254;
 
 /// Rounds of drawing parents before a cell's kernel is summed. The wildfire rejects about 1 in 30,
 /// in a corner 1 in 3; only models with columns of very different sums come here often.
@@ -145,7 +141,8 @@ impl Parents {
         n_rejected
     }
 
-    /// Draws from a mixture for the cell at `home`, which bears [`ESCAPED`] or [`REJECTED`]: a state, or [`REJECTED`].
+    /// Draws for the cell at `home`, by its mark: from the residual distribution after a byte, from the whole
+    /// after a rejection.
     #[inline]
     fn outcome(&self, mixture: u8, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
         let table = usize::from(mixture << 1 | mark & 1) << self.log_n_slots;

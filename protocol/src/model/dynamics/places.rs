@@ -62,3 +62,8 @@ impl Places {
         }
     }
 }
+
+/// Where the cell itself lies, relative to its home.
+pub(super) fn centre(offsets: &[usize]) -> usize {
+    offsets[offsets.len() / 2]
+}

@@ -6,7 +6,7 @@
 //! Why it is the same: `w x + w y = w (x + y)`. The sums of the formula, in double precision, are in
 //! `tests/model/transition.rs` and `own_state.rs`, which compare them for any models and grids.
 
-use super::{LANES, Layout};
+use super::layout::{LANES, Layout};
 use ndarray::{Array4, NdFloat, s};
 
 /// For each next state its bias and its weight for some of the groups.

@@ -8,12 +8,12 @@ use candle_nn::{Init, VarBuilder};
 
 /// `P(y | x)`, learned.
 #[derive(Debug)]
-pub struct Observation {
+pub struct ObservationMatrix {
     /// Before the softmax of each column, `[observations, states]`.
     weight: Tensor,
 }
 
-impl Observation {
+impl ObservationMatrix {
     /// A matrix for so many observations and states.
     pub fn new(vb: &VarBuilder<'_>, n_observations: usize, n_states: usize) -> Result<Self> {
         let (mean, stdev) = (0.0, 1.0);

@@ -1,0 +1,7 @@
+//! One program: each would link candle.
+
+mod learned_filter;
+mod own_kernels;
+mod prior;
+mod report;
+mod rollout;
