@@ -23,8 +23,8 @@ fn options() -> String {
     let beliefs = EstimatorKind::FAMILIES.map(|(family, _)| family).join(", ");
     let names = OPTIONS.map(|option| option.name).join(", ");
     format!(
-        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}; \
-         rule: the best region if it promises more, else exploit\n"
+        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}\n    \
+         or rule: the best region if it promises more than here, else exploit\n"
     )
 }
 
@@ -101,6 +101,6 @@ mod tests {
                  states, only in `compare`"
             )
         );
-        assert!(list.lines().all(|line| line.len() <= 160), "{list}");
+        assert!(list.lines().all(|line| line.len() <= 130), "{list}");
     }
 }
