@@ -7,7 +7,7 @@ use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use agent::planning::policy::EstimatorKind;
 use anyhow::{Context, Result, ensure};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use network::Device;
 use protocol::channels::Instance;
 use protocol::program::{WatchedProcess, stop_on_signals};
@@ -32,8 +32,8 @@ pub struct ServeDecisionsCommand {
     #[arg(long)]
     takeover: bool,
     /// What keeps the beliefs [default: the checkpoint's filter; without one the known model's]
-    #[arg(long)]
-    estimator: Option<EstimatorName>,
+    #[arg(long, value_name = "NAME")]
+    estimator: Option<EstimatorKind>,
     /// What `train` learned, for learned estimators; may be given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
@@ -45,36 +45,6 @@ pub struct ServeDecisionsCommand {
     exit_with: Option<i32>,
     #[command(flatten)]
     settings: AgentFlags,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-#[value(rename_all = "snake_case")]
-enum EstimatorName {
-    /// The paper's Bayes filter: cells are independent
-    KnownModel,
-    /// One whose corrections reach neighbouring cells, by correlations that it learns
-    SpatialFilter,
-    /// A filter that `train --learner filter` learned
-    LearnedFilter,
-    /// The same, whose corrections reach neighbouring cells
-    LearnedSpatialFilter,
-    /// A filter that `train --learner own_filter` learned
-    LearnedOwnFilter,
-    /// The same, whose corrections reach neighbouring cells
-    LearnedOwnSpatialFilter,
-}
-
-impl From<EstimatorName> for EstimatorKind {
-    fn from(name: EstimatorName) -> Self {
-        match name {
-            EstimatorName::KnownModel => Self::KnownModel,
-            EstimatorName::SpatialFilter => Self::Spatial,
-            EstimatorName::LearnedFilter => Self::Learned,
-            EstimatorName::LearnedSpatialFilter => Self::LearnedSpatial,
-            EstimatorName::LearnedOwnFilter => Self::LearnedOwn,
-            EstimatorName::LearnedOwnSpatialFilter => Self::LearnedOwnSpatial,
-        }
-    }
 }
 
 impl ServeDecisionsCommand {
@@ -104,7 +74,7 @@ impl ServeDecisionsCommand {
 
     fn estimator(&self, learned: &Learned) -> Result<EstimatorKind> {
         let kind = match (self.estimator, &learned.decisions) {
-            (Some(name), _) => name.into(),
+            (Some(kind), _) => kind,
             (None, Some(decisions)) => decisions.estimator,
             (None, None) if learned.filter.is_some() => EstimatorKind::Learned,
             (None, None) if learned.own_filter.is_some() => EstimatorKind::LearnedOwn,

@@ -9,7 +9,7 @@ use agent::learning::learned::Learned;
 use agent::learning::train::{CHECKPOINT, Training, train};
 use agent::planning::policy::EstimatorKind;
 use agent::server::launch::OwnServer;
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use network::DeviceKind;
 use protocol::channels::Instance;
@@ -45,7 +45,7 @@ pub struct TrainCommand {
     steps: Option<u64>,
     /// Whose belief decisions are learned on [default: learned_filter]
     #[arg(long, value_name = "NAME")]
-    estimator: Option<String>,
+    estimator: Option<EstimatorKind>,
     /// The filter for that, of an earlier training; without it, one is learned first
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
@@ -114,11 +114,8 @@ impl TrainCommand {
     fn training(&self) -> Result<Training> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
-        if let Some(name) = &self.estimator {
-            let kind = EstimatorKind::try_from(name.clone());
-            config.decisions.estimator = kind.map_err(|error| anyhow!("--estimator: {error}"))?;
-            config.check()?;
-        }
+        let decisions = &mut config.decisions;
+        decisions.estimator = self.estimator.unwrap_or(decisions.estimator);
         let n_worlds = self.worlds.unwrap_or(match config.learner {
             LearnerKind::Autoencoder => 1,
             _ => 16,

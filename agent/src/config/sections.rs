@@ -4,7 +4,7 @@ use crate::estimation::belief::EntropyKind;
 use crate::planning::BasisKind;
 use crate::planning::policy::EstimatorKind;
 use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
-use anyhow::{Result, bail, ensure};
+use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 /// Below 1, so that Adam's means move.
@@ -204,11 +204,6 @@ impl NetworkDqnConfig {
 impl DecisionsConfig {
     pub(super) fn check(&self) -> Result<()> {
         check_dqn("decisions.", &self.learning, 2e5)?;
-        ensure!(
-            self.estimator.suits_decisions(),
-            "decisions.estimator: expected a filter that is told frames alone, got {}",
-            self.estimator.label()
-        );
         let ranges = [
             ("beam_width", self.beam_width as f64, 1.0, 1e4),
             ("episode_steps", self.episode_steps as f64, 1.0, 1e9),

@@ -5,8 +5,9 @@ use crate::planning::options::{OPTIONS, PathOption};
 use anyhow::{Context, Result, bail};
 use protocol::Model;
 use serde::{Deserialize, Serialize};
+use std::str::FromStr;
 
-/// In settings and tables by [`EstimatorKind::label`].
+/// In settings and checkpoints by [`EstimatorKind::label`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(into = "&'static str", try_from = "String")]
 pub enum EstimatorKind {
@@ -79,25 +80,6 @@ impl EstimatorKind {
         ("oracle", Self::Truth),
     ];
 
-    const ALL: [Self; 10] = [
-        Self::None,
-        Self::KnownModel,
-        Self::Spatial,
-        Self::Learned,
-        Self::LearnedSpatial,
-        Self::LearnedOwn,
-        Self::LearnedOwnSpatial,
-        Self::Autoencoder,
-        Self::Truth,
-        Self::NextTruth,
-    ];
-
-    /// Whether decisions can be learned on its belief, from frames alone.
-    pub fn suits_decisions(self) -> bool {
-        let mut families = Self::FAMILIES.iter();
-        self != Self::Truth && families.any(|(_, kind)| *kind == self)
-    }
-
     /// Whether its kernels see the cell's own state.
     pub fn sees_own_state(self) -> bool {
         matches!(self, Self::LearnedOwn | Self::LearnedOwnSpatial)
@@ -149,16 +131,28 @@ impl From<EstimatorKind> for &'static str {
     }
 }
 
+impl FromStr for EstimatorKind {
+    type Err = String;
+
+    /// One on whose belief decisions can be learned, from frames alone.
+    fn from_str(name: &str) -> Result<Self, String> {
+        let kinds = Self::FAMILIES.map(|(_, kind)| kind).into_iter();
+        let mut kinds = kinds.filter(|kind| *kind != Self::Truth);
+        kinds
+            .clone()
+            .find(|kind| kind.label() == name)
+            .ok_or_else(|| {
+                let names: Vec<&str> = kinds.by_ref().map(Self::label).collect();
+                format!("expected one of {}, got {name:?}", names.join(", "))
+            })
+    }
+}
+
 impl TryFrom<String> for EstimatorKind {
     type Error = String;
 
     fn try_from(name: String) -> Result<Self, String> {
-        let kind = Self::ALL.into_iter().find(|kind| kind.label() == name);
-        kind.ok_or_else(|| {
-            let names = Self::ALL.into_iter().filter(|kind| kind.suits_decisions());
-            let names: Vec<&str> = names.map(Self::label).collect();
-            format!("expected one of {}, got {name:?}", names.join(", "))
-        })
+        name.parse()
     }
 }
 
@@ -533,7 +527,7 @@ mod tests {
                 Ok(estimator)
             );
         }
-        let error = EstimatorKind::try_from("filter".to_owned()).expect_err("no name");
+        let error = "filter".parse::<EstimatorKind>().expect_err("no name");
         assert!(
             error.ends_with("learned_own_spatial_filter, got \"filter\""),
             "{error}"

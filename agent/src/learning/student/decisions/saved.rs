@@ -120,12 +120,6 @@ impl SavedDecisions {
         let expected = OPTIONS.map(|option| option.name).join(" ");
         let got = self.options.join(" ");
         check(got == expected, "options", &expected, &got)?;
-        check(
-            self.estimator.suits_decisions(),
-            "estimator",
-            "one that decisions can be learned on",
-            self.estimator.label(),
-        )?;
         check_counts(&[
             ("dqn.n_updates", self.dqn.n_updates),
             ("world_steps", self.world_steps),
@@ -294,10 +288,6 @@ mod tests {
         refused(
             |saved| saved.options.truncate(1),
             "options: expected exploit exploit_entropy",
-        );
-        refused(
-            |saved| saved.estimator = EstimatorKind::Truth,
-            "estimator: expected one",
         );
         refused(
             |saved| saved.dqn.n_updates = u64::MAX,
