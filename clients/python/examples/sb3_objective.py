@@ -115,7 +115,8 @@ def compare(envs: VecEnv, model: DQN, n_steps: int) -> None:
 
 
 def learner(envs: VecEnv, seed: int) -> DQN:
-    """A DQN on these worlds whose step size and exploration fall."""
+    """A DQN on these worlds whose step size and exploration fall; an update for 8 decisions."""
+    updates = max(1, envs.num_envs // 8)
     return DQN(
         ScoringPolicy,
         ScaledRewards(envs),
@@ -125,11 +126,11 @@ def learner(envs: VecEnv, seed: int) -> DQN:
         batch_size=256,
         learning_starts=3_000,
         train_freq=1,
-        gradient_steps=max(1, envs.num_envs // 8),
+        gradient_steps=updates,
         n_steps=4,
         gamma=0.97,
-        tau=0.005,
-        target_update_interval=1,
+        tau=0.005 * updates,
+        target_update_interval=envs.num_envs,
         exploration_initial_eps=0.5,
         exploration_fraction=0.5,
     )
@@ -155,6 +156,7 @@ def main() -> None:
         "model": args.model,
         "n_moves": args.moves,
         "burn_in": args.burn_in,
+        "timeout": 60.0,  # of a busy machine
         "checkpoint": args.checkpoint,
     }
     name = "emberwatch/WildfireObjective-v1"
