@@ -11,8 +11,8 @@ use thiserror::Error;
 
 /// Keeps a belief about one world: [`Self::correct`] with each frame, then [`Self::predict`].
 pub trait Estimator: Send {
-    /// Takes in a frame of X_k (eq. 5). `truth` is X_k, shape `[H, W]`, where somebody knows it: for upper
-    /// bounds only.
+    /// Takes in a frame of X_k (eq. 5). `truth` is X_k, shape `[H, W]`, where somebody knows it: for oracles
+    /// only.
     ///
     /// # Errors
     /// [`EstimatorError`] if the frame is impossible, or `truth` is needed and missing; the belief is then as
@@ -78,7 +78,7 @@ pub enum EstimatorError {
     Network(#[from] NetworkError),
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
-    /// An upper bound that is not told the hidden states.
+    /// An oracle that is not told the hidden states.
     #[error("the policy needs the truth channel: start the server with --publish-truth")]
     NoTruth,
 }
