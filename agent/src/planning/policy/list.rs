@@ -53,8 +53,8 @@ fn description(policy: &Policy, model: &Model) -> String {
 fn goal(policy: &Policy, model: &Model) -> String {
     match policy.choice {
         Choice::Network => return "what a learned DQN chooses".into(),
-        Choice::Scorer => return "the option that a learned DQN values most".into(),
-        Choice::Rule => return "the best region if it promises more than here".into(),
+        Choice::Scorer => return "the option of most value".into(),
+        Choice::Rule => return "what is near, or the best region".into(),
         Choice::Option(option) => return format!("the option {}, always", option.name),
         Choice::Objective => (),
     }
