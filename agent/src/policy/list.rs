@@ -23,8 +23,8 @@ fn options() -> String {
     let beliefs = EstimatorKind::FAMILIES.map(|(family, _)| family).join(", ");
     let names = OPTIONS.map(|option| option.name).join(", ");
     format!(
-        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}; \
-         rule: the best region if it promises more, else exploit\n"
+        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}\n    \
+         or rule: the best region if it promises more than here, else exploit\n"
     )
 }
 
@@ -53,8 +53,8 @@ fn description(policy: &Policy, model: &Model) -> String {
 fn goal(policy: &Policy, model: &Model) -> String {
     match policy.choice {
         Choice::Network => return "what a learned DQN chooses".into(),
-        Choice::Scorer => return "the option that a learned DQN values most".into(),
-        Choice::Rule => return "the best region if it promises more than here".into(),
+        Choice::Scorer => return "the option of most value".into(),
+        Choice::Rule => return "what is near, or the best region".into(),
         Choice::Option(option) => return format!("the option {}, always", option.name),
         Choice::Objective => (),
     }
@@ -101,6 +101,6 @@ mod tests {
                  states, only in `compare`"
             )
         );
-        assert!(list.lines().all(|line| line.len() <= 160), "{list}");
+        assert!(list.lines().all(|line| line.len() <= 130), "{list}");
     }
 }

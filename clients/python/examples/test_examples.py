@@ -31,8 +31,8 @@ EXAMPLES = [
     ),
     (
         "sb3_objective.py",
-        "--total-steps 500 --evaluation-steps 50",
-        r"always fire +[1-9]\S* fires found a step\n(.*\n)*PPO +\d",
+        "--model wildfire --moves 64 --worlds 4 --total-steps 500 --test-worlds 2 --test-steps 50",
+        r"500 decisions, .*\nDQN .*\nrandom .*\nexploit +[1-9]",
     ),
     ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
     ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),

@@ -1,6 +1,7 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
+use ::network::{Dqn, DqnShape};
 use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
@@ -16,7 +17,6 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
-use ::network::{Dqn, DqnShape};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
 use std::collections::BTreeMap;

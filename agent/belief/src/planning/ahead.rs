@@ -1,10 +1,12 @@
-//! Beam search over several paths, of which the first is flown: it sets out for what one path cannot reach.
+//! Beam search over several paths, of which the first is flown: it sets out for what one path cannot reach, and beyond
+//! that for the nearest cells that are worth something.
 
 use crate::planning::beam::BeamSearch;
+use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use protocol::Grid;
 
-/// Paths that are planned at once. On the true states of wildfire-sparse and wildfire-latent (T = 12) a
-/// plan of six paths sees most of the grid.
+/// Paths that are planned at once: of T = 12 moves, they reach most of a grid of 64 x 64 cells.
 const N_PATHS: usize = 6;
 
 /// Worth of a path's cells beside those of the path before it: what a later path finds may have burnt out by then.
@@ -24,15 +26,82 @@ impl Ahead {
 impl Planner for Ahead {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
         let n_moves = problem.n_moves;
-        self.0
-            .set_discount(DISCOUNT.powf(1.0 / n_moves.max(1) as f32));
+        let discount = DISCOUNT.powf(1.0 / n_moves.max(1) as f32);
+        let mut values = problem.values.clone();
+        values.add(BEAM_BONUS, &promise(problem.values, discount));
+        self.0.set_discount(discount);
         let all = self.0.plan(&PlanningProblem {
             n_moves: N_PATHS * n_moves,
+            values: &values,
             ..*problem
         });
         let mut moves = all.moves;
         moves.truncate(n_moves);
         let score = problem.values.score(problem.start, &moves);
         Plan { moves, score }
+    }
+}
+
+/// The best of all cells from each cell, where every move of the way there leaves a share; shape `[H, W]`. A search
+/// over equal cells has no direction without it.
+fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
+    let mut promise = values.value().mapv(|value| value.max(0.0));
+    let (height, width) = promise.dim();
+    let cells = (0..height).flat_map(|row| (0..width).map(move |col| (row, col)));
+    let mut spread = |(row, col): (usize, usize), from: [(usize, usize); 2]| {
+        for near in from {
+            let passed_on = promise.get(near).map_or(0.0, |near| near * kept_per_move);
+            promise[[row, col]] = promise[[row, col]].max(passed_on);
+        }
+    };
+    // Once down and to the right, once back: the way to any cell is such a pair.
+    for (row, col) in cells.clone() {
+        spread(
+            (row, col),
+            [(row.wrapping_sub(1), col), (row, col.wrapping_sub(1))],
+        );
+    }
+    for (row, col) in cells.collect::<Vec<_>>().into_iter().rev() {
+        spread((row, col), [(row + 1, col), (row, col + 1)]);
+    }
+    promise
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Cell;
+
+    #[test]
+    fn a_promise_fades_with_the_way_to_it() {
+        let best = [((2, 1), 1.0_f32), ((6, 7), 0.9)];
+        let mut value = Grid::zeros((8, 9));
+        best.iter().for_each(|&(at, worth)| value[at] = worth);
+        let promise = promise(&CellValues::new(value, 0.02), 0.9);
+        for ((row, col), &got) in promise.indexed_iter() {
+            let of = |&((r, c), worth): &((usize, usize), f32)| {
+                worth * 0.9_f32.powi((row.abs_diff(r) + col.abs_diff(c)) as i32)
+            };
+            let expected = best.iter().map(of).fold(0.0, f32::max);
+            assert!(
+                (got - expected).abs() < 1e-6,
+                "{row} {col}: {got} {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn what_no_plan_reaches_gives_its_direction() {
+        let mut value = Grid::zeros((64, 64));
+        value[(60, 5)] = 1.0;
+        let values = CellValues::new(value, BEAM_BONUS);
+        let plan = Ahead::new(50).plan(&PlanningProblem {
+            start: Cell { row: 5, col: 5 },
+            n_moves: 4,
+            values: &values,
+            seed: 0,
+            step: 0,
+        });
+        assert_eq!(plan.moves, [protocol::Move::Down; 4]);
     }
 }

@@ -45,9 +45,9 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
 
     ## Observation Space
 
-    `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies. `feature_names`
-    names the 26 numbers, PROTOCOL.md section 13 explains them. The same network can score each row
-    by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of it.
+    `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
+    `feature_names` names the 26 numbers, PROTOCOL.md section 13 explains them. One network can
+    score each row by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of them.
 
     ## Starting State
 
