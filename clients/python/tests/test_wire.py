@@ -110,7 +110,7 @@ class Wired:
             made.header = headers[1]
             return made
 
-        names = ("clean_up", "check", "close", "remember_files")
+        names = ("clean_up", "check", "close", "remember_files", "fill_ports")
         node = SimpleNamespace(**dict.fromkeys(names, lambda: None))
         with (
             patch.object(emberwatch.connection, "Node", lambda _: node),
