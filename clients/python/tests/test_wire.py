@@ -112,7 +112,7 @@ class Wired:
             return made
 
         names = ("clean_up", "check", "close", "remember_files", "fill_ports")
-        node = SimpleNamespace(**dict.fromkeys(names, lambda: None))
+        node = SimpleNamespace(instance="nowhere", **dict.fromkeys(names, lambda: None))
         with (
             patch.object(emberwatch.connection, "Node", lambda _: node),
             patch.object(emberwatch.connection, "Peer", lambda *_: self.peer),
