@@ -175,8 +175,8 @@ fn private_instance(owner: u32) -> Instance {
     let find = || {
         let processes = std::fs::read_dir("/proc").expect("processes").flatten();
         let lines = processes.filter_map(|it| std::fs::read(it.path().join("cmdline")).ok());
-        let lines = lines.map(|line| String::from_utf8_lossy(&line).into_owned());
-        let server = lines.filter(|line| line.contains(&exit_with)).next();
+        let mut lines = lines.map(|line| String::from_utf8_lossy(&line).into_owned());
+        let server = lines.find(|line| line.contains(&exit_with));
         name = server.and_then(|line| {
             let (_, rest) = line.split_once("--instance\0")?;
             Some(rest.split('\0').next()?.to_owned())

@@ -25,6 +25,7 @@ from emberwatch.client import Client
 from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
 from emberwatch.replies import LeftBeliefInfo, ServerInfo, ServerStatus, WorldInfo, WorldStatus
+from emberwatch.turn import pid_namespace
 
 LAYOUTS = document.layouts()
 SCALARS = {"u16": ctypes.c_uint16, "u32": ctypes.c_uint32, "u64": ctypes.c_uint64}
@@ -84,7 +85,7 @@ class Wired:
     def __init__(self, **hello: Any) -> None:
         self.control, self.step = Port(), Port()
         sizes = {"height": 3, "width": 5, "n_moves": 4, "n_worlds": 1, "n_robots": 2}
-        self.say(HELLO | sizes | hello)
+        self.say(HELLO | sizes | {"pid_namespace": pid_namespace()} | hello)
         self.peer = SimpleNamespace(
             listener_low=0, listener_high=0, watch=lambda _: None, close=lambda: None
         )
@@ -110,8 +111,8 @@ class Wired:
             made.header = headers[1]
             return made
 
-        names = ("clean_up", "check", "close", "remember_files")
-        node = SimpleNamespace(**dict.fromkeys(names, lambda: None))
+        names = ("clean_up", "check", "close", "remember_files", "fill_ports")
+        node = SimpleNamespace(instance="nowhere", **dict.fromkeys(names, lambda: None))
         with (
             patch.object(emberwatch.connection, "Node", lambda _: node),
             patch.object(emberwatch.connection, "Peer", lambda *_: self.peer),
@@ -173,7 +174,7 @@ def test_a_refusal_says_the_detail_that_the_table_gives_it() -> None:
 
 
 def test_an_unknown_status_is_a_refusal() -> None:
-    for code in (23, 2**32 - 1):
+    for code in (24, 2**32 - 1):
         error = errors.refusal(code, 3)
         assert (type(error), error.code, error.detail) == (EmberwatchError, "unknown", 3)
         assert str(code) in str(error)
@@ -333,6 +334,11 @@ def test_the_documented_replies_become_records() -> None:
     message = error["message"].replace('"takeover": true', "takeover=True")  # in Python's terms
     assert (str(raised.value), raised.value.detail) == (message, error["detail"])
     assert str(errors.refusal(10, error["detail"])) == message
+
+
+def test_a_server_of_another_pid_namespace_is_refused() -> None:
+    with fails("pid_namespace", match="another PID namespace"):
+        Wired(pid_namespace=1)
 
 
 def test_unknown_keys_of_a_reply_are_ignored() -> None:

@@ -90,7 +90,7 @@ pub enum Status {
     Incomplete = 21,
     /// A robot outside the server's; detail: number of robots of all worlds.
     NoSuchRobot = 22,
-    /// There is too little shared memory for the answer; detail: its bytes, or 0.
+    /// There is too little shared memory for the answer; detail: 0.
     NoMemory = 23,
 }
 

@@ -138,7 +138,7 @@ impl Answers {
         if text.len() > JSON_SLICE
             && let Err(error) = check_room_for_ports(text.len())
         {
-            let refusal = Reply::error(Status::NoMemory, text.len() as u64, error.to_string());
+            let refusal = Reply::error(Status::NoMemory, 0, error.to_string());
             status = Status::NoMemory;
             text = serde_json::to_vec(&refusal).expect("invariant: replies serialise");
         }

@@ -52,6 +52,8 @@ class ServerInfo:
     deadline_millis: int
     #: None of simulated worlds.
     recorded_world: RecordedWorld | None = None
+    #: That of the number `pid`.
+    pid_namespace: int | None = None
 
     @property
     def recorded_states(self) -> Description | None:
@@ -197,7 +199,9 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
-        if name == "recorded_world":  # the one key that may be missing
+        if name == "pid_namespace" and name not in given:
+            continue
+        if name == "recorded_world":  # it may be missing, too
             nested = given.get(name)
             values[name] = None if nested is None else record(RecordedWorld, nested)
             continue
