@@ -293,17 +293,22 @@ fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
     found
 }
 
+/// The files that a file depends on, also by way of others.
+fn reached<'a>(graph: &'a Graph, from: &'a Vec<String>) -> BTreeSet<&'a Vec<String>> {
+    let mut reached = BTreeSet::new();
+    let mut next = vec![from];
+    while let Some(file) = next.pop() {
+        next.extend(graph[file].iter().filter(|used| reached.insert(*used)));
+    }
+    reached
+}
+
 /// The files of one circle, if there is one.
 fn circle(graph: &Graph) -> Vec<Vec<String>> {
-    let reached = |from: &Vec<String>| {
-        let mut reached = BTreeSet::new();
-        let mut next = vec![from];
-        while let Some(file) = next.pop() {
-            next.extend(graph[file].iter().filter(|used| reached.insert(*used)));
-        }
-        reached
-    };
-    let all: BTreeMap<_, _> = graph.keys().map(|file| (file, reached(file))).collect();
+    let all: BTreeMap<_, _> = graph
+        .keys()
+        .map(|file| (file, reached(graph, file)))
+        .collect();
     let Some(start) = graph.keys().find(|file| all[file].contains(file)) else {
         return Vec::new();
     };

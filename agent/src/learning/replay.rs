@@ -204,6 +204,7 @@ impl Block {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::Probabilities;
 
     fn frame(value: u8) -> Frame {
         let shape = Shape::new(1, 3).expect("test shape");
@@ -213,7 +214,8 @@ mod tests {
     /// About two states of three cells, another for each number.
     fn belief(number: u8) -> Belief {
         let p = f32::from(number) / 16.0;
-        Belief::everywhere(&[p, 1.0 - p], Shape::new(1, 3).expect("test shape"))
+        let states = Probabilities::from_shape_fn((2, 1, 3), |(state, _, _)| [p, 1.0 - p][state]);
+        Belief::from_probabilities(states).expect("valid")
     }
 
     /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.

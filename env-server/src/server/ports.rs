@@ -76,7 +76,7 @@ impl PortConfig {
 
 /// All ports of a server.
 pub struct Ports {
-    step: Server<Ipc, [u8], StepRequest, [u8], StepReply>,
+    step: StepServer,
     control: ControlServer,
     frames: Publisher<Ipc, [u8], FrameHeader>,
     truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
@@ -321,11 +321,13 @@ impl Ports {
     }
 }
 
+type StepServer = Server<Ipc, [u8], StepRequest, [u8], StepReply>;
+
 fn step_server(
     service: &StepService,
     answer_bytes: usize,
     failed: &FailedConnections,
-) -> Result<Server<Ipc, [u8], StepRequest, [u8], StepReply>, ServerCreateError> {
+) -> Result<StepServer, ServerCreateError> {
     service
         .server_builder()
         .initial_max_slice_len(answer_bytes.max(1))

@@ -176,7 +176,7 @@ proptest! {
             let values = values.iter().take(shape.n_cells());
             let bytes: Vec<u8> = values.map(|&v| if v < 3 { v } else { UNOBSERVED }).collect();
             let frame = Frame::from_bytes(shape, 3, &bytes).expect("valid frame");
-            filter.correct(&frame, None).expect("no probability is zero");
+            filter.correct(&frame).expect("no probability is zero");
             let posterior = filter.belief().view().to_owned();
             prop_assert!(Belief::from_probabilities(posterior).is_ok());
             filter.predict();

@@ -167,10 +167,9 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
 fn a_network_decides_on_what_it_was_learned_with() {
     let learned = network(BasisKind::Predictor, |_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
-    let hidden = |estimator: &AutoencoderEstimator| estimator.follower().expect("one").clone();
-    let before = hidden(&estimator).hidden().to_vec();
-    estimator.correct(&world(0).1, None).expect("possible");
-    let after = hidden(&estimator).hidden().to_vec();
+    let before = estimator.hidden().expect("a vector").to_vec();
+    estimator.correct(&world(0).1).expect("possible");
+    let after = estimator.hidden().expect("a vector").to_vec();
     let network = network(BasisKind::Predictor, |dqn| {
         dqn.best(&before) != dqn.best(&after)
     });
