@@ -7,6 +7,7 @@ mod files;
 mod liveness;
 mod memory;
 mod pending;
+mod port_config;
 mod ports;
 mod publications;
 mod resets;
@@ -15,5 +16,6 @@ mod state;
 mod taken;
 
 pub use liveness::Clients;
-pub use ports::{PortConfig, Ports};
+pub use port_config::PortConfig;
+pub use ports::Ports;
 pub use serve::serve;

@@ -1,7 +1,7 @@
 //! Memory for a server's messages. There must be enough for all clients and observers before a server starts. Each gets
 //! its part when it comes, so that few clients take little, and a server writes only where there is memory.
 
-use super::ports::PortConfig;
+use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
 use protocol::channels::{
     ChannelError, FRAME_BUFFER, MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,

@@ -2,6 +2,7 @@
 
 use super::descriptors::raise_limit;
 use super::memory::{Memory, PortIds, check_shared_memory};
+use super::port_config::{PortConfig, frame_bytes};
 use super::taken::{Taken, once_free};
 use crate::config::Checked;
 use anyhow::Result;
@@ -16,10 +17,10 @@ use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
-    Channel, ChannelError, ControlService, Entries, FrameService, Instance, Ipc, RequestResponse,
-    Services, StepService, TruthService, create_node, ipc_error, lives_elsewhere,
+    Channel, ChannelError, ControlService, Entries, FrameService, Ipc, RequestResponse, Services,
+    StepService, TruthService, create_node, ipc_error, lives_elsewhere,
 };
-use protocol::control::{Reply, ServerInfo};
+use protocol::control::Reply;
 use protocol::failed_connections::FailedConnections;
 use protocol::message::{FrameHeader, Header, Status, StepReply, StepRequest, TruthHeader};
 use protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
@@ -38,41 +39,6 @@ use std::time::Instant;
 
 /// A request on `step` that waits for its answer.
 pub type ActiveStep = Active<StepRequest, StepReply>;
-
-/// The instance, and the sizes of its messages.
-#[derive(Debug, Clone)]
-pub struct PortConfig {
-    pub instance: Instance,
-    /// Most cells of a frame, or of hidden states.
-    pub n_cells: usize,
-    /// Longest sample on `frames`, bytes.
-    pub frame_bytes: usize,
-    /// Longest answer on `step`, bytes.
-    pub answer_bytes: usize,
-    /// Whether to publish hidden states.
-    pub publish_truth: bool,
-}
-
-impl PortConfig {
-    /// Of an instance that serves nothing yet.
-    pub fn empty(instance: Instance) -> Self {
-        Self {
-            instance,
-            n_cells: 0,
-            frame_bytes: 0,
-            answer_bytes: 0,
-            publish_truth: false,
-        }
-    }
-
-    /// Makes room for the samples of a server's worlds.
-    pub fn fit(&mut self, info: &ServerInfo) {
-        let n_cells = info.height * info.width;
-        let n_bytes = frame_bytes(info.n_robots, n_cells, info.n_moves);
-        self.n_cells = self.n_cells.max(n_cells);
-        self.frame_bytes = self.frame_bytes.max(n_bytes);
-    }
-}
 
 /// All ports of a server.
 pub struct Ports {
@@ -362,11 +328,6 @@ fn publish<H: Header>(
     *sample.user_header_mut() = header;
     let sent = sample.write_from_slice(bytes).send();
     sent.map_err(|error| format!("{error:?}"))
-}
-
-/// The longest payload of a sample on `frames`.
-fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
-    n_robots as usize * (ROBOT_BYTES + n_cells + n_moves)
 }
 
 fn taken<Q: Header, R: Header>(

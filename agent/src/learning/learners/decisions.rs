@@ -1,52 +1,33 @@
 //! Learns which option to fly (paper section III.E): on an estimator's belief all options are planned, and a DQN that
 //! reads each one's features says what it is worth.
 
+mod base;
+mod run;
 mod saved;
 
-pub use self::saved::{LearnedDecisions, SavedDecisions};
+pub use self::base::Base;
+pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
 
-use self::saved::SavedRun;
+use self::run::Run;
+use self::saved::{Held, SavedModel, SavedRun, filter_tensors};
 use crate::config::AgentConfig;
-use crate::learning::checkpoint::Contents;
+use crate::learning::checkpoint::{Contents, check};
 use crate::learning::learners::base::{Learner, Worlds, without_truth};
-use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
-use ::network::{Dqn, DqnShape, Track, Transition};
+use ::network::Dqn;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
-use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_belief::planning::{OPTIONS, Proposal, Target};
+use emberwatch_belief::planning::{OPTIONS, Target};
+use protocol::Move;
 use protocol::client::Observation;
 use protocol::randomness::{Purpose, stream};
-use protocol::{Model, Move, Shape};
 use rand_chacha::rand_core::Rng;
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "decisions";
-
-/// What a decision is made on, and among.
-pub const SHAPE: DqnShape = DqnShape {
-    n_inputs: N_FEATURES,
-    n_outputs: 1,
-    n_candidates: OPTIONS.len(),
-};
-
-/// What keeps the beliefs that decisions are made on, before a world's first frame.
-pub struct Base {
-    pub kind: EstimatorKind,
-    filter: BayesFilter,
-    /// The state that pays most.
-    target: usize,
-    correlations: Correlations,
-    state_names: Vec<String>,
-    /// What the filter learned, unless the model is known.
-    model: Option<LearnedModel>,
-}
 
 /// A DQN over options that learns on several worlds.
 pub struct DecisionsLearner {
@@ -63,58 +44,6 @@ pub struct DecisionsLearner {
     earned: f64,
     is_frozen: bool,
     times: [(&'static str, Duration); 2],
-}
-
-struct Run {
-    rollout: Rollout,
-    /// The features of the option flown last and its reward, until what follows is known.
-    last: Option<(Vec<f32>, f32)>,
-    track: Track,
-    held: Held,
-    /// What is flown next.
-    next: Option<(usize, Proposal)>,
-}
-
-/// A random option that is flown for some steps in a row.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-struct Held {
-    option: usize,
-    n_steps: u64,
-}
-
-impl Base {
-    /// On a known model, whose filter is given.
-    pub fn known(kind: EstimatorKind, filter: BayesFilter, model: &Model) -> Self {
-        Self {
-            kind,
-            filter,
-            target: model.target_state(),
-            correlations: Correlations::default(),
-            state_names: model.state_names(),
-            model: None,
-        }
-    }
-
-    pub fn learned(kind: EstimatorKind, model: LearnedModel, shape: Shape) -> Self {
-        Self {
-            kind,
-            filter: BayesFilter::learned(&model.tables, model.tables.prior(shape)),
-            target: model.target,
-            correlations: model.correlations.clone(),
-            state_names: numbered_states(model.tables.dimensions.n_states),
-            model: Some(model),
-        }
-    }
-
-    fn estimator(&self) -> Box<dyn Estimator> {
-        let filter = self.filter.clone();
-        if self.kind.is_spatial() {
-            let correlations = self.correlations.clone();
-            Box::new(SpatialFilter::new(filter, self.target, correlations))
-        } else {
-            Box::new(filter)
-        }
-    }
 }
 
 impl DecisionsLearner {
@@ -158,13 +87,7 @@ impl DecisionsLearner {
         let mut rollout = self.rollout_at(observation);
         rollout.correct()?;
         rollout.agent.predict();
-        Ok(Run {
-            rollout,
-            last: None,
-            track: self.dqn.track(),
-            held: Held::default(),
-            next: None,
-        })
+        Ok(Run::begun(rollout, &self.dqn))
     }
 
     /// Chooses a run's option: the best one, or while one is held at random, that.
@@ -209,31 +132,42 @@ impl DecisionsLearner {
         let done = self.world_steps as f32 / config.steps.max(1) as f32;
         (1.0 - done).max(config.final_rate)
     }
-}
 
-impl Run {
-    fn propose(&mut self) -> Vec<Proposal> {
-        let cell = self.rollout.observation().robot.cell();
-        self.rollout.agent.propose(cell)
+    fn saved(&self) -> Contents {
+        let runs = self.runs.iter().map(Run::saved);
+        let model = self.base.model.as_ref();
+        let state = SavedDecisions {
+            options: OPTIONS.map(|option| option.name.into()).into(),
+            estimator: self.base.kind,
+            model: model.map(|model| SavedModel {
+                dimensions: model.tables.dimensions,
+                target: model.target,
+                correlations: model.correlations.clone(),
+            }),
+            world_steps: self.world_steps,
+            earned: self.earned,
+            dqn: self.dqn.saved(),
+            worlds: self.worlds.numbers.clone().zip(runs).collect(),
+        };
+        let of_filter = model.into_iter().flat_map(filter_tensors);
+        Contents::new(
+            self.dqn.named_tensors().into_iter().chain(of_filter),
+            &state,
+        )
     }
 
-    /// The path of the option that was chosen.
-    fn take_up(&mut self) -> Vec<Move> {
-        let next = self.next.take();
-        let (option, proposal) = next.expect("invariant: an option was chosen");
-        self.last = Some((proposal.features.to_vec(), 0.0));
-        self.rollout.agent.take_up(option, proposal).moves
-    }
-
-    /// Takes in the features of what can be flown now; gives the transition that is complete by then.
-    fn led_to(&mut self, features: &[f32]) -> Option<Transition> {
-        let (input, reward) = self.last.take()?;
-        self.track.add(Transition {
-            input,
-            action: 0,
-            reward,
-            next: features.to_vec(),
-        })
+    /// Goes on from a checkpoint on the same base.
+    fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedDecisions = contents.state()?;
+        saved.load_into(&mut self.dqn, contents)?;
+        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
+        check(got == expected, "decisions.estimator", expected, got)?;
+        self.world_steps = saved.world_steps;
+        self.earned = saved.earned;
+        self.left = saved.worlds;
+        let n_states = self.base.state_names.len();
+        let mut left = self.left.values();
+        left.try_for_each(|left| left.check(n_states, self.worlds.shape))
     }
 }
 
@@ -253,7 +187,7 @@ impl Learner for DecisionsLearner {
             let run = match left.filter(|left| left.is_of(&observation)) {
                 Some(left) => {
                     n_gone_on += 1;
-                    left.restore(self.rollout_at(observation), &self.dqn)?
+                    Run::restore(left, self.rollout_at(observation), &self.dqn)?
                 }
                 None => self.begun(observation)?,
             };

@@ -1,14 +1,12 @@
 //! Decisions in a checkpoint: the DQN, what the belief's filter learned, and where the robots are.
 
-use super::{Base, DecisionsLearner, Held, Run, SHAPE};
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
 use crate::learning::learners::base::{Place, place};
 use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::EstimatorKind;
-use crate::rollout::Rollout;
-use ::network::{Dqn, NamedTensor, SavedDqn, Track};
+use ::network::{Dqn, DqnShape, NamedTensor, SavedDqn, Track};
 use anyhow::Result;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
@@ -21,11 +19,25 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// What a decision is made on, and among.
+pub const SHAPE: DqnShape = DqnShape {
+    n_inputs: N_FEATURES,
+    n_outputs: 1,
+    n_candidates: OPTIONS.len(),
+};
+
 /// More updates than a step of all worlds earns.
 const MOST_EARNED: f64 = 2e6;
 
 /// Before the names of the filter's tensors.
 const FILTER: &str = "filter.";
+
+/// A random option that is flown for some steps in a row.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Held {
+    pub(super) option: usize,
+    pub(super) n_steps: u64,
+}
 
 /// What policies act on.
 #[derive(Debug, Clone)]
@@ -42,33 +54,33 @@ pub struct LearnedDecisions {
 pub struct SavedDecisions {
     pub options: Vec<String>,
     pub estimator: EstimatorKind,
-    model: Option<SavedModel>,
+    pub(super) model: Option<SavedModel>,
     pub world_steps: u64,
-    earned: f64,
+    pub(super) earned: f64,
     pub dqn: SavedDqn,
-    worlds: BTreeMap<u32, SavedRun>,
+    pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
 /// What a filter learned, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct SavedModel {
-    dimensions: Dimensions,
-    target: usize,
-    correlations: Correlations,
+pub(super) struct SavedModel {
+    pub(super) dimensions: Dimensions,
+    pub(super) target: usize,
+    pub(super) correlations: Correlations,
 }
 
 /// Where a world was left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedRun {
-    place: Place,
-    frame: Vec<u8>,
+    pub(super) place: Place,
+    pub(super) frame: Vec<u8>,
     /// All that the estimator remembers.
-    belief: Vec<u8>,
-    estimate: Option<Belief>,
-    memory: Memory,
-    last: Option<(Vec<f32>, f32)>,
-    track: Track,
-    held: Held,
+    pub(super) belief: Vec<u8>,
+    pub(super) estimate: Option<Belief>,
+    pub(super) memory: Memory,
+    pub(super) last: Option<(Vec<f32>, f32)>,
+    pub(super) track: Track,
+    pub(super) held: Held,
 }
 
 impl LearnedDecisions {
@@ -116,7 +128,7 @@ impl SavedDecisions {
         Ok(Some(LearnedModel::new(parameters, target, correlations)))
     }
 
-    fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
+    pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
         let expected = OPTIONS.map(|option| option.name).join(" ");
         let got = self.options.join(" ");
         check(got == expected, "options", &expected, &got)?;
@@ -131,81 +143,13 @@ impl SavedDecisions {
     }
 }
 
-impl DecisionsLearner {
-    pub(super) fn saved(&self) -> Contents {
-        let runs = self.runs.iter().map(Run::saved);
-        let model = self.base.model.as_ref();
-        let state = SavedDecisions {
-            options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: self.base.kind,
-            model: model.map(|model| SavedModel {
-                dimensions: model.tables.dimensions,
-                target: model.target,
-                correlations: model.correlations.clone(),
-            }),
-            world_steps: self.world_steps,
-            earned: self.earned,
-            dqn: self.dqn.saved(),
-            worlds: self.worlds.numbers.clone().zip(runs).collect(),
-        };
-        let of_filter = model.into_iter().flat_map(filter_tensors);
-        Contents::new(
-            self.dqn.named_tensors().into_iter().chain(of_filter),
-            &state,
-        )
-    }
-
-    /// Goes on from a checkpoint on the same base.
-    pub(super) fn load(&mut self, contents: &Contents) -> Result<()> {
-        let saved: SavedDecisions = contents.state()?;
-        saved.load_into(&mut self.dqn, contents)?;
-        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
-        check(got == expected, "decisions.estimator", expected, got)?;
-        self.world_steps = saved.world_steps;
-        self.earned = saved.earned;
-        self.left = saved.worlds;
-        let n_states = self.base.state_names.len();
-        let mut left = self.left.values();
-        left.try_for_each(|left| left.check(n_states, self.worlds.shape))
-    }
-}
-
-impl Base {
-    /// What a checkpoint's decisions are on, if that was learned.
-    pub fn saved(contents: &Contents, shape: Shape) -> Result<Option<Self>> {
-        let saved: SavedDecisions = contents.state()?;
-        let model = saved.model(contents)?;
-        Ok(model.map(|model| Self::learned(saved.estimator, model, shape)))
-    }
-}
-
-impl Run {
-    fn saved(&self) -> SavedRun {
-        let (agent, observation) = (&self.rollout.agent, self.rollout.observation());
-        SavedRun {
-            place: place(observation),
-            frame: observation.frame.as_bytes().to_vec(),
-            belief: agent
-                .estimator()
-                .handover()
-                .map(|it| it.to_bytes())
-                .unwrap_or_default(),
-            estimate: agent.estimate().cloned(),
-            memory: agent.memory.clone(),
-            last: self.last.clone(),
-            track: self.track.clone(),
-            held: self.held,
-        }
-    }
-}
-
 impl SavedRun {
     /// Whether a world shows what it showed then.
     pub(super) fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
+    pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         let mut estimates = self.estimate.iter();
         estimates
             .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))?;
@@ -223,31 +167,9 @@ impl SavedRun {
         let (most, got) = (OPTIONS.len(), self.held.option);
         check(got < most, "worlds.held", format!("less than {most}"), got)
     }
-
-    /// Goes on with an agent that has not yet taken in what its world shows.
-    pub(super) fn restore(self, mut rollout: Rollout, dqn: &Dqn) -> Result<Run> {
-        let agent = &mut rollout.agent;
-        let estimator = agent.estimator_mut().handover_mut();
-        let is_taken = estimator.is_some_and(|it| it.restore(&self.belief));
-        check(
-            is_taken,
-            "worlds.belief",
-            "that of its estimator",
-            "another",
-        )?;
-        agent.remember_estimate(self.estimate.as_ref());
-        agent.memory = self.memory;
-        Ok(Run {
-            rollout,
-            last: self.last,
-            track: dqn.resume_track(self.track)?,
-            held: self.held,
-            next: None,
-        })
-    }
 }
 
-fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = NamedTensor> {
+pub(super) fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = NamedTensor> {
     let parameters = &model.parameters;
     let shapes = parameters.dimensions.shapes().into_iter();
     let named = Parameters::NAMES

@@ -1,0 +1,45 @@
+//! What a server's ports must hold.
+
+use protocol::channels::Instance;
+use protocol::control::ServerInfo;
+use protocol::payload::ROBOT_BYTES;
+
+/// The instance, and the sizes of its messages.
+#[derive(Debug, Clone)]
+pub struct PortConfig {
+    pub instance: Instance,
+    /// Most cells of a frame, or of hidden states.
+    pub n_cells: usize,
+    /// Longest sample on `frames`, bytes.
+    pub frame_bytes: usize,
+    /// Longest answer on `step`, bytes.
+    pub answer_bytes: usize,
+    /// Whether to publish hidden states.
+    pub publish_truth: bool,
+}
+
+impl PortConfig {
+    /// Of an instance that serves nothing yet.
+    pub fn empty(instance: Instance) -> Self {
+        Self {
+            instance,
+            n_cells: 0,
+            frame_bytes: 0,
+            answer_bytes: 0,
+            publish_truth: false,
+        }
+    }
+
+    /// Makes room for the samples of a server's worlds.
+    pub fn fit(&mut self, info: &ServerInfo) {
+        let n_cells = info.height * info.width;
+        let n_bytes = frame_bytes(info.n_robots, n_cells, info.n_moves);
+        self.n_cells = self.n_cells.max(n_cells);
+        self.frame_bytes = self.frame_bytes.max(n_bytes);
+    }
+}
+
+/// The longest payload of a sample on `frames`.
+pub(super) fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
+    n_robots as usize * (ROBOT_BYTES + n_cells + n_moves)
+}
