@@ -11,7 +11,7 @@ use rustix::process::Signal;
 use std::ffi::OsString;
 use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, repository, run};
+use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, run};
 
 /// A private server with small worlds.
 const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";

@@ -79,7 +79,7 @@ proptest! {
         let outlook = Outlook::new(&belief, belief.n_states() - 1, &memory, n_moves);
         for proposal in OptionPlanner::new(4).propose(&outlook, robot) {
             prop_assert_eq!(proposal.plan.moves.len(), n_moves);
-            prop_assert!(proposal.features.iter().all(|number| (0.0..=7.0).contains(number)));
+            prop_assert!(proposal.features.iter().all(|number| (0.0..=10.0).contains(number)));
         }
     }
 

@@ -1,6 +1,7 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
+use ::network::{Dqn, DqnSettings, DqnShape};
 use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::estimation::belief::Belief;
@@ -9,10 +10,11 @@ use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
 use agent::learning::learner::{self, Learner};
 use agent::learning::reward::RewardEstimate;
-use agent::learning::student::decisions::{self, Decisions};
+use agent::learning::student::decisions::{self, Base, DecisionsStudent};
 use agent::learning::student::filter::{FilterStudent, SavedFilter};
 use agent::learning::student::network::{self, Position, SavedNetwork};
 use agent::learning::student::{Student, Worlds};
+use agent::planning::policy::EstimatorKind;
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
@@ -108,7 +110,10 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
             "likelihoods sum to {sums}"
         );
-        let (_, contents) = decode(&[kind], &bytes).expect("read before");
+        // That of decisions is no learner's.
+        let Ok((_, contents)) = decode(&[kind], &bytes) else {
+            continue;
+        };
         if let Ok(mut student) = FilterStudent::resume(&contents, dimensions, worlds(), &config()) {
             let again = student.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
@@ -116,8 +121,13 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             let _ = (saved.learner.owed < 8.0).then(|| student.learn());
         }
     }
-    if let Some(contents) = learned.decisions {
-        let _ = decisions().load(&contents);
+    if learned.decisions.is_some() {
+        let (_, contents) = decode(&[decisions::KIND], &bytes).expect("read before");
+        let base = Base::saved(&contents, worlds().shape).expect("read before");
+        let base = base.unwrap_or_else(base_of_filter);
+        if let Ok(student) = DecisionsStudent::new(base, Some(&contents), worlds(), &config()) {
+            student.contents().expect("no device");
+        }
     }
     true
 }
@@ -146,21 +156,32 @@ fn config() -> AgentConfig {
     config.learning.window = 2;
     config.learning.block_windows = 1;
     config.learning.streams = 2;
+    // Few enough numbers for a corpus.
+    config.decisions.learning.width = 1;
     config
 }
 
-fn decisions() -> Decisions {
-    Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
+/// Decisions before their first step, on a filter before its first.
+fn decisions() -> Contents {
+    let student = DecisionsStudent::new(base_of_filter(), None, worlds(), &config());
+    let mut contents = student.and_then(|student| student.contents());
+    let contents = contents.as_mut().expect("no device");
+    contents.settings = toml::to_string(&config()).expect("TOML");
+    contents.clone()
+}
+
+fn base_of_filter() -> Base {
+    let learner = Learner::new(dimensions(false), worlds().shape, &config());
+    Base::learned(EstimatorKind::Learned, learner.learned(), worlds().shape)
+}
+
+fn dqn() -> Dqn {
+    Dqn::new(DqnSettings::paper(), DqnShape::of_actions(1, 2), 0)
 }
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
     let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));
-    // The tensors of networks would be too long for a corpus.
-    let decisions = Contents {
-        tensors: BTreeMap::new(),
-        ..decisions().to_contents()
-    };
     vec![
         ("filter", encoded(learner::KIND, filter(dimensions(false)))),
         (
@@ -170,7 +191,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
         ("autoencoder_large", encoded(network::KIND, large)),
-        ("decisions", encoded(decisions::KIND, decisions)),
+        ("decisions", encoded(decisions::KIND, decisions())),
     ]
 }
 
@@ -202,13 +223,13 @@ fn autoencoder(side: usize, length: usize) -> Contents {
         shape: Shape::new(side, side).expect("a grid"),
         n_observations: 3,
         counters: [0, 0],
-        dqn: decisions().dqn.saved(),
+        dqn: dqn().saved(),
         frames: Vec::new(),
         tracks: Vec::new(),
         position: Position {
             follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
             estimate: None,
-            track: decisions().dqn.track(),
+            track: dqn().track(),
             reward: RewardEstimate::new(3),
             iterations: 0,
             place: None,
