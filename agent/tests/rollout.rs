@@ -111,7 +111,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         "beam_exploit",
         "shooting_exploit",
         "random_walk",
-        "act_exploit_ahead_3",
+        "known_exploit_ahead_3",
     ] {
         let mut alone = robot(policy, &CELLS[..1]);
         let mut team = robot(policy, &CELLS);
