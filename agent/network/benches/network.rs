@@ -4,7 +4,7 @@
 
 use criterion::{Criterion, criterion_group};
 use network::{
-    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape,
+    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, NetworkShape,
     Transition, Window, set_up_process,
 };
 use protocol::frame::Frame;

@@ -1,52 +1,31 @@
 //! Learns which option to fly (paper section III.E): on an estimator's belief all options are planned, and a DQN that
 //! reads each one's features says what it is worth.
 
+mod run;
 mod saved;
 
+pub use self::run::{Base, SHAPE};
 pub use self::saved::{LearnedDecisions, SavedDecisions};
 
+use self::run::{Held, Run};
 use self::saved::SavedRun;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
-use crate::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
-use crate::learning::checkpoint::Contents;
-use crate::learning::learner::LearnedModel;
+use crate::learning::checkpoint::{Contents, check};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::options::N_FEATURES;
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
-use crate::planning::{OPTIONS, Proposal, Target};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::planning::{OPTIONS, Target};
 use crate::rollout::{self, Robot, in_parallel};
-use ::network::{Dqn, DqnShape, Track, Transition};
+use ::network::Dqn;
 use anyhow::Result;
 use protocol::client::Observation;
 use protocol::randomness::{Purpose, stream};
-use protocol::{Model, Shape};
 use rand_chacha::rand_core::Rng;
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "decisions";
-
-/// What a decision is made on, and among.
-pub const SHAPE: DqnShape = DqnShape {
-    n_inputs: N_FEATURES,
-    n_outputs: 1,
-    n_candidates: OPTIONS.len(),
-};
-
-/// What keeps the beliefs that decisions are made on, before a world's first frame.
-pub struct Base {
-    pub kind: EstimatorKind,
-    filter: BayesFilter,
-    /// The state that pays most.
-    target: usize,
-    correlations: Correlations,
-    state_names: Vec<String>,
-    /// What the filter learned, unless the model is known.
-    model: Option<LearnedModel>,
-}
 
 /// A DQN over options that learns on several worlds.
 pub struct DecisionsStudent {
@@ -63,58 +42,6 @@ pub struct DecisionsStudent {
     earned: f64,
     is_frozen: bool,
     times: [(&'static str, Duration); 2],
-}
-
-struct Run {
-    robot: Robot,
-    /// The features of the option flown last and its reward, until what follows is known.
-    last: Option<(Vec<f32>, f32)>,
-    track: Track,
-    held: Held,
-    /// What is flown next.
-    next: Option<(usize, Proposal)>,
-}
-
-/// A random option that is flown for some steps in a row.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-struct Held {
-    option: usize,
-    n_steps: u64,
-}
-
-impl Base {
-    /// On a known model, whose filter is given.
-    pub fn known(kind: EstimatorKind, filter: BayesFilter, model: &Model) -> Self {
-        Self {
-            kind,
-            filter,
-            target: model.target_state(),
-            correlations: Correlations::default(),
-            state_names: model.state_names(),
-            model: None,
-        }
-    }
-
-    pub fn learned(kind: EstimatorKind, model: LearnedModel, shape: Shape) -> Self {
-        Self {
-            kind,
-            filter: BayesFilter::learned(&model.tables, model.tables.prior(shape)),
-            target: model.target,
-            correlations: model.correlations.clone(),
-            state_names: numbered_states(model.tables.dimensions.n_states),
-            model: Some(model),
-        }
-    }
-
-    fn estimator(&self) -> Box<dyn Estimator> {
-        let filter = self.filter.clone();
-        if self.kind.is_spatial() {
-            let correlations = self.correlations.clone();
-            Box::new(SpatialFilter::new(filter, self.target, correlations))
-        } else {
-            Box::new(filter)
-        }
-    }
 }
 
 impl DecisionsStudent {
@@ -143,6 +70,20 @@ impl DecisionsStudent {
             student.load(contents)?;
         }
         Ok(student)
+    }
+
+    /// Goes on from a checkpoint on the same base.
+    fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedDecisions = contents.state()?;
+        saved.load_into(&mut self.dqn, contents)?;
+        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
+        check(got == expected, "decisions.estimator", expected, got)?;
+        self.world_steps = saved.world_steps;
+        self.earned = saved.earned;
+        self.left = saved.worlds;
+        let n_states = self.base.state_names.len();
+        let mut left = self.left.values();
+        left.try_for_each(|left| left.check(n_states, self.worlds.shape))
     }
 
     /// A robot before it takes in what its world shows.
@@ -212,24 +153,6 @@ impl DecisionsStudent {
         let config = &self.config.decisions;
         let done = self.world_steps as f32 / config.steps.max(1) as f32;
         (1.0 - done).max(config.final_rate)
-    }
-}
-
-impl Run {
-    fn propose(&mut self) -> Vec<Proposal> {
-        let cell = self.robot.observation().robot.cell();
-        self.robot.agent.propose(cell)
-    }
-
-    /// Takes in the features of what can be flown now; gives the transition that is complete by then.
-    fn led_to(&mut self, features: &[f32]) -> Option<Transition> {
-        let (input, reward) = self.last.take()?;
-        self.track.add(Transition {
-            input,
-            action: 0,
-            reward,
-            next: features.to_vec(),
-        })
     }
 }
 
@@ -338,7 +261,12 @@ impl Student for DecisionsStudent {
     }
 
     fn contents(&self) -> Result<Contents> {
-        Ok(self.saved())
+        let runs = self.runs.iter().map(SavedRun::of);
+        let runs = self.worlds.numbers.clone().zip(runs);
+        let counts = (self.world_steps, self.earned);
+        Ok(SavedDecisions::contents(
+            &self.base, &self.dqn, counts, runs,
+        ))
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -1,6 +1,6 @@
 //! Decisions in a checkpoint: the DQN, what the belief's filter learned, and where the robots are.
 
-use super::{Base, DecisionsStudent, Held, Run, SHAPE};
+use super::run::{Base, Held, Run, SHAPE};
 use crate::estimation::Correlations;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Parameters};
@@ -44,9 +44,9 @@ pub struct SavedDecisions {
     pub estimator: EstimatorKind,
     model: Option<SavedModel>,
     pub world_steps: u64,
-    earned: f64,
+    pub(super) earned: f64,
     pub dqn: SavedDqn,
-    worlds: BTreeMap<u32, SavedRun>,
+    pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
 /// What a filter learned, without its tensors.
@@ -88,6 +88,31 @@ impl LearnedDecisions {
 }
 
 impl SavedDecisions {
+    /// As a checkpoint, without the settings.
+    pub(super) fn contents(
+        base: &Base,
+        dqn: &Dqn,
+        (world_steps, earned): (u64, f64),
+        runs: impl Iterator<Item = (u32, SavedRun)>,
+    ) -> Contents {
+        let model = base.model.as_ref();
+        let state = Self {
+            options: OPTIONS.map(|option| option.name.into()).into(),
+            estimator: base.kind,
+            model: model.map(|model| SavedModel {
+                dimensions: model.tables.dimensions,
+                target: model.target,
+                correlations: model.correlations.clone(),
+            }),
+            world_steps,
+            earned,
+            dqn: dqn.saved(),
+            worlds: runs.collect(),
+        };
+        let of_filter = model.into_iter().flat_map(filter_tensors);
+        Contents::new(dqn.named_tensors().into_iter().chain(of_filter), &state)
+    }
+
     /// What the belief's filter learned, if it did.
     pub fn model(&self, contents: &Contents) -> Result<Option<LearnedModel>> {
         let Some(saved) = &self.model else {
@@ -116,7 +141,7 @@ impl SavedDecisions {
         Ok(Some(LearnedModel::new(parameters, target, correlations)))
     }
 
-    fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
+    pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
         let expected = OPTIONS.map(|option| option.name).join(" ");
         let got = self.options.join(" ");
         check(got == expected, "options", &expected, &got)?;
@@ -131,45 +156,6 @@ impl SavedDecisions {
     }
 }
 
-impl DecisionsStudent {
-    pub(super) fn saved(&self) -> Contents {
-        let runs = self.runs.iter().map(Run::saved);
-        let model = self.base.model.as_ref();
-        let state = SavedDecisions {
-            options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: self.base.kind,
-            model: model.map(|model| SavedModel {
-                dimensions: model.tables.dimensions,
-                target: model.target,
-                correlations: model.correlations.clone(),
-            }),
-            world_steps: self.world_steps,
-            earned: self.earned,
-            dqn: self.dqn.saved(),
-            worlds: self.worlds.numbers.clone().zip(runs).collect(),
-        };
-        let of_filter = model.into_iter().flat_map(filter_tensors);
-        Contents::new(
-            self.dqn.named_tensors().into_iter().chain(of_filter),
-            &state,
-        )
-    }
-
-    /// Goes on from a checkpoint on the same base.
-    pub(super) fn load(&mut self, contents: &Contents) -> Result<()> {
-        let saved: SavedDecisions = contents.state()?;
-        saved.load_into(&mut self.dqn, contents)?;
-        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
-        check(got == expected, "decisions.estimator", expected, got)?;
-        self.world_steps = saved.world_steps;
-        self.earned = saved.earned;
-        self.left = saved.worlds;
-        let n_states = self.base.state_names.len();
-        let mut left = self.left.values();
-        left.try_for_each(|left| left.check(n_states, self.worlds.shape))
-    }
-}
-
 impl Base {
     /// What a checkpoint's decisions are on, if that was learned.
     pub fn saved(contents: &Contents, shape: Shape) -> Result<Option<Self>> {
@@ -179,29 +165,27 @@ impl Base {
     }
 }
 
-impl Run {
-    fn saved(&self) -> SavedRun {
-        let (agent, observation) = (&self.robot.agent, self.robot.observation());
-        SavedRun {
+impl SavedRun {
+    pub(super) fn of(run: &Run) -> Self {
+        let (agent, observation) = (&run.robot.agent, run.robot.observation());
+        Self {
             place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),
             belief: agent.estimator().memory(),
             estimate: agent.estimate().cloned(),
             memory: agent.memory.clone(),
-            last: self.last.clone(),
-            track: self.track.clone(),
-            held: self.held,
+            last: run.last.clone(),
+            track: run.track.clone(),
+            held: run.held,
         }
     }
-}
 
-impl SavedRun {
     /// Whether a world shows what it showed then.
     pub(super) fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
+    pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         let mut estimates = self.estimate.iter();
         estimates
             .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))?;
