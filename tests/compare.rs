@@ -46,8 +46,8 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let places = format!("--csv {} --figures {}", csv.display(), figures.display());
     let ended = agent(&format!("{WHAT} {WORLDS} {places}"));
     let rows = rows(&csv);
-    // Thirteen policies of the wildfire's ladder, two seeds each.
-    assert_eq!(rows.len(), 13 * 2, "{rows:?}");
+    // Fifteen policies of the wildfire's ladder, two seeds each.
+    assert_eq!(rows.len(), 15 * 2, "{rows:?}");
     for [first, second] in rows.as_chunks::<2>().0 {
         ended.check_prints(&first[0]);
         assert_eq!((&first[0], &*first[2], &*second[2]), (&second[0], "3", "4"));
@@ -205,8 +205,8 @@ fn a_second_model_runs_from_end_to_end() {
         &folder.path().join("ice.csv"),
         &format!("{flags} {figures}"),
     );
-    // Fifteen policies: the ladder has one for each of three states beside the one that pays.
-    assert_eq!(rows.len(), 15 * 2, "{rows:?}");
+    // Sixteen policies: the ladder has one for each of three states beside the one that pays.
+    assert_eq!(rows.len(), 16 * 2, "{rows:?}");
     assert!(folder.path().join("figures/snapshot.png").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");

@@ -57,12 +57,12 @@ fn hello_tells_what_can_be_decided() {
 
 #[test]
 fn exploiting_makes_the_steps_of_a_policy_that_does() {
-    assert_the_same_steps("beam_exploit", "known_model");
+    assert_the_same_steps("known_exploit", "known_model");
 }
 
 #[test]
 fn decisions_are_made_on_the_spatial_belief() {
-    assert_the_same_steps("spatial_beam", "spatial_filter");
+    assert_the_same_steps("spatial_exploit", "spatial_filter");
 }
 
 /// A policy that exploits makes the steps of decisions to exploit with its estimator.

@@ -199,8 +199,9 @@ impl Policy {
         let all = Self::all(model);
         let found = all.iter().find(|policy| policy.name == name).cloned();
         found.with_context(|| {
-            let names: Vec<&str> = all.iter().map(|policy| &*policy.name).collect();
-            unknown(name, &names)
+            let names = all.iter().filter(|policy| !policy.is_option());
+            let names = names.map(|policy| &*policy.name);
+            unknown(name, &names.chain(["BELIEF_OPTION"]).collect::<Vec<_>>())
         })
     }
 

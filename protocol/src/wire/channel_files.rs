@@ -9,7 +9,7 @@ use super::error::Ipc;
 use super::process::{if_there, node_pid, process_state};
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
-use rustix::process::{Flock, FlockType, fcntl_getlk};
+use rustix::process::{Flock, FlockType, Pid, fcntl_getlk};
 use rustix::time::{ClockId, clock_gettime};
 use std::collections::HashSet;
 use std::fs::{File, Metadata};
@@ -170,7 +170,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
     Ok((living, dead))
 }
 
-/// Whether a node without a process of its number here lives: in another PID namespace.
+/// Whether a node lives in another PID namespace: the process that holds its lock has another number here, or none.
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
     // To close that of a node of this process would end its lock.
@@ -179,7 +179,7 @@ pub fn lives_elsewhere(node: u128) -> bool {
     }
     let locked = File::open(channel_directory().join(monitor))
         .and_then(|file| Ok(fcntl_getlk(file, &Flock::from(FlockType::ReadLock))?));
-    matches!(locked, Ok(Some(_)))
+    locked.is_ok_and(|lock| lock.is_some_and(|lock| Pid::as_raw(lock.pid) != node_pid(node)))
 }
 
 fn service_id(text: &str) -> Option<u128> {

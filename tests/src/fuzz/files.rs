@@ -1,7 +1,7 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
-use ::network::{Dqn, DqnShape};
+use ::network::{Dqn, DqnSettings, DqnShape};
 use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
@@ -13,7 +13,6 @@ use agent::learning::learners::network::{self, Position, SavedNetwork};
 use agent::learning::learners::{Learner, Worlds};
 use agent::learning::reward::RewardEstimate;
 use agent::policy::EstimatorKind;
-use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
@@ -95,9 +94,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         && expected.len() == got.len()
     {
         let mut words = bytes.windows(got.len());
-        let place = words
-            .position(|word| word == expected.as_bytes())
-            .map_or(0..0, |at| at..at + got.len());
+        let place = words.position(|word| word == expected.as_bytes());
+        let place = place.map_or(0..0, |at| at..at + got.len());
         bytes.splice(place, got.bytes());
         learned = Learned::from_bytes(&bytes);
     }
@@ -112,12 +110,23 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
             "likelihoods sum to {sums}"
         );
-        let (_, contents) = decode(&[kind], &bytes).expect("read before");
+        // That of decisions is no learner's.
+        let Ok((_, contents)) = decode(&[kind], &bytes) else {
+            continue;
+        };
         if let Ok(mut learner) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
             let again = learner.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
             // More takes its time. Numbers that are finite may be too large to work with.
             let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
+        }
+    }
+    if learned.decisions.is_some() {
+        let (_, contents) = decode(&[decisions::KIND], &bytes).expect("read before");
+        let base = Base::saved(&contents, worlds().shape).expect("read before");
+        let base = base.unwrap_or_else(base_of_filter);
+        if let Ok(learner) = DecisionsLearner::new(base, Some(&contents), worlds(), &config()) {
+            learner.contents().expect("no device");
         }
     }
     true
@@ -147,30 +156,32 @@ fn config() -> AgentConfig {
     config.learning.window = 2;
     config.learning.block_windows = 1;
     config.learning.streams = 2;
+    // Few enough numbers for a corpus.
+    config.decisions.learning.width = 1;
     config
 }
 
+/// Decisions before their first step, on a filter before its first.
 fn decisions() -> Contents {
-    let (model, shape) = (Model::wildfire(), worlds().shape);
-    let filter = BayesFilter::known(&model, Belief::uniform(3, shape)).expect("valid");
-    let base = Base::known(EstimatorKind::KnownModel, filter, &model);
-    let learner = DecisionsLearner::new(base, None, worlds(), &AgentConfig::default());
-    learner.expect("nothing to read").contents().expect("whole")
+    let learner = DecisionsLearner::new(base_of_filter(), None, worlds(), &config());
+    let mut contents = learner.and_then(|learner| learner.contents());
+    let contents = contents.as_mut().expect("no device");
+    contents.settings = "decisions.width = 1".into();
+    contents.clone()
+}
+
+fn base_of_filter() -> Base {
+    let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
+    Base::learned(EstimatorKind::Learned, fit.learned(), worlds().shape)
 }
 
 fn dqn() -> Dqn {
-    let settings = AgentConfig::default().dqn.settings();
-    Dqn::new(settings, DqnShape::of_actions(4, 4), 0)
+    Dqn::new(DqnSettings::paper(), DqnShape::of_actions(1, 2), 0)
 }
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
     let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));
-    // The tensors of networks would be too long for a corpus.
-    let decisions = Contents {
-        tensors: BTreeMap::new(),
-        ..decisions()
-    };
     vec![
         ("filter", encoded(fit::KIND, filter(dimensions(false)))),
         (
@@ -180,7 +191,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
         ("autoencoder_large", encoded(network::KIND, large)),
-        ("decisions", encoded(decisions::KIND, decisions)),
+        ("decisions", encoded(decisions::KIND, decisions())),
     ]
 }
 

@@ -10,8 +10,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use std::ops::Range;
 
-/// Longest result, bytes: long enough for every length that is checked at a small size.
-const MOST_BYTES: usize = 1 << 14;
+/// Longest result, bytes: longer than each file of the corpus.
+const MOST_BYTES: usize = 1 << 15;
 
 /// Integers at which lengths, counts and signs break.
 const INTEGERS: [u64; 16] = [
