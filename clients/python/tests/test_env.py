@@ -462,7 +462,7 @@ def test_an_unknown_keyword_is_named(name: str, keyword: str, hint: str) -> None
         make(name, **{keyword: 2})
     words = r"Wildfire\w*Env\(\) got an unexpected keyword argument '{}'{}; known are .*burn_in.*"
     assert re.fullmatch(words.format(keyword, hint), str(raised.value))
-    assert ("planner" in str(raised.value)) == (name == OBJECTIVE)
+    assert ("checkpoint" in str(raised.value)) == (name == OBJECTIVE)
 
 
 def test_a_missing_model_is_named_by_make() -> None:

@@ -59,7 +59,8 @@ def decide(env: Any) -> Any:
 @pytest.mark.parametrize("keywords", [{}, {"truth": True}, {"estimator": "spatial_filter"}])
 def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
-    check_env(env, skip_render_check=True)
+    with environments.no_warnings():
+        check_env(env, skip_render_check=True)
     picture = env.render()
     assert picture.dtype == np.uint8 and picture.ndim == 3
 
@@ -79,6 +80,7 @@ def test_actions_and_numbers_have_names(env: Any) -> None:
     assert np.allclose(named["n_paths"], 1 / 200)
 
 
+@pytest.mark.filterwarnings("ignore:.*is out of date")
 def test_the_former_version_is_named() -> None:
     with pytest.raises(gymnasium.error.DeprecatedEnv, match="WildfireObjective-v1"):
         gymnasium.make("emberwatch/WildfireObjective-v0")

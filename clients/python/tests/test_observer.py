@@ -283,7 +283,7 @@ def test_one_too_many_is_told_the_limit_and_others_go_on(
 ) -> None:
     started = server(publish_truth=True)
     readers = [make(started.instance) for _ in range(limit)]
-    with fails("channel", match=f"more than {limit} readers"):
+    with fails("channel", match=f"at most {limit} readers"):
         make(started.instance)
     started.connect().acquire().step(paths(0))
     for reader in readers:

@@ -37,7 +37,7 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
         (MOVES, {"observation": "recent", "window": 37}),
         (MOVES, {"observation": ("image", "belief", "local"), "window": 37}),
         (OBJECTIVE, {"prior": "initial"}),
-        (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "truth": True}),
+        (OBJECTIVE, {"prior": "uniform", "truth": True}),
     ],
     ids=str,
 )

@@ -89,7 +89,7 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
     [
         *((WILDFIRE, {"observation": parts}) for parts in (*PARTS, ("frame", "robot"))),
         *((MOVES, {"observation": part}) for part in ("local", "move")),
-        (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "estimator": "spatial_filter"}),
+        (OBJECTIVE, {"prior": "uniform", "estimator": "spatial_filter"}),
         *ALL.items(),
     ],
     ids=str,

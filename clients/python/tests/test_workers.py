@@ -30,7 +30,8 @@ def workers(**keywords: Any) -> AsyncVectorEnv:
 
 
 def make_later(**keywords: Any) -> Callable[[], Any]:
-    return lambda: gymnasium.make(WILDFIRE, **keywords)
+    # Spawned workers know no id but with its package.
+    return lambda: gymnasium.make(f"emberwatch:{WILDFIRE}", **keywords)
 
 
 @pytest.fixture(autouse=True)

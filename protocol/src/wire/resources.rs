@@ -51,7 +51,7 @@ pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
     if free < n_bytes {
         let (needed, free) = (in_words(n_bytes), in_words(free));
         return no_room(format!(
-            "expected {needed} free in {SHARED_MEMORY}, got {free}"
+            "expected {needed} free in {SHARED_MEMORY}, got {free}; {REMEDY}"
         ));
     }
     // A file system without a limit says 0 of 0.
