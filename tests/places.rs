@@ -100,6 +100,22 @@ fn a_server_in_another_pid_namespace_is_called_so_and_goes_on() {
 }
 
 #[test]
+fn servers_that_are_both_process_1_of_their_namespaces_are_told_apart() {
+    let other = "unshare -p -f --kill-child --mount-proc $S";
+    let script = format!(
+        "{other} {SMALL} & first=$!
+         until $S status 2>&1 | grep -q 'another PID namespace'; do sleep 0.01; done
+         {other} {SMALL}; echo the second ended with $?; kill $first"
+    );
+    let Some(output) = apart(&script) else { return };
+    let said = String::from_utf8_lossy(&output.stdout);
+    let warned = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("the second ended with 1"), "{said} {warned}");
+    let refusal = "served from another PID namespace";
+    assert!(warned.contains(refusal), "{warned}");
+}
+
+#[test]
 fn a_full_shared_memory_is_called_so_and_kills_nobody() {
     let fill = "fallocate -l $(($(stat -f -c '%a * %S' /dev/shm) - LEFT)) /dev/shm/filler";
     for left in [0, 8192, 65536] {

@@ -22,6 +22,7 @@ mod json;
 pub mod message;
 mod node;
 pub mod observer;
+mod own_nodes;
 pub mod payload;
 mod poll;
 pub(crate) mod process;

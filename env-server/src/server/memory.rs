@@ -87,6 +87,6 @@ pub fn check_shared_memory(config: &PortConfig) -> Result<()> {
     let frames = bytes(samples(MAX_OBSERVERS, FRAME_BUFFER), config.frame_bytes);
     let truth = bytes(samples(MAX_TRUTH_READERS, TRUTH_BUFFER), config.n_cells);
     let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
-    check_room(needed)
+    check_room(needed, answers.max(frames).max(truth))
         .map_err(|error| anyhow!("{error}, or serve fewer worlds or robots, or a smaller grid"))
 }

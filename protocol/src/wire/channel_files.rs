@@ -6,6 +6,7 @@
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::error::Ipc;
+use super::own_nodes;
 use super::process::{if_there, node_pid, process_state};
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
@@ -174,7 +175,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
     // To close that of a node of this process would end its lock.
-    if node_pid(node) == std::process::id() as i32 {
+    if own_nodes::has(node) {
         return false;
     }
     let locked = File::open(channel_directory().join(monitor))

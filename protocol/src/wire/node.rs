@@ -3,6 +3,7 @@
 use super::cleanup::make_way;
 use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, prefix};
 use super::error::{ChannelError, Ipc};
+use super::own_nodes;
 use super::resources::{check_room_for_ports, ipc_error};
 use super::turn::{SHORT_WAIT, Turn};
 use iceoryx2::node::{Node, NodeBuilder};
@@ -29,6 +30,7 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled);
     let node = node.create().map_err(ipc_error("create a node"))?;
+    own_nodes::add(node.id().value());
     // Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
     own_segments(shared_memory, &prefix())?;
     Ok(node)

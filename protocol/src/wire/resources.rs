@@ -29,40 +29,52 @@ const PORT_DESCRIPTORS: usize = 10;
 /// # Errors
 /// If not.
 pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelError> {
-    check_room(PORT_BYTES + message_bytes as u64)
+    let n_bytes = PORT_BYTES + message_bytes as u64;
+    check_room(n_bytes, n_bytes)
 }
 
-/// Checks that so many bytes of shared memory are free, and as many files as the ports of a connection are.
+/// Checks that so many bytes of shared memory are free, as many files as the ports of a connection are, and that a file
+/// may be as long as the longest of them.
 ///
 /// # Errors
 /// If not.
-pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
+pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
-    if limit < n_bytes {
-        let (needed, limit) = (in_words(n_bytes), in_words(limit));
+    if limit < longest_file {
+        let (needed, limit) = (in_words(longest_file), in_words(limit));
         return no_room(format!(
             "expected a limit on file sizes of at least {needed}, got {limit}; raise it (`ulimit -f`)"
         ));
     }
+    check_free(n_bytes)?;
+    // A file system without a limit says 0 of 0.
+    let found = statvfs(SHARED_MEMORY).ok();
+    let found = found.filter(|found| found.f_files > 0 && found.f_favail < PORT_FILES);
+    found.map_or(Ok(()), |found| {
+        let free = found.f_favail;
+        no_room(format!(
+            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
+             nr_inodes)"
+        ))
+    })
+}
+
+/// Checks that so many bytes of shared memory are free.
+///
+/// # Errors
+/// If not.
+pub(super) fn check_free(n_bytes: u64) -> Result<(), ChannelError> {
     let Ok(found) = statvfs(SHARED_MEMORY) else {
         return Ok(());
     };
     let free = found.f_bavail.saturating_mul(found.f_frsize);
-    if free < n_bytes {
-        let (needed, free) = (in_words(n_bytes), in_words(free));
-        return no_room(format!(
-            "expected {needed} free in {SHARED_MEMORY}, got {free}; {REMEDY}"
-        ));
+    if free >= n_bytes {
+        return Ok(());
     }
-    // A file system without a limit says 0 of 0.
-    if found.f_files > 0 && found.f_favail < PORT_FILES {
-        let free = found.f_favail;
-        return no_room(format!(
-            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
-             nr_inodes)"
-        ));
-    }
-    Ok(())
+    let (needed, free) = (in_words(n_bytes), in_words(free));
+    no_room(format!(
+        "expected {needed} free in {SHARED_MEMORY}, got {free}; {REMEDY}"
+    ))
 }
 
 pub(super) fn no_room<T>(problem: String) -> Result<T, ChannelError> {

@@ -4,7 +4,7 @@
 use super::channel_files::ChannelFiles;
 use super::directory::directory_error;
 use super::error::{ChannelError, Ipc};
-use super::resources::{REMEDY, SHARED_MEMORY, check_room, in_words, no_room};
+use super::resources::{REMEDY, SHARED_MEMORY, check_free, in_words, no_room};
 use iceoryx2::node::Node;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
@@ -97,7 +97,7 @@ impl MessageMemory {
         }
         let unused = (self.n_messages - n_messages) * self.message_bytes;
         if n_ready > 0 {
-            check_room((n_messages - n_ready) * self.message_bytes)?;
+            check_free((n_messages - n_ready) * self.message_bytes)?;
         }
         fill(&self.path, &self.file, self.n_bytes.saturating_sub(unused))?;
         self.n_ready.set(n_messages);
