@@ -42,7 +42,13 @@ fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
 
 #[test]
 fn an_agent_that_takes_over_flies_as_the_other_would_have() {
-    for policy in ["beam_exploit", "shooting_explore", "spatial_beam"] {
+    for policy in [
+        "beam_exploit",
+        "shooting_explore",
+        "spatial_beam",
+        "known_coverage",
+        "known_rule",
+    ] {
         let policy = format!("--policy {policy}");
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");
@@ -77,6 +83,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let shape = client.shape();
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
     let kind = filter.expect("a filter").kind();
+    let kind = format!("{kind}; freshness [H, W] as f32, rewards, paths");
     leave_belief(&mut client, 0, &at, &kind, b"not whole").expect("leave");
     client.release().expect("release");
     let ended = run(&server, &format!("{policy} --steps 10")).ends(0);

@@ -62,6 +62,9 @@ fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) ->
         return Ok(false);
     };
     rollout.agent.correct(&seen[0].frame, None)?;
+    if step > 0 {
+        rollout.agent.earn(seen[0].robot.reward);
+    }
     rollout.agent.predict();
     Ok(true)
 }
@@ -74,13 +77,13 @@ pub fn take_over_left(
     rollout: &mut Rollout,
 ) -> Result<bool, ConnectionError> {
     let step = rollout.step();
-    let Some(estimator) = rollout.agent.estimator_mut().handover_mut() else {
+    let Some(kind) = rollout.agent.handover_kind() else {
         return Ok(false);
     };
-    let Some(left) = left_belief(client, number, &estimator.kind())? else {
+    let Some(left) = left_belief(client, number, &kind)? else {
         return Ok(false);
     };
-    let is_taken = estimator.restore(&left);
+    let is_taken = rollout.agent.take_over(&left);
     if is_taken {
         tracing::info!(
             robot = number,
@@ -94,10 +97,10 @@ pub fn take_over_left(
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one of a robot.
 pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
     let present = rollout.observation().world;
-    let Some(estimator) = rollout.agent.estimator().handover() else {
+    let agent = &rollout.agent;
+    let Some((kind, bytes)) = agent.handover_kind().zip(agent.handover()) else {
         return Ok(());
     };
-    let (kind, bytes) = (estimator.kind(), estimator.to_bytes());
     match leave_belief(client, number, &present, &kind, &bytes) {
         // A server that keeps no beliefs, or none that is so long.
         Err(ConnectionError::Refused {

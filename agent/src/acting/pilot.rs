@@ -103,7 +103,7 @@ impl Pilot {
             learned: &mission.learned,
         };
         let agent = registry::agent(policy, &mission.config, task)?;
-        let Some(kind) = agent.estimator().handover().map(|it| it.kind()) else {
+        let Some(kind) = agent.handover_kind() else {
             return Ok(None);
         };
         if !is_belief_left(&mission.instance, numbers.start, &kind)? {

@@ -45,6 +45,10 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
     let setup = Setup {
         chooser: chooser(policy, &task, config, objective)?,
         basis: basis(policy, &task, config)?,
+        beam_width: match policy.choice {
+            Choice::Scorer => decisions(policy, task.learned)?.beam_width,
+            _ => config.decisions.beam_width,
+        },
         state_names,
         n_moves: task.n_moves,
         seed: task.seed,

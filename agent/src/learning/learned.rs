@@ -50,8 +50,8 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            fit::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
-            fit::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
+            fit::KIND => self.add_filter(filter(&contents, false)?),
+            fit::OWN_KIND => self.add_filter(filter(&contents, true)?),
             decisions::KIND => self.add_decisions(&contents)?,
             _ => {
                 let network = network::Progress::read(&contents, device)?;
@@ -60,6 +60,18 @@ impl Learned {
         };
         ensure!(!twice, "expected one checkpoint of {kind}, got two");
         Ok(())
+    }
+
+    /// A filter; returns whether there was one before, unless decisions brought the same.
+    fn add_filter(&mut self, model: LearnedModel) -> bool {
+        let is_own = model.tables.dimensions.sees_own_state;
+        let slot = if is_own {
+            &mut self.own_filter
+        } else {
+            &mut self.filter
+        };
+        let is_same = self.decisions.is_some() && slot.as_ref() == Some(&model);
+        slot.replace(model).is_some() && !is_same
     }
 
     /// Decisions, with what their belief's filter learned; returns whether there were some before.

@@ -67,6 +67,8 @@ pub enum OptionChooser {
 pub struct Setup {
     pub chooser: Chooser,
     pub basis: BasisKind,
+    /// Width of the beam search that plans options.
+    pub beam_width: usize,
     pub state_names: Vec<String>,
     pub n_moves: usize,
     /// Seed of the planner's random numbers: the agent's and the world's.
@@ -97,7 +99,7 @@ impl Agent {
             basis: setup.basis,
             estimate: None,
             planner: config.planner(policy),
-            options: OptionPlanner::new(config.decisions.beam_width),
+            options: OptionPlanner::new(setup.beam_width),
             target: setup.target,
             aim: aim.into(),
             state_names: setup.state_names,
@@ -254,6 +256,36 @@ impl Agent {
 
     pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
         &mut *self.estimator
+    }
+
+    /// Names what [`Self::handover`] gives; `None` of an agent whose bytes no other can go on from.
+    pub fn handover_kind(&self) -> Option<String> {
+        let kind = self.estimator.handover()?.kind();
+        Some(format!("{kind}; freshness [H, W] as f32, rewards, paths"))
+    }
+
+    /// All that it knows of its world before X_{k+1}: what its estimator does, and its memory.
+    pub fn handover(&self) -> Option<Vec<u8>> {
+        let estimator = self.estimator.handover()?.to_bytes();
+        Some([estimator, self.memory.to_bytes()].concat())
+    }
+
+    /// Goes on from the bytes of an agent of the same kind. Returns false, and changes nothing, if they do not fit.
+    pub fn take_over(&mut self, bytes: &[u8]) -> bool {
+        let shape = self.belief().shape();
+        let Some(n_bytes) = bytes.len().checked_sub(Memory::n_bytes(shape)) else {
+            return false;
+        };
+        let (estimator, memory) = bytes.split_at(n_bytes);
+        let Some(memory) = Memory::from_bytes(memory, shape) else {
+            return false;
+        };
+        let own = self.estimator.handover_mut();
+        let is_taken = own.is_some_and(|own| own.restore(estimator));
+        if is_taken {
+            self.memory = memory;
+        }
+        is_taken
     }
 
     /// Goes on with another estimator, such as one with newer parameters.

@@ -60,6 +60,44 @@ impl Memory {
         self.freshness.mapv(|fresh| 1.0 - fresh)
     }
 
+    /// Bytes of [`Self::to_bytes`] on a grid.
+    pub fn n_bytes(shape: Shape) -> usize {
+        4 * shape.n_cells() + 16
+    }
+
+    /// Little-endian: how fresh each cell is, `[H, W]` as `f32`; the last and the mean reward as `f32`; the number of
+    /// paths as `u64`.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let Recent {
+            last_reward,
+            mean_reward,
+            n_paths,
+        } = self.recent;
+        let floats = self.freshness.iter().chain([&last_reward, &mean_reward]);
+        let bytes = floats.flat_map(|number| number.to_le_bytes());
+        bytes.chain(n_paths.to_le_bytes()).collect()
+    }
+
+    /// From the bytes of another on the same grid; `None` if they are not.
+    pub fn from_bytes(bytes: &[u8], shape: Shape) -> Option<Self> {
+        if bytes.len() != Self::n_bytes(shape) {
+            return None;
+        }
+        let (floats, n_paths) = bytes.split_at(bytes.len() - 8);
+        let floats = floats.as_chunks::<4>().0;
+        let mut floats = floats.iter().map(|number| f32::from_le_bytes(*number));
+        let cells = floats.by_ref().take(shape.n_cells()).collect();
+        let memory = Self {
+            freshness: Grid::from_shape_vec(shape.dim(), cells).ok()?,
+            recent: Recent {
+                last_reward: floats.next()?,
+                mean_reward: floats.next()?,
+                n_paths: u64::from_le_bytes(n_paths.try_into().ok()?),
+            },
+        };
+        memory.is_of(shape).then_some(memory)
+    }
+
     /// Whether all of it is possible on a grid.
     pub fn is_of(&self, shape: Shape) -> bool {
         let rewards = [self.recent.last_reward, self.recent.mean_reward];
@@ -89,6 +127,11 @@ mod tests {
         assert!((novelty[[0, 0]] - (1.0 - (-1.0_f32).exp())).abs() < 1e-4);
         assert_eq!(novelty[[0, 1]], 1.0);
         assert!(memory.is_of(shape));
+        memory.earn(3.0, 4);
+        let bytes = memory.to_bytes();
+        assert_eq!(Memory::from_bytes(&bytes, shape), Some(memory.clone()));
+        assert_eq!(Memory::from_bytes(&bytes[1..], shape), None);
+        assert_eq!(Memory::from_bytes(&[0xff; 24], shape), None, "not numbers");
         assert!(!memory.is_of(Shape::new(2, 1).expect("test shape")));
     }
 

@@ -149,6 +149,7 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         assert_eq!(plans("autoencoder_policy", &other, &learned), expected);
         let scorer = Dqn::new(config(basis).decisions.settings(), SHAPE, 0);
         learned.decisions = Some(LearnedDecisions {
+            beam_width: 30,
             scorer: Arc::new(scorer),
             estimator: EstimatorKind::KnownModel,
             basis,

@@ -39,6 +39,7 @@ impl Worlds {
         let objective = config.objective(policy);
         let setup = Setup {
             basis: config.objective.belief,
+            beam_width: config.decisions.beam_width,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),

@@ -60,6 +60,11 @@ pub fn learner(
                 Some(base) => base,
                 None => base(spec, info, worlds.shape)?,
             };
+            let (expected, got) = (worlds.n_observations, base.n_observations());
+            ensure!(
+                got == expected,
+                "checkpoint: expected {expected} observations as the world's, got {got}"
+            );
             let learner = DecisionsLearner::new(base, contents, worlds, config);
             Box::new(learner.with_context(of_file)?)
         }
@@ -72,11 +77,6 @@ fn base(spec: &TrainingSpec, info: &ServerInfo, shape: Shape) -> Result<Base> {
     if kind.is_learned() {
         let filter = spec.learned.filter(kind);
         let filter = filter.context("decisions: expected a checkpoint of a filter, got none")?;
-        let (expected, got) = (info.n_observations, filter.tables.dimensions.n_observations);
-        ensure!(
-            got == expected,
-            "checkpoint: expected {expected} observations as the world's, got {got}"
-        );
         return Ok(Base::learned(kind, filter.clone(), shape));
     }
     let model = info.model.as_deref().with_context(|| {

@@ -44,6 +44,12 @@ impl Base {
         }
     }
 
+    /// Number of values that a cell may show to it.
+    pub fn n_observations(&self) -> usize {
+        let likelihood = self.filter.likelihood();
+        likelihood.map_or(0, |likelihood| likelihood.ncols())
+    }
+
     pub(super) fn estimator(&self) -> Box<dyn Estimator> {
         let filter = self.filter.clone();
         if self.kind.is_spatial() {

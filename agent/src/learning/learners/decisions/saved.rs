@@ -47,6 +47,8 @@ pub struct LearnedDecisions {
     pub estimator: EstimatorKind,
     /// What paths are planned on.
     pub basis: BasisKind,
+    /// Width of the beam search that plans the options.
+    pub beam_width: usize,
 }
 
 /// All of a checkpoint of decisions but the tensors.
@@ -94,6 +96,7 @@ impl LearnedDecisions {
             scorer: Arc::new(dqn),
             estimator: saved.estimator,
             basis: config.objective.belief,
+            beam_width: config.decisions.beam_width,
         };
         Ok((decisions, saved.model(contents)?))
     }
