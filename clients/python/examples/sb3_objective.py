@@ -78,7 +78,7 @@ class Progress(BaseCallback):
 
     def _on_step(self) -> bool:
         self._rewards.append(float(self.locals["rewards"].mean()) / REWARD_SCALE)
-        part = self.model._total_timesteps // 20
+        part = max(1, self.model._total_timesteps // 20)
         if self.num_timesteps // part > (self.num_timesteps - self.training_env.num_envs) // part:
             reward, seconds = np.mean(self._rewards), time.monotonic() - self._start
             self._rewards.clear()

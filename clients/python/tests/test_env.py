@@ -372,6 +372,16 @@ def test_resume_goes_on_where_another_agent_stopped() -> None:
         assert env.reset(seed=1)[1]["step"] == 0
 
 
+def test_a_closed_private_world_cannot_be_resumed() -> None:
+    env = make()
+    env.reset(seed=1)
+    env.close()
+    with refuses("options: expected a reset before resume=True"):
+        env.reset(options={"resume": True})
+    with fails("closed"):
+        env.step([0] * 4)
+
+
 def test_resume_of_a_private_world_is_where_it_stands() -> None:
     with refuses("expected a reset before resume=True"):
         make().reset(options={"resume": True})

@@ -126,6 +126,14 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
         ),
         steps(np.where(ARRIVAL > 180, -1, ARRIVAL)),
     ),
+    "limit of integers as unpacked": (
+        grid(
+            ONE._replace(values=ARRIVAL // 60).told(
+                scale_factor=np.int32(60), valid_max=np.int32(180)
+            )
+        ),
+        steps(np.where(ARRIVAL > 180, -1, ARRIVAL)),
+    ),
     "range as packed": (packed(valid_range=np.array([0, 2400], "i2")), WITHOUT_LAST),
     "range as unpacked": (packed(valid_range=[60.0, 300.0]), WITHOUT_FIRST),
     "limits beyond an offset": (
@@ -332,6 +340,14 @@ def test_the_date_has_the_offset_of_packed_times(tmp_path: Path) -> None:
 
 def test_bounds_say_where_cells_are(tmp_path: Path) -> None:
     edged = {**bounded(X, "x"), "y": Y, "v": ONE}
+    np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
+
+
+def test_bounds_need_not_be_packed_as_their_coordinate_is(tmp_path: Path) -> None:
+    edged = {**bounded(X, "x"), "y": Y, "v": ONE}
+    edges = (np.asarray(edged["x"].values) - 500_000) / 15
+    whole = edged["x"]._replace(values=edges, kind="i2")
+    edged["x"] = whole.told(scale_factor=15.0, add_offset=500_000.0)
     np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
 
 

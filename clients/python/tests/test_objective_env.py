@@ -158,7 +158,7 @@ def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset(any_env
         pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"),
     ):
         decide(any_env)
-    with fails("closed", match="an earlier step timed out"):
+    with fails("closed", match="an earlier step or reset timed out"):
         decide(any_env)
     _, info = any_env.reset(options={"resume": True})
     assert np.all(decide(any_env) == info["step"] + 1)
@@ -250,7 +250,9 @@ def test_a_server_that_is_killed_ends_the_agent_with_a_word(any_env: Any) -> Non
 def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> None:
     env.reset(seed=1000)
     env.step(2)
-    guest = make(instance=env.instance, agent="running")
+    with fails("invalid_argument", match="estimator: expected that of the running agent"):
+        make(instance=env.instance, agent="running", estimator="spatial_filter").reset(seed=1)
+    guest = make(instance=env.instance, agent="running", estimator="known_model")
     _, info = guest.reset(options={"resume": True})
     assert info["step"] == 1
     guest.step(2)

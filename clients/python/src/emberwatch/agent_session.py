@@ -69,6 +69,8 @@ class AgentSession(Session):
                 raise invalid(name, expected, repr(arguments[name]))
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
+        if arguments["agent"] == "running" and arguments["checkpoint"] is not None:
+            raise invalid("checkpoint", "none, as the agent runs already", arguments["checkpoint"])
         if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
             raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
@@ -152,6 +154,10 @@ class AgentSession(Session):
                 f"agent='running': expected one of worlds {self._worlds[0]} to {self._worlds[-1]}, "
                 f"got one of {first} to {last}"
             )
+        asked, runs = self._arguments["estimator"], decisions.info.estimator
+        if asked not in (None, runs):
+            decisions.close()
+            raise invalid("estimator", f"that of the running agent, {runs!r}", repr(asked))
         self._decisions = decisions
 
     def _start_agent(self, instance: str) -> Decisions:
@@ -192,13 +198,16 @@ class AgentSession(Session):
         return self._answer(decisions)
 
     def _observe(self) -> StepAnswer:
-        if self._program is not None and self._program.exit_code() is not None:
+        if self._program is not None and self._program.has_ended():
             # An agent answers from memory until it notices.
             raise ServerGoneError(f"the server of instance {self.instance!r} has ended")
         return self._answer(self._asked().last(timeout=self.settings.timeout))
 
     def _settle(self) -> None:
-        """The agent answers one request after the other: those before are done, or are dropped."""
+        """Waits for a reset that still runs: the agent answers one request after the other."""
+        if self._is_torn:
+            self._asked().last(timeout=RESET_TIMEOUT)
+            self._is_torn = False
 
     def _answer(self, decisions: tuple[Decision, ...]) -> StepAnswer:
         """Takes in the features; the rest as the server would tell it."""

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.arguments import as_seed
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.arguments import as_seed, told
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.observations import Observations
 from emberwatch.owner import SessionOwner
 from emberwatch.session import Session
@@ -85,12 +85,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         if resumes:
             answer = self._session.resume()
             if self._robot is not None and answer.worlds["truncated"][0]:
-                self._session.finish()
-                raise EmberwatchError(
-                    "the episode of the world is over: a reset is for a client that holds all "
-                    "its robots",
-                    "episode_over",
-                )
+                raise self._session.refuse_over()
         else:
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
@@ -155,7 +150,7 @@ def as_options(options: object) -> dict[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping):
-        raise invalid("options", "a dictionary such as {'resume': True}, or None", repr(options))
+        raise invalid("options", "a dictionary such as {'resume': True}, or None", told(options))
     return dict(cast("Mapping[str, Any]", options))
 
 

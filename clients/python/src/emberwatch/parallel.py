@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from emberwatch.arguments import as_array
+from emberwatch.arguments import as_array, told
 from emberwatch.base import NOTHING_TO_DRAW, as_options
 from emberwatch.env import WildfireVectorEnv
 from emberwatch.errors import invalid
@@ -119,7 +119,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """A move or a path of each robot; raises as `WildfireEnv.step` does."""
         given: Any = actions
         if not isinstance(given, dict) or actions.keys() != set(self.agents):
-            raise invalid("actions", f"one for each of {self.agents}", actions)
+            raise invalid("actions", f"one for each of {self.agents}", told(actions))
         if not actions:
             return {}, {}, {}, {}, {}
         chosen = as_array([actions[agent] for agent in self.agents], "actions", "all of one shape")

@@ -200,6 +200,10 @@ class Program:
             self._process.wait(_EXIT_TIMEOUT)
         return self._process.returncode
 
+    def has_ended(self) -> bool:
+        """Whether it runs no more."""
+        return self._process.poll() is not None
+
     def output(self) -> str:
         """What it wrote, such as warnings and errors."""
         self._output.seek(0)

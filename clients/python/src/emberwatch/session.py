@@ -48,8 +48,12 @@ LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 #: Why there is no next step: the error's code, and its words.
 _INTERRUPTED: Final = "interrupted", "an earlier step or reset did not finish (Ctrl-C or an error)"
-_TIMED_OUT: Final = "closed", "an earlier step timed out"
+_TIMED_OUT: Final = "closed", "an earlier step or reset timed out"
 _CLOSED: Final = "closed", "the environment is closed"
+_OVER: Final = (
+    "episode_over",
+    "the episode of the world is over: a reset is for a client that holds all its robots",
+)
 
 
 class Session:
@@ -121,14 +125,20 @@ class Session:
         """The environment has taken in what `begin_step` or `begin_reset` began."""
         self._unfinished = None
 
+    def refuse_over(self) -> EmberwatchError:
+        """The error for one robot of a world that is over; steps raise it until the next reset."""
+        self._unfinished = _OVER
+        return self._no_step()
+
     @property
     def is_unfinished(self) -> bool:
         """Whether worlds may have moved unseen: then all are reset, or resumed."""
-        return self._unfinished not in (None, _CLOSED)
+        return self._unfinished not in (None, _CLOSED, _OVER)
 
     def resume(self) -> StepAnswer:
         """Goes on from where the worlds stand, such as after another agent."""
         if self.settings.instance is None and not self.is_open:
+            self._unfinished = _CLOSED
             raise invalid("options", "a reset before resume=True", "the first one")
         self._open(0)
         with self._told():
@@ -350,6 +360,8 @@ class Session:
         if self._unfinished is None or self._unfinished is _CLOSED:
             return not_reset()
         code, words = self._unfinished
+        if self._unfinished is _OVER:
+            return EmberwatchError(words, code)
         return EmberwatchError(
             f"{words}, and the world may have moved: reset, or go on from where it stands with "
             "reset(options={'resume': True})",

@@ -120,7 +120,8 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                 # Not ">": "not a number" would never end.
                 if not now - start < limit:
                     lock.close()
-                    who = f"pid {holder}" if holder else "a process of another PID namespace"
+                    holder = holder or _holder(lock)
+                    who = f"pid {holder}" if holder else "another process"
                     problem = f"expected the lock within {limit} s, got it held by {who}"
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)

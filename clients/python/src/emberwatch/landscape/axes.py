@@ -24,6 +24,10 @@ _NAMES: Final = {
     "T": ("time", "t", "dimt", "date", "step", "layer", "band"),
 }
 _EVEN: Final = 0.1  # share of a cell by which one may be beside its place, as 32-bit numbers are
+
+#: Names of coordinates that are hardly metres.
+_ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
+
 _METRES: Final = {
     "": 1.0, "1": 1.0, "m": 1.0, "meter": 1.0, "metre": 1.0, "km": 1e3, "kilometer": 1e3,
     "kilometre": 1e3, "foot": 0.3048, "us_survey_foot": 1200 / 3937,
@@ -150,6 +154,8 @@ def _unit(name: str, given: Attributes, mapping: Attributes) -> tuple[float, boo
         return 1.0, True
     if unit in ("rad", "radian", "radians") and "perspective_point_height" in mapping:
         return float(mapping["perspective_point_height"]), False  # of a geostationary satellite
+    if not unit and name.rpartition(" ")[2].rpartition("/")[2] in _ANGLES:
+        raise invalid(f"{name}, units", "degrees, m, km or feet", "''")
     unit = unit.replace("feet", "foot")
     metres = _METRES.get(unit, _METRES.get(unit.removesuffix("s")))
     if metres is None:
@@ -168,6 +174,8 @@ def _cells(
         raise invalid(
             f"{file}, {coordinate.name}, bounds", "two for each cell", f"'{given['bounds']}'"
         )
-    edges = unpacked(f"{file}, {bounds.name}", bounds[:], {**given, **attributes(bounds)})
+    # They are packed as their coordinate is, unless they are of another type.
+    inherited: Attributes = given if bounds.dtype == coordinate.dtype else {}
+    edges = unpacked(f"{file}, {bounds.name}", bounds[:], {**inherited, **attributes(bounds)})
     edges = np.unwrap(edges, period=360) if is_longitude else edges
     return edges.mean(axis=1), np.abs(edges[:, 1] - edges[:, 0])
