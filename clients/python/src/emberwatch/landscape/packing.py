@@ -40,7 +40,7 @@ def unpacked(
         if not is_unpacked and (wide is None or are_whole or limit.dtype == stored.dtype):
             limit = stored.dtype.type(limit) if stored.dtype.kind == "f" else limit
             missing |= sign * packed > sign * float(limit)
-        elif limit.dtype == wide:
+        elif wide is not None and limit.dtype == wide:
             slack = _ROUNDED * abs(float(scale[0])) if scale.size else 0.0
             slack += float(np.finfo(wide).eps * abs(limit)) if wide.kind == "f" else 0.0
             missing |= sign * values > sign * float(limit) + slack
