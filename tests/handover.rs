@@ -215,6 +215,7 @@ fn an_agent_told_to_stop_leaves_its_belief() {
     let Reply::Belief { info, .. } = connection.control(&ask, PATIENCE).expect("a belief") else {
         panic!("expected a belief");
     };
-    assert_eq!(info.length, 3 * 16 * 16 * 4);
+    // Three states, and when each cell was seen; two rewards and a count.
+    assert_eq!(info.length, (3 + 1) * 16 * 16 * 4 + 16);
     assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

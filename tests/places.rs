@@ -105,7 +105,7 @@ fn servers_that_are_both_process_1_of_their_namespaces_are_told_apart() {
     let script = format!(
         "{other} {SMALL} & first=$!
          until $S status 2>&1 | grep -q 'another PID namespace'; do sleep 0.01; done
-         {other} {SMALL}; echo the second ended with $?; kill $first"
+         {other} {SMALL}; echo the second ended with $?; kill -9 $first"
     );
     let Some(output) = apart(&script) else { return };
     let said = String::from_utf8_lossy(&output.stdout);

@@ -74,7 +74,6 @@ impl Rollout {
         let score = self.agent.score(&seen.observation.frame);
         let before = std::mem::replace(&mut self.seen, seen);
         self.correct()?;
-        self.agent.earn(self.observation().robot.reward);
         Ok(Turn {
             before: before.observation,
             score,
@@ -86,7 +85,12 @@ impl Rollout {
         let Seen {
             observation, truth, ..
         } = &self.seen;
-        self.agent.correct(&observation.frame, truth.as_ref())
+        self.agent.correct(&observation.frame, truth.as_ref())?;
+        // Nothing was flown before the first frame.
+        if observation.world.step > 0 {
+            self.agent.earn(observation.robot.reward);
+        }
+        Ok(())
     }
 
     pub fn observation(&self) -> &Observation {
