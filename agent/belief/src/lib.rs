@@ -5,7 +5,10 @@
 //! - [`planning`]: from a belief to a path (paper section III.D)
 //! - [`merit`], [`brier`]: how good a run and a belief were
 
-#![allow(missing_docs, reason = "filled in below, item by item")]
+#![allow(
+    missing_docs,
+    reason = "items that their names explain have no words of their own"
+)]
 
 pub mod brier;
 pub mod estimation;

@@ -121,7 +121,7 @@ impl CompareCommand {
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
             }
-            report.is_recorded = arena.is_recorded();
+            report.baseline = self.baseline(&comparison.policies, arena.is_recorded());
             report.add(axis_label(arena.model()), results);
         }
         self.tell(&report, added, &config)
@@ -132,7 +132,7 @@ impl CompareCommand {
         // What was measured is kept in any case.
         let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
-        write(&render_table(&all, self.baseline(report.is_recorded)))?;
+        write(&render_table(&all, &report.baseline))?;
         if let Some(path) = &self.csv {
             write_csv(path, &all)?;
         }
@@ -213,7 +213,7 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        named(&self.baseline(false).to_owned()).context("--baseline")?;
+        named(&self.baseline(&policies, false)).context("--baseline")?;
         if let Some(policy) = policies.iter().find(|policy| !learned.suits(policy)) {
             bail!(needs_checkpoint(policy));
         }
@@ -225,12 +225,19 @@ impl CompareCommand {
         self.robots.iter().any(|&robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    fn baseline(&self, is_recorded: bool) -> &str {
-        match (&self.baseline, self.has_teams()) {
-            (Some(name), _) => name,
-            (None, true) => self.policies.first().map_or(OF_TEAMS, String::as_str),
-            (None, false) if is_recorded => "coverage",
-            (None, false) => "shooting_exploit",
+    fn baseline(&self, policies: &[Policy], is_recorded: bool) -> String {
+        let mut options = policies.iter().filter(|policy| policy.is_option());
+        let has_options = self.policies.iter().any(|name| name == OPTIONS);
+        match (&self.baseline, self.has_teams(), options.next()) {
+            (Some(name), ..) => name.clone(),
+            (None, true, _) => self
+                .policies
+                .first()
+                .map_or(OF_TEAMS, String::as_str)
+                .into(),
+            (None, false, Some(exploit)) if has_options => exploit.name.clone(),
+            (None, false, _) if is_recorded => "coverage".into(),
+            (None, false, _) => "shooting_exploit".into(),
         }
     }
 
@@ -250,7 +257,7 @@ struct Report {
     /// The same for all numbers of robots.
     fire_cells: Vec<f32>,
     axis_label: String,
-    is_recorded: bool,
+    baseline: String,
 }
 
 impl Report {

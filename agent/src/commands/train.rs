@@ -7,6 +7,7 @@ use agent::client::launch::OwnServer;
 use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::learning::checkpoint::Contents;
 use agent::learning::learned::Learned;
+use agent::learning::learners::decisions::SavedDecisions;
 use agent::learning::train::{CHECKPOINT, TrainingSpec, train};
 use agent::policy::EstimatorKind;
 use anyhow::{Context, Result, ensure};
@@ -17,7 +18,7 @@ use protocol::program::stop_on_signals;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// First seed of the worlds to train on; those below are for tests.
 const TRAINING_SEED: u64 = 1000;
@@ -85,12 +86,15 @@ pub struct TrainCommand {
 impl TrainCommand {
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
-        let mut training = self.training()?;
+        let (start, mut training) = (Instant::now(), self.training()?);
         let contents = if self.resume && self.goes_on_with_filter(&training) {
             None
         } else {
             training.check()?
         };
+        if let Some(contents) = contents.as_ref().filter(|_| decides(&training)) {
+            self.go_on_from(contents.state()?, &mut training)?;
+        }
         let (instance, own) = self.server(&training)?;
         if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
             return Ok(());
@@ -101,9 +105,13 @@ impl TrainCommand {
                 let contents = filter.check()?;
                 learn(&instance, &filter, contents, &stop)?;
             }
-            if stop.load(Relaxed) {
+            training.resume = true;
+            if stop.load(Relaxed) || training.of_filter()?.is_some() {
+                tracing::warn!("the filter is not learned yet: continue with --resume");
                 return Ok(());
             }
+            let limit = &mut training.time_limit;
+            *limit = limit.map(|limit| limit.saturating_sub(start.elapsed()));
             let filter = training.filter_folder().join(CHECKPOINT);
             training.learned = Learned::read([&*filter], &training.device)?;
             training.resume = false;
@@ -114,8 +122,13 @@ impl TrainCommand {
     fn training(&self) -> Result<TrainingSpec> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
-        let decisions = &mut config.decisions;
-        decisions.estimator = self.estimator.unwrap_or(decisions.estimator);
+        let estimator = self.estimator.unwrap_or(config.decisions.estimator);
+        config.decisions.estimator = estimator;
+        let is_of_decisions = self.estimator.is_some() || self.checkpoint.is_some();
+        ensure!(
+            config.learner == LearnerKind::Decisions || !is_of_decisions,
+            "--estimator, --checkpoint: expected them with --learner decisions alone, got another learner"
+        );
         let n_worlds = self.worlds.unwrap_or(match config.learner {
             LearnerKind::Autoencoder => 1,
             _ => 16,
@@ -128,6 +141,12 @@ impl TrainCommand {
             _ => 0,
         };
         let device = self.device.open()?;
+        let learned = Learned::read(self.checkpoint.as_deref(), &device)?;
+        ensure!(
+            self.checkpoint.is_none() || learned.filter(estimator).is_some(),
+            "--checkpoint: expected a filter for the belief {}, got another",
+            estimator.label()
+        );
         Ok(TrainingSpec {
             worlds: self.world..last,
             takeover: self.takeover,
@@ -136,15 +155,41 @@ impl TrainCommand {
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
-            learned: Learned::read(self.checkpoint.as_deref(), &device)?,
+            learned,
             device,
             config,
         })
     }
 
+    /// Goes on with decisions where their checkpoint left them: on its belief, for the steps that are left.
+    fn go_on_from(&self, saved: SavedDecisions, training: &mut TrainingSpec) -> Result<()> {
+        let own = saved.estimator;
+        ensure!(
+            self.estimator.is_none_or(|estimator| estimator == own),
+            "--estimator: expected that of the checkpoint, {}, got {}",
+            own.label(),
+            training.config.decisions.estimator.label()
+        );
+        ensure!(
+            self.checkpoint.is_none(),
+            "--checkpoint: expected none with --resume, as the checkpoint of --out has its filter"
+        );
+        training.config.decisions.estimator = own;
+        if self.steps.is_none() && !self.freeze {
+            training.steps = training.steps.saturating_sub(saved.world_steps);
+            ensure!(
+                training.steps > 0,
+                "--resume: all {} steps of decisions are made: expected --steps with more",
+                saved.world_steps
+            );
+        }
+        Ok(())
+    }
+
     /// Whether a training of decisions was left while its filter was learned.
     fn goes_on_with_filter(&self, training: &TrainingSpec) -> bool {
-        needs_filter(training)
+        !self.freeze
+            && needs_filter(training)
             && training.filter_folder().join(CHECKPOINT).exists()
             && !training.out.join(CHECKPOINT).exists()
     }
@@ -166,8 +211,8 @@ impl TrainCommand {
         });
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        let (learner, decisions) = (training.config.learner, &training.config.decisions);
-        let decides = learner == LearnerKind::Decisions;
+        let decisions = &training.config.decisions;
+        let decides = decides(training);
         // Who learns a model does not look at it, and could not.
         let reveals = (decides && decisions.estimator.knows_model()).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
@@ -181,12 +226,14 @@ impl TrainCommand {
     }
 }
 
+fn decides(training: &TrainingSpec) -> bool {
+    training.config.learner == LearnerKind::Decisions
+}
+
 /// Whether decisions are to be learned on the belief of a filter that is yet to be learned.
 fn needs_filter(training: &TrainingSpec) -> bool {
     let estimator = training.config.decisions.estimator;
-    training.config.learner == LearnerKind::Decisions
-        && estimator.is_learned()
-        && training.learned.filter(estimator).is_none()
+    decides(training) && estimator.is_learned() && training.learned.filter(estimator).is_none()
 }
 
 /// Trains, and says what that gave.

@@ -1,7 +1,7 @@
 //! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is read only where decisions are learned. One message steps all robots.
+//! model that a server may reveal is read only for decisions on its belief. One message steps all robots.
 //! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
 
 mod events;

@@ -29,6 +29,9 @@ pub const SHAPE: DqnShape = DqnShape {
 /// More updates than a step of all worlds earns.
 const MOST_EARNED: f64 = 2e6;
 
+/// Steps for which no option is held longer: the limit of `longest_hold`.
+const MOST_HELD: u64 = 1000;
+
 /// Before the names of the filter's tensors.
 const FILTER: &str = "filter.";
 
@@ -167,6 +170,8 @@ impl SavedRun {
             check_numbers("worlds.last", features, N_FEATURES)?;
             check_numbers("worlds.last", &[*reward], 1)?;
         }
+        let (most, got) = (MOST_HELD, self.held.n_steps);
+        check(got <= most, "worlds.held", format!("at most {most}"), got)?;
         let (most, got) = (OPTIONS.len(), self.held.option);
         check(got < most, "worlds.held", format!("less than {most}"), got)
     }
