@@ -417,6 +417,15 @@ REFUSED: dict[str, tuple[Variables, tuple[str, ...], str]] = {
         (),
         "a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'",
     ),
+    "latitudes without a unit": (
+        {
+            "Lat": Variable(LAT.values, "f8", ("Lat",)),
+            "lon": LON,
+            "v": ONE._replace(over=("Lat", "lon")),
+        },
+        (),
+        "a.nc, Lat, units: expected degrees, m, km or feet, got ''",
+    ),
     "degrees and metres": (
         grid(ONE, x=X.told(units="degrees_east")),
         (),
