@@ -1,6 +1,5 @@
 """Worlds that an agent estimates, plans and steps in: its client chooses what each path is for."""
 
-import weakref
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Final
@@ -171,8 +170,6 @@ class AgentSession(Session):
         self._own_agent = agent = Program(
             "emberwatch-agent", command + ["--takeover"] * settings.takeover
         )
-        # For environments that nobody closes. Does nothing where it has been stopped before.
-        weakref.finalize(self, agent.stop)
 
         def connect_to_own() -> Decisions:
             decisions = self._connect_to_agent(instance)
