@@ -69,7 +69,8 @@ class AgentSession(Session):
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
         if arguments["agent"] == "running" and arguments["checkpoint"] is not None:
-            raise invalid("checkpoint", "none, as the agent runs already", arguments["checkpoint"])
+            given = repr(arguments["checkpoint"])
+            raise invalid("checkpoint", "none, as the agent runs already", given)
         if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
             raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
