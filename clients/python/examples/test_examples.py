@@ -34,6 +34,11 @@ EXAMPLES = [
         "--model wildfire --moves 64 --worlds 4 --total-steps 500 --test-worlds 2 --test-steps 50",
         r"500 decisions, .*\nDQN .*\nrandom .*\nexploit +[1-9]",
     ),
+    (
+        "sb3_objective.py",
+        "--model wildfire --moves 64 --worlds 2 --total-steps 4 --test-worlds 2 --test-steps 50",
+        r" 4 decisions, .*\nDQN .*\nrandom .*\nexploit +[1-9]",
+    ),
     ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
     ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),
     (

@@ -101,12 +101,29 @@ def test_seeds_of_a_lease_are_one_for_each_world() -> None:
     assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
 
 
-@pytest.mark.parametrize("options", ["resume", ["resume"], 5, {"resume"}], ids=repr)
+@pytest.mark.parametrize(
+    "options",
+    ["resume", ["resume"], 5, {"resume"}, Elsewhere(ELSEWHERE[0])],
+    ids=lambda it: type(it).__name__,
+)
 def test_options_are_a_dictionary(options: Any) -> None:
     team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
     for env in (make(), make_vec(2), team):
         with refuses(r"options: expected a dictionary such as \{'resume': True\}, or None, got"):
             env.reset(options=options)
+
+
+def test_what_does_not_show_itself_is_refused_in_its_own_words() -> None:
+    team = closed_later(emberwatch.parallel_env(robots=2, action="path", **SMALL))
+    team.reset(seed=1)
+    for error in ELSEWHERE:
+        for resume in ({"resume": Elsewhere(error)}, Elsewhere(error)):
+            with refuses(f"options: expected .*, got Elsewhere: {error}"):
+                team.reset(options=resume)
+        with refuses(f"actions: expected one for each of .*, got Elsewhere: {error}"):
+            team.step(Elsewhere(error))
+        with refuses(f"actions: expected one for each of .*, got dict: {error}"):
+            team.step({"robot_0": Elsewhere(error)})
 
 
 KEYWORDS: list[dict[str, Any]] = [

@@ -14,8 +14,10 @@ import pytest
 from environments import (
     MOVES,
     OBJECTIVE,
+    WILDFIRE,
     assert_same,
     closed_later,
+    impatient,
     make,
     make_vec,
     private_pid,
@@ -134,28 +136,37 @@ def test_a_step_that_was_interrupted_is_never_taken_for_the_next(pair: tuple[Any
         else:
             assert_same(outcome, both if same(outcome, both) else lone)
         assert_same([env.reset(seed=5), env.step(first), env.step(second)], fresh)
-    assert n_refused > 12
+    assert n_refused > 4  # of up to 25: waits differ in how often they poll
 
 
 def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, Any]) -> None:
     env, other = pair
     first = action(env, 10)
+    begun(other)
     n_places = places(lambda: other.reset(seed=7))
     fresh = [other.reset(seed=5), other.step(first)]
     outcomes = [begun(other).step(first), (other.reset(seed=7), other.step(first))[1]]
-    kept = []
+    stood = resumed(begun(other))
+    kept, n_refused = [], 0
     for n in range(1, n_places, max(1, n_places // 12)):
         begun(env)
         kept.append(interrupted(lambda: env.reset(seed=7), n))
         try:
             outcome = env.step(first)
         except REFUSALS:
-            _, info = env.reset(options={"resume": True})
-            told = info.get("robot_0", info)["step"]
-            assert np.all(np.isin(told, range(4)))
+            step = resumed(env)  # as it was, or of the new episode
+            n_refused += 1
+            assert np.all((step == stood) | (step == 0))
         else:
             assert_same(outcome, outcomes[same(outcome, outcomes[1])])
         assert_same([env.reset(seed=5), env.step(first)], fresh)
+    assert n_refused > 2
+
+
+def resumed(env: Any) -> Any:
+    """The step from which an environment goes on, or that of each world."""
+    _, info = env.reset(options={"resume": True})
+    return np.asarray(info.get("robot_0", info)["step"])
 
 
 def same(left: object, right: object) -> bool:
@@ -221,13 +232,14 @@ def test_a_lone_robot_is_never_late() -> None:
 
 
 @pytest.mark.parametrize("seed", [5, None])
+@pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
 def test_a_reset_waits_for_the_one_that_was_interrupted(
-    monkeypatch: pytest.MonkeyPatch, seed: int | None
+    monkeypatch: pytest.MonkeyPatch, name: str, seed: int | None
 ) -> None:
-    started = server(burn_in=50_000)
-    env = closed_later(emberwatch.WildfireEnv(instance=started.instance))
+    started = server(burn_in=3_000_000)  # takes longer than the timeout below
+    env = make(name, instance=started.instance)
     env.reset(seed=1)
-    env.step([1] * 6)
+    env.step(first := np.zeros(env.action_space.shape, int))
     wait = ports.Peer.wait
 
     def interrupt(*_: object) -> None:
@@ -238,12 +250,10 @@ def test_a_reset_waits_for_the_one_that_was_interrupted(
     monkeypatch.setattr(ports.Peer, "wait", interrupt)
     with pytest.raises(KeyboardInterrupt):
         env.reset(seed=7)
-    if seed is None:
-        env.reset(options={"resume": True})
-    else:
-        env.reset(seed=seed)
+    with impatient(env, 0.5):
+        env.reset(seed=seed, options={"resume": True} if seed is None else None)
     assert started.status().worlds[0].seed == (seed or 7)
-    assert env.step([1] * 6)[4]["step"] == 1
+    assert env.step(first)[4]["step"] == 1
 
 
 def test_a_path_that_waits_for_others_is_taken_back_by_ctrl_c() -> None:

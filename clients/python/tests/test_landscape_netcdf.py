@@ -343,11 +343,14 @@ def test_bounds_say_where_cells_are(tmp_path: Path) -> None:
     np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
 
 
-def test_bounds_need_not_be_packed_as_their_coordinate_is(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["f8", "i2"])
+def test_bounds_are_packed_as_their_coordinate_is_if_of_its_type(kind: str, tmp_path: Path) -> None:
+    given = {"scale_factor": 15.0, "add_offset": 500_000.0, "valid_min": np.int16(0)}
     edged = {**bounded(X, "x"), "y": Y, "v": ONE}
-    edges = (np.asarray(edged["x"].values) - 500_000) / 15
-    whole = edged["x"]._replace(values=edges, kind="i2")
-    edged["x"] = whole.told(scale_factor=15.0, add_offset=500_000.0)
+    for name in ("x", "edges") if kind == "i2" else ("x",):
+        whole = (np.asarray(edged[name].values) - 500_000) / 15
+        edged[name] = edged[name]._replace(values=whole, kind="i2")
+    edged["x"] = edged["x"].told(**given)
     np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
 
 
@@ -413,6 +416,15 @@ REFUSED: dict[str, tuple[Variables, tuple[str, ...], str]] = {
         grid(ONE, x=X.told(units="furlongs")),
         (),
         "a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'",
+    ),
+    "latitudes without a unit": (
+        {
+            "Lat": Variable(LAT.values, "f8", ("Lat",)),
+            "lon": LON,
+            "v": ONE._replace(over=("Lat", "lon")),
+        },
+        (),
+        "a.nc, Lat, units: expected degrees, m, km or feet, got ''",
     ),
     "degrees and metres": (
         grid(ONE, x=X.told(units="degrees_east")),

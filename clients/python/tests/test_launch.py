@@ -2,11 +2,11 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from failures import fails, refuses
@@ -83,10 +83,47 @@ def test_a_program_that_never_answers_is_given_up(
     check = f'case "$1" in --check) exec {programs.find("emberwatch-server")} "$@";; esac'
     path.write_text(f"#!/bin/sh\n{check}\nexec sleep 60\n")
     path.chmod(0o700)
-    started: list[Program] = []
-    monkeypatch.setattr(programs, "_programs", SimpleNamespace(add=started.append, discard=id))
+    started = starting(monkeypatch)
     assert "did not answer within 0.2 s" in launch_error()
-    assert [program._process.returncode is None for program in started] == [False]
+    assert [is_running(process.pid) for process in started] == [False]
+
+
+def starting(
+    monkeypatch: pytest.MonkeyPatch, then: Callable[[], None] = lambda: None
+) -> list[subprocess.Popen[bytes]]:
+    """The processes of programs that start from now on; `then` is called as soon as one runs."""
+    start, started = Program._start, []
+
+    def started_too(program: Program, command: list[str]) -> subprocess.Popen[bytes]:
+        started.append(start(program, command))
+        then()
+        return started[-1]
+
+    monkeypatch.setattr(Program, "_start", started_too)
+    return started
+
+
+def test_ctrl_c_while_a_program_starts_leaves_none_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = WildfireEnv(**SMALL)
+    started = starting(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt) as kept:
+        env.reset(seed=1)
+    assert kept is not None
+    assert [is_running(process.pid) for process in started] == [False]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_ends_a_program_that_was_started() -> None:
+    program = server().program
+    os.kill(program.pid, signal.SIGINT)
+    assert eventually(lambda: not is_running(program.pid))
+
+
+def test_a_forgotten_program_ends() -> None:
+    program = Program("emberwatch-server", [f"--instance={programs.unused_instance()}"])
+    pid = program.pid
+    del program
+    assert not is_running(pid)
 
 
 def test_a_program_that_does_not_stop_is_killed(

@@ -141,6 +141,14 @@ def test_the_world_is_that_of_wildfire_with_the_same_seed(env: Any) -> None:
     assert counts[0] == counts[1]
 
 
+def test_a_resume_does_not_wait_for_the_end_of_a_server_that_runs(
+    any_env: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(Program, "exit_code")  # which waits for it
+    _, info = any_env.reset(options={"resume": True})
+    assert np.all(info["step"] == 0)
+
+
 def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
     env.reset(seed=1000)
     env.step(2)
@@ -207,6 +215,10 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
         ({"prior": "none"}, "expected one of simulated, initial, uniform"),
         ({"agent": "other"}, "expected one of own, running"),
         ({"agent": "running"}, "expected instance="),
+        (
+            {"agent": "running", "instance": "lab", "checkpoint": "a.safetensors"},
+            "checkpoint: expected none, as the agent runs already, got 'a.safetensors'",
+        ),
     ],
 )
 @pytest.mark.parametrize("maker", [make, make_vec])

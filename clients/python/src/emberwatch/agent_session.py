@@ -1,6 +1,5 @@
 """Worlds that an agent estimates, plans and steps in: its client chooses what each path is for."""
 
-import weakref
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Final
@@ -70,7 +69,8 @@ class AgentSession(Session):
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
         if arguments["agent"] == "running" and arguments["checkpoint"] is not None:
-            raise invalid("checkpoint", "none, as the agent runs already", arguments["checkpoint"])
+            given = repr(arguments["checkpoint"])
+            raise invalid("checkpoint", "none, as the agent runs already", given)
         if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
             raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
@@ -171,8 +171,6 @@ class AgentSession(Session):
         self._own_agent = agent = Program(
             "emberwatch-agent", command + ["--takeover"] * settings.takeover
         )
-        # For environments that nobody closes. Does nothing where it has been stopped before.
-        weakref.finalize(self, agent.stop)
 
         def connect_to_own() -> Decisions:
             decisions = self._connect_to_agent(instance)

@@ -158,10 +158,10 @@ def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Reads the options of a reset."""
     for key in as_options(options):
         if key != "resume":
-            raise invalid("options", "'resume'", repr(key))
+            raise invalid("options", "'resume'", told(key))
     resume = as_options(options).get("resume", False)
     if not isinstance(resume, bool):
-        raise invalid("options", "resume True or False", repr(resume))
+        raise invalid("options", "resume True or False", told(resume))
     if resume and seed is not None:
         raise InvalidArgumentError(
             "options: expected no seed with resume=True, which begins no episode"

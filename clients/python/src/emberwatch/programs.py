@@ -1,6 +1,5 @@
 """The programs that come with the package: found, run, and started as private ones."""
 
-import atexit
 import contextlib
 import itertools
 import os
@@ -12,11 +11,13 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import threading
 import time
 import tomllib
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import IO, Any, Final, Protocol, TypeVar
 
 from emberwatch.errors import (
@@ -129,8 +130,28 @@ def _cleaned(text: str) -> str:
     return text.partition("\n\nFor more information")[0].strip()
 
 
+@contextlib.contextmanager
+def _ctrl_c_later() -> Generator[None]:
+    """Postpones Ctrl-C to its end. A blocked signal would stay blocked in a program's process."""
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    pressed: list[FrameType | None] = []
+    signal.signal(signal.SIGINT, lambda _, frame: pressed.append(frame))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if pressed:
+            handler(signal.SIGINT, pressed[0])
+
+
 class Program:
-    """A program of our own. It ends with `stop`, or with this process, however that ends."""
+    """A program of our own.
+
+    It ends with `stop`, when it is forgotten, or with this process, however that ends.
+    """
 
     def __init__(self, name: str, arguments: Sequence[str]) -> None:
         command = [str(find(name)), *arguments, "--exit-with", str(os.getpid())]
@@ -138,10 +159,22 @@ class Program:
         self._owner = os.getpid()
         # For the error if it ends at once. A file, unlike a pipe, never fills up and blocks it.
         self._output = _nameless_file()
+        stop = None
+        try:
+            with _ctrl_c_later():
+                self._process = self._start(command)
+                # For programs that nobody stops, such as that of a forgotten environment.
+                stop = weakref.finalize(self, _stop, self._process, self._output, self._owner)
+        except BaseException:
+            if stop is not None:
+                stop()
+            raise
+
+    def _start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
         try:
             # A process group of its own: Ctrl-C is for Python, which then stops it. Not a session:
             # each has its own share of the cores, and between shares a wake-up waits longer.
-            self._process = subprocess.Popen(
+            return subprocess.Popen(
                 command,
                 env={"RUST_LOG": "warn"} | os.environ,
                 stdin=subprocess.DEVNULL,
@@ -152,7 +185,6 @@ class Program:
         except OSError as error:
             self._output.close()
             raise _not_started(command, error) from None
-        _programs.add(self)
 
     def wait_for(
         self, connect: Callable[[], _Connection], timeout: float | None = None
@@ -211,22 +243,16 @@ class Program:
 
     def stop(self) -> None:
         """Stops it and waits for its end, if it still runs; does nothing in a forked child."""
-        if os.getpid() != self._owner or self._output.closed:
-            return
-        _programs.discard(self)
-        self._process.send_signal(signal.SIGTERM)
-        try:
-            self._process.wait(_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._output.close()
+        _stop(self._process, self._output, self._owner)
 
 
-_programs: weakref.WeakSet[Program] = weakref.WeakSet()
-
-
-@atexit.register
-def _stop_all() -> None:
-    for program in list(_programs):
-        program.stop()
+def _stop(process: subprocess.Popen[bytes], output: IO[bytes], owner: int) -> None:
+    if os.getpid() != owner or output.closed:
+        return
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(_STOP_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    output.close()

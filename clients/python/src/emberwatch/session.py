@@ -7,7 +7,6 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 import inspect
 import logging
 import warnings
-import weakref
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -219,8 +218,6 @@ class Session:
         flags = [f"--instance={instance}", f"--seed={seed}"]
         flags += self.settings.server_flags(self.n_worlds)
         self._program = Program("emberwatch-server", flags)
-        # For environments that nobody closes. Does nothing where it has been stopped before.
-        weakref.finalize(self, self._program.stop)
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:

@@ -119,8 +119,8 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                         return None
                 # Not ">": "not a number" would never end.
                 if not now - start < limit:
-                    lock.close()
                     holder = holder or _holder(lock)
+                    lock.close()
                     who = f"pid {holder}" if holder else "another process"
                     problem = f"expected the lock within {limit} s, got it held by {who}"
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None

@@ -25,7 +25,7 @@ _NAMES: Final = {
 }
 _EVEN: Final = 0.1  # share of a cell by which one may be beside its place, as 32-bit numbers are
 
-#: Names of coordinates that are hardly metres.
+#: Names of dimensions and coordinates that are hardly metres.
 _ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
 
 _METRES: Final = {
@@ -82,7 +82,8 @@ def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
     if axis.coordinate is None:
         return None
     given, name = attributes(axis.coordinate), f"{file}, {axis.coordinate.name}"
-    factor, is_in_degrees = _unit(name, given, mapping)
+    is_angle = not _ANGLES.isdisjoint((axis.name.lower(), axis.coordinate.name.lower()))
+    factor, is_in_degrees = _unit(name, given, mapping, is_angle=is_angle)
     is_longitude = is_in_degrees and axis.letter == "X"
     middles, sizes = _cells(file, axis.coordinate, given, is_longitude=is_longitude)
     middles = np.unwrap(middles, period=360) if is_longitude else middles
@@ -146,19 +147,19 @@ def _axis(file: Path, variable: Any, name: str, position: int) -> Axis:
     return Axis(name, position, "".join(by_name), along[0] if along else None)
 
 
-def _unit(name: str, given: Attributes, mapping: Attributes) -> tuple[float, bool]:
+def _unit(
+    name: str, given: Attributes, mapping: Attributes, *, is_angle: bool
+) -> tuple[float, bool]:
     """Metres of a unit of coordinates, or 1 and that they are degrees."""
     unit = str(given.get("units", "")).strip().lower()
-    is_angle = "itude" in str(given.get("standard_name", ""))
-    if unit.startswith("degree") or (is_angle and not unit):
+    is_said = "itude" in str(given.get("standard_name", ""))
+    if unit.startswith("degree") or (is_said and not unit):
         return 1.0, True
     if unit in ("rad", "radian", "radians") and "perspective_point_height" in mapping:
         return float(mapping["perspective_point_height"]), False  # of a geostationary satellite
-    if not unit and name.rpartition(" ")[2].rpartition("/")[2] in _ANGLES:
-        raise invalid(f"{name}, units", "degrees, m, km or feet", "''")
     unit = unit.replace("feet", "foot")
     metres = _METRES.get(unit, _METRES.get(unit.removesuffix("s")))
-    if metres is None:
+    if metres is None or (is_angle and not unit):
         raise invalid(f"{name}, units", "degrees, m, km or feet", f"'{unit}'")
     return metres, False
 

@@ -36,14 +36,13 @@ def unpacked(
     for key, limit, sign in _limits(name, given):
         # A limit has the type, and so the unit, of the packed numbers or of the unpacked ones.
         are_whole = {limit.dtype.kind, stored.dtype.kind} <= {"i", "u"}
-        is_unpacked = wide is not None and limit.dtype == wide != stored.dtype
-        if not is_unpacked and (wide is None or are_whole or limit.dtype == stored.dtype):
-            limit = stored.dtype.type(limit) if stored.dtype.kind == "f" else limit
-            missing |= sign * packed > sign * float(limit)
-        elif wide is not None and limit.dtype == wide:
+        if wide is not None and limit.dtype == wide != stored.dtype:
             slack = _ROUNDED * abs(float(scale[0])) if scale.size else 0.0
             slack += float(np.finfo(wide).eps * abs(limit)) if wide.kind == "f" else 0.0
             missing |= sign * values > sign * float(limit) + slack
+        elif wide is None or are_whole or limit.dtype == stored.dtype:
+            limit = stored.dtype.type(limit) if stored.dtype.kind == "f" else limit
+            missing |= sign * packed > sign * float(limit)
         else:
             expected = f"the type of the numbers, {stored.dtype}, or of scale_factor, {wide}"
             raise invalid(f"{name}, {key}", expected, limit.dtype)
