@@ -30,6 +30,8 @@ const EXPLOIT: PathOption = PathOption {
     goal: None,
 };
 
+const BEST_REGION: PathOption = towards("best_region", Layer::Surplus);
+
 /// All options, in the order of a decision's numbers.
 pub const OPTIONS: [PathOption; 8] = [
     EXPLOIT,
@@ -42,19 +44,14 @@ pub const OPTIONS: [PathOption; 8] = [
         n_paths: 3,
         ..EXPLOIT
     },
-    towards("best_region", Layer::Surplus),
+    BEST_REGION,
     towards("unseen_region", Layer::Novelty),
 ];
 
 /// Numbers that describe an option: see [`feature_names`].
 pub const N_FEATURES: usize = 18 + OPTIONS.len();
 
-/// Number of the option that exploits, and of the one that flies to the best region.
-const EXPLOITS: usize = 0;
-const GOES: usize = 6;
-
-/// Rise in a cell's worth per cell nearer to the goal: more than any cell is worth, so the robot goes there by the way
-/// that promises most.
+/// Rise in a cell's worth per cell nearer to the goal, so that over a path nearer cells outweigh what lies aside.
 const SLOPE: f32 = 0.3;
 
 /// Rows and columns around the goal's centre between which nothing draws the robot.
@@ -151,11 +148,6 @@ impl OptionPlanner {
 }
 
 impl PathOption {
-    /// The number of an option.
-    pub fn index(name: &str) -> Option<usize> {
-        OPTIONS.iter().position(|option| option.name == name)
-    }
-
     fn goal_on(&self, outlook: &Outlook, robot: Cell) -> Option<Cell> {
         let best = |layer| outlook.best_region(layer, robot, KEPT_PER_PATH);
         self.goal.map(best)
@@ -265,7 +257,7 @@ pub fn choose_by_rule(outlook: &Outlook, robot: Cell) -> &'static PathOption {
     let n_paths = distance(robot, goal) as f32 / outlook.n_moves as f32;
     let away = outlook.around(Layer::Surplus, goal) * KEPT_PER_PATH.powf(n_paths);
     let here = outlook.around(Layer::Surplus, robot);
-    &OPTIONS[if away > here { GOES } else { EXPLOITS }]
+    if away > here { &BEST_REGION } else { &EXPLOIT }
 }
 
 #[cfg(test)]

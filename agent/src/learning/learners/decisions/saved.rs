@@ -20,11 +20,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// What a decision is made on, and among.
-pub const SHAPE: DqnShape = DqnShape {
-    n_inputs: N_FEATURES,
-    n_outputs: 1,
-    n_candidates: OPTIONS.len(),
-};
+pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
 /// More updates than a step of all worlds earns.
 const MOST_EARNED: f64 = 2e6;
