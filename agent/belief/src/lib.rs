@@ -5,7 +5,10 @@
 //! - [`planning`]: from a belief to a path (paper section III.D)
 //! - [`merit`], [`brier`]: how good a run and a belief were
 
-#![allow(missing_docs, reason = "part of a program: what names say is not said again")]
+#![allow(
+    missing_docs,
+    reason = "part of a program: what names say is not said again"
+)]
 
 pub mod brier;
 pub mod estimation;
