@@ -35,5 +35,6 @@ mod security;
 mod snapshots;
 mod team_agents;
 mod teams;
+mod trained_decisions;
 mod training;
 mod trainings;

@@ -9,9 +9,9 @@ use agent::learning::learners::filter::fit::KIND;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, repository, run};
+use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, run};
 
 /// A private server with small worlds.
 const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
@@ -350,88 +350,4 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
     check(AGENT, &words, kernel);
     place.set("[learning]\nrate = 2.0\n");
     check(AGENT, &words, "learning.rate: expected 0 to 1, got 2");
-}
-
-/// A model file of the wildfire that shows one value more.
-fn four_observations(place: &Place) -> PathBuf {
-    let small = repository().join("config/models/wildfire-small.toml");
-    let small = std::fs::read_to_string(small).expect("the model");
-    let four = small.replace("observed_as = [", "observed_as = [0.0, ");
-    let smoke = "[[observations]]\nname = \"smoke\"\ncolor = \"#000000\"\n\n[[observations]]";
-    let path = place.path("four.toml");
-    std::fs::write(&path, four.replacen("[[observations]]", smoke, 1)).expect("write the model");
-    path
-}
-
-#[test]
-fn decisions_are_learned_and_enter_the_ladder() {
-    let place = place();
-    let settings = "learner = \"decisions\"\nbeam_width = 4\nprior_worlds = 2\n[learning]\nwindow = 4\n\
-                    [decisions]\nfilter_steps = 40\nbatch = 8\nreplay = 100\nupdates_per_step = 1.0\n\
-                    episode_steps = 9\nsteps = 100\n";
-    place.set(settings);
-    place.train("out", &format!("{WORLDS} --steps 60"));
-    place.train("out", &format!("{WORLDS} --resume"));
-    let four = format!("--steps 4 --model {}", four_observations(&place).display());
-    let refusals = [
-        ("", "--resume: all 100 steps of decisions are made"),
-        (
-            "--estimator known_model",
-            "--estimator: expected that of the checkpoint, learned_filter, got known_model",
-        ),
-        (&*four, "expected 4 observations as the world's, got 3"),
-        (
-            "--learner filter --estimator learned_filter",
-            "expected them with --learner decisions",
-        ),
-    ];
-    for (flags, refusal) in refusals {
-        let words = place.words("out", &format!("{WORLDS} --resume {flags}"));
-        check(AGENT, &words, refusal);
-    }
-    let metrics = std::fs::read_to_string(place.path("out").join("metrics.csv"));
-    let metrics = metrics.expect("the metrics");
-    let last: Vec<&str> = metrics.lines().last().expect("rows").split(',').collect();
-    assert_eq!(last[1], "100");
-    assert!(last[6].parse::<f64>().is_ok_and(f64::is_finite), "{last:?}");
-    let checkpoint = place.checkpoint("out");
-    let worlds =
-        "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 --beam-width 4";
-    let compare = format!("compare --policies options {worlds}");
-    let filter = place.checkpoint("out/filter");
-    let checkpoints = format!(
-        "--checkpoint {} --checkpoint {}",
-        checkpoint.display(),
-        filter.display()
-    );
-    let compared = agent(&format!("{compare} {checkpoints}"));
-    compared.check_prints("to learned_exploit");
-    for policy in [
-        "random_walk",
-        "learned_exploit_ahead_3",
-        "learned_rule",
-        "learned_policy",
-    ] {
-        compared.check_prints(policy);
-    }
-    check(AGENT, &compare, "options | --checkpoint FILE");
-    let one = format!("compare --policies known_policy --baseline coverage {worlds}");
-    let one = format!("{one} --checkpoint {}", checkpoint.display());
-    check(AGENT, &one, "known_policy | known_model");
-    let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
-    let flags = format!("--instance {} --worlds 2 --steps 4", server.instance.name());
-    let known = format!("{flags} --estimator known_model");
-    check(AGENT, &place.words("hidden", &known), "--reveal-model true");
-    check(
-        AGENT,
-        &place.words("hidden", &format!("{flags} --estimator filter")),
-        "--estimator | got",
-    );
-    // The filter of an earlier training, on worlds whose model nobody tells.
-    let given = format!(
-        "{flags} --estimator learned_spatial_filter --checkpoint {}",
-        filter.display()
-    );
-    place.train("given", &given);
-    assert!(!place.path("given/filter").exists());
 }

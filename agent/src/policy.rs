@@ -1,7 +1,8 @@
 //! Policies by name: which belief, which planner, which objective (the ladder of the benchmark).
 
+mod kinds;
 mod list;
 mod named;
 
+pub use kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
 pub use list::list;
-pub use named::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};

@@ -14,7 +14,7 @@ use agent::benchmark::team::Team;
 use agent::client::launch::OwnDashboard;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
-use agent::policy::{EstimatorKind, Policy};
+use agent::policy::{Choice, EstimatorKind, Policy};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
@@ -38,8 +38,8 @@ pub struct CompareCommand {
     /// rule and the learned choice [default: the ladder; of teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// The policy that others are paired against [default: shooting_exploit; of teams: the first policy; of
-    /// recorded worlds: coverage]
+    /// The policy that others are paired against [default: shooting_exploit; of options: that which exploits; of
+    /// teams: the first policy; of recorded worlds: coverage]
     #[arg(long)]
     baseline: Option<String>,
     /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
@@ -121,7 +121,8 @@ impl CompareCommand {
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
             }
-            report.baseline = self.baseline(&comparison.policies, arena.is_recorded());
+            let baseline = self.baseline(arena.is_recorded(), &comparison.policies);
+            baseline.clone_into(&mut report.baseline);
             report.add(axis_label(arena.model()), results);
         }
         self.tell(&report, added, &config)
@@ -213,7 +214,7 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        named(&self.baseline(&policies, false)).context("--baseline")?;
+        named(&self.baseline(false, &policies).to_owned()).context("--baseline")?;
         if let Some(policy) = policies.iter().find(|policy| !learned.suits(policy)) {
             bail!(needs_checkpoint(policy));
         }
@@ -225,20 +226,21 @@ impl CompareCommand {
         self.robots.iter().any(|&robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    fn baseline(&self, policies: &[Policy], is_recorded: bool) -> String {
-        let mut options = policies.iter().filter(|policy| policy.is_option());
-        let has_options = self.policies.iter().any(|name| name == OPTIONS);
-        match (&self.baseline, self.has_teams(), options.next()) {
-            (Some(name), ..) => name.clone(),
-            (None, true, _) => self
-                .policies
-                .first()
-                .map_or(OF_TEAMS, String::as_str)
-                .into(),
-            (None, false, Some(exploit)) if has_options => exploit.name.clone(),
-            (None, false, _) if is_recorded => "coverage".into(),
-            (None, false, _) => "shooting_exploit".into(),
-        }
+    /// The one that was named; else one of the policies, if these are of teams or of options.
+    fn baseline<'a>(&'a self, is_recorded: bool, policies: &'a [Policy]) -> &'a str {
+        let mut policies = policies.iter();
+        let found = if self.policies.iter().any(|name| name == OPTIONS) {
+            policies.find(|policy| matches!(policy.choice, Choice::Option(_)))
+        } else {
+            policies.next().filter(|_| self.has_teams())
+        };
+        let usual = if is_recorded {
+            "coverage"
+        } else {
+            "shooting_exploit"
+        };
+        let named = self.baseline.as_deref();
+        named.unwrap_or(found.map_or(usual, |policy| &policy.name))
     }
 
     fn needs_scouts(&self) -> bool {

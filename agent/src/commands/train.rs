@@ -4,7 +4,7 @@ use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
 use agent::benchmark::report::training::draw_training;
 use agent::client::launch::OwnServer;
-use agent::config::{AgentFlags, LearnerKind, Preset};
+use agent::config::{AgentConfig, AgentFlags, LearnerKind, Preset};
 use agent::learning::checkpoint::Contents;
 use agent::learning::learned::Learned;
 use agent::learning::learners::decisions::SavedDecisions;
@@ -12,7 +12,7 @@ use agent::learning::train::{CHECKPOINT, TrainingSpec, train};
 use agent::policy::EstimatorKind;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use network::DeviceKind;
+use network::{Device, DeviceKind};
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
@@ -40,17 +40,17 @@ pub struct TrainCommand {
     /// What to learn [default: filter; of preset paper: autoencoder]
     #[arg(long)]
     learner: Option<LearnerKind>,
-    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of decisions: those of the
-    /// settings]
+    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of decisions: what is left of
+    /// those of the settings]
     #[arg(long)]
     steps: Option<u64>,
-    /// Whose belief decisions are learned on [default: learned_filter]
+    /// Whose belief decisions are learned on [default: learned_filter, or the checkpoint's to go on from]
     #[arg(long, value_name = "NAME")]
     estimator: Option<EstimatorKind>,
     /// The filter for that, of an earlier training; without it, one is learned first
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Seconds to act for
+    /// Seconds to act for, with a filter that is learned first
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
     /// Folder for checkpoint.safetensors, metrics.csv and training.png; a filter that is learned first has a folder in it
@@ -86,72 +86,49 @@ pub struct TrainCommand {
 impl TrainCommand {
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
-        let (start, mut training) = (Instant::now(), self.training()?);
-        let contents = if self.resume && self.goes_on_with_filter(&training) {
-            None
-        } else {
-            training.check()?
-        };
-        if let Some(contents) = contents.as_ref().filter(|_| decides(&training)) {
-            self.go_on_from(contents.state()?, &mut training)?;
-        }
+        let mut training = self.training()?;
+        let contents = self.contents(&mut training)?;
         let (instance, own) = self.server(&training)?;
         if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
             return Ok(());
         }
+        let end = |limit| Instant::now().checked_add(limit);
+        training.deadline = self.time_limit.and_then(end);
         if contents.is_none() && needs_filter(&training) {
-            if let Some(filter) = training.of_filter()? {
-                make_folder(&filter.out)?;
-                let contents = filter.check()?;
-                learn(&instance, &filter, contents, &stop)?;
-            }
-            training.resume = true;
-            if stop.load(Relaxed) || training.of_filter()?.is_some() {
-                tracing::warn!("the filter is not learned yet: continue with --resume");
+            learn_filter(&instance, &training, &stop)?;
+            if stop.load(Relaxed) {
                 return Ok(());
             }
-            let limit = &mut training.time_limit;
-            *limit = limit.map(|limit| limit.saturating_sub(start.elapsed()));
             let filter = training.filter_folder().join(CHECKPOINT);
             training.learned = Learned::read([&*filter], &training.device)?;
             training.resume = false;
         }
-        learn(&instance, &training, contents, &stop)
+        learn(&instance, &training, contents, &stop).map(drop)
     }
 
     fn training(&self) -> Result<TrainingSpec> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
-        let estimator = self.estimator.unwrap_or(config.decisions.estimator);
-        config.decisions.estimator = estimator;
-        let is_of_decisions = self.estimator.is_some() || self.checkpoint.is_some();
-        ensure!(
-            config.learner == LearnerKind::Decisions || !is_of_decisions,
-            "--estimator, --checkpoint: expected them with --learner decisions alone, got another learner"
-        );
+        let decisions = &mut config.decisions;
+        decisions.estimator = self.estimator.unwrap_or(decisions.estimator);
         let n_worlds = self.worlds.unwrap_or(match config.learner {
             LearnerKind::Autoencoder => 1,
             _ => 16,
         });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
-        make_folder(&self.out)?;
         let steps = match config.learner {
             LearnerKind::Decisions => config.decisions.steps,
             _ => 0,
         };
         let device = self.device.open()?;
-        let learned = Learned::read(self.checkpoint.as_deref(), &device)?;
-        ensure!(
-            self.checkpoint.is_none() || learned.filter(estimator).is_some(),
-            "--checkpoint: expected a filter for the belief {}, got another",
-            estimator.label()
-        );
+        let learned = self.learned(&config, &device)?;
+        make_folder(&self.out)?;
         Ok(TrainingSpec {
             worlds: self.world..last,
             takeover: self.takeover,
             steps: self.steps.unwrap_or(steps),
-            time_limit: self.time_limit,
+            deadline: None,
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
@@ -161,37 +138,77 @@ impl TrainCommand {
         })
     }
 
-    /// Goes on with decisions where their checkpoint left them: on its belief, for the steps that are left.
-    fn go_on_from(&self, saved: SavedDecisions, training: &mut TrainingSpec) -> Result<()> {
-        let own = saved.estimator;
+    /// The filter that was given for decisions; refuses what would be ignored.
+    fn learned(&self, config: &AgentConfig, device: &Device) -> Result<Learned> {
+        let flags = [
+            ("--estimator", self.estimator.is_some()),
+            ("--checkpoint", self.checkpoint.is_some()),
+        ];
+        for (flag, is_given) in flags {
+            ensure!(
+                !is_given || config.learner == LearnerKind::Decisions,
+                "{flag}: expected none, or --learner decisions"
+            );
+        }
+        let learned = Learned::read(self.checkpoint.as_deref(), device)?;
+        let estimator = config.decisions.estimator;
+        if let Some(path) = &self.checkpoint {
+            ensure!(
+                learned.filter(estimator).is_some(),
+                "--checkpoint {}: expected a filter on which {} acts, got another",
+                path.display(),
+                estimator.label()
+            );
+        }
+        Ok(learned)
+    }
+
+    /// What to go on from, if that is asked for; `None` also if it is a filter, before decisions on its belief.
+    /// Decisions go on with the estimator that they began with, for the steps that are left.
+    fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
+        if training.config.learner != LearnerKind::Decisions || !self.resume {
+            return training.check();
+        }
+        if let Some(estimator) = training.estimator_of_filter()? {
+            ensure!(
+                !self.freeze,
+                "--freeze: expected a checkpoint of decisions in {}, got one of their filter alone",
+                self.out.display()
+            );
+            self.go_on_with(estimator, training)?;
+            return Ok(None);
+        }
+        let contents = training.check()?;
+        if let Some(contents) = &contents {
+            let saved: SavedDecisions = contents.state()?;
+            self.go_on_with(saved.estimator, training)?;
+            let all = training.config.decisions.steps;
+            if self.steps.is_none() && !self.freeze && all > 0 {
+                training.steps = all.saturating_sub(saved.world_steps);
+                ensure!(
+                    training.steps > 0,
+                    "--steps: expected a number, as the {all} of the settings are done"
+                );
+            }
+        }
+        Ok(contents)
+    }
+
+    fn go_on_with(&self, estimator: EstimatorKind, training: &mut TrainingSpec) -> Result<()> {
+        let (expected, got) = (estimator, self.estimator.unwrap_or(estimator));
         ensure!(
-            self.estimator.is_none_or(|estimator| estimator == own),
-            "--estimator: expected that of the checkpoint, {}, got {}",
-            own.label(),
-            training.config.decisions.estimator.label()
+            got == expected,
+            "--estimator: expected {} as in the checkpoint, got {}",
+            expected.label(),
+            got.label()
         );
         ensure!(
             self.checkpoint.is_none(),
-            "--checkpoint: expected none with --resume, as the checkpoint of --out has its filter"
+            "--checkpoint: expected none beside --resume, which goes on with the filter of {}",
+            self.out.display()
         );
-        training.config.decisions.estimator = own;
-        if self.steps.is_none() && !self.freeze {
-            training.steps = training.steps.saturating_sub(saved.world_steps);
-            ensure!(
-                training.steps > 0,
-                "--resume: all {} steps of decisions are made: expected --steps with more",
-                saved.world_steps
-            );
-        }
+        training.config.decisions.estimator = estimator;
         Ok(())
-    }
-
-    /// Whether a training of decisions was left while its filter was learned.
-    fn goes_on_with_filter(&self, training: &TrainingSpec) -> bool {
-        !self.freeze
-            && needs_filter(training)
-            && training.filter_folder().join(CHECKPOINT).exists()
-            && !training.out.join(CHECKPOINT).exists()
     }
 
     /// The server, and itself if it was started: dropped, it stops.
@@ -211,8 +228,8 @@ impl TrainCommand {
         });
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        let decisions = &training.config.decisions;
-        let decides = decides(training);
+        let (learner, decisions) = (training.config.learner, &training.config.decisions);
+        let decides = learner == LearnerKind::Decisions;
         // Who learns a model does not look at it, and could not.
         let reveals = (decides && decisions.estimator.knows_model()).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
@@ -226,23 +243,35 @@ impl TrainCommand {
     }
 }
 
-fn decides(training: &TrainingSpec) -> bool {
-    training.config.learner == LearnerKind::Decisions
-}
-
 /// Whether decisions are to be learned on the belief of a filter that is yet to be learned.
 fn needs_filter(training: &TrainingSpec) -> bool {
     let estimator = training.config.decisions.estimator;
-    decides(training) && estimator.is_learned() && training.learned.filter(estimator).is_none()
+    training.config.learner == LearnerKind::Decisions
+        && estimator.is_learned()
+        && training.learned.filter(estimator).is_none()
 }
 
-/// Trains, and says what that gave.
+/// Learns the filter whose belief decisions are to be learned on, unless that is done.
+fn learn_filter(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
+    let Some(filter) = training.of_filter()? else {
+        return Ok(());
+    };
+    make_folder(&filter.out)?;
+    let n_steps = learn(instance, &filter, filter.check()?, stop)?;
+    ensure!(
+        n_steps >= filter.steps || stop.load(Relaxed),
+        "--time-limit: the filter is not learned yet: continue with --resume"
+    );
+    Ok(())
+}
+
+/// Trains, says what that gave, and returns the world steps that were acted.
 fn learn(
     instance: &Instance,
     training: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
-) -> Result<()> {
+) -> Result<u64> {
     let kind = training.config.learner;
     tracing::info!(learner = ?kind, steps = training.steps, out = %training.out.display(), "learning");
     let summary = train(instance, training, contents, stop)?;
@@ -259,5 +288,5 @@ fn learn(
     if summary.steps > 0 && !training.freeze {
         draw_training(&training.out)?;
     }
-    Ok(())
+    Ok(summary.steps)
 }

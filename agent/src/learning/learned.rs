@@ -62,33 +62,25 @@ impl Learned {
         Ok(())
     }
 
-    /// A filter; returns whether there was one before, unless decisions brought the same.
+    /// A filter; returns whether there was another before: decisions bring the one that they were learned on.
     fn add_filter(&mut self, model: LearnedModel) -> bool {
-        let is_own = model.tables.dimensions.sees_own_state;
-        let slot = if is_own {
+        let slot = if model.tables.dimensions.sees_own_state {
             &mut self.own_filter
         } else {
             &mut self.filter
         };
-        let is_same = self.decisions.is_some() && slot.as_ref() == Some(&model);
-        slot.replace(model).is_some() && !is_same
+        let is_other = slot.as_ref().is_some_and(|filter| *filter != model);
+        *slot = Some(model);
+        is_other
     }
 
     /// Decisions, with what their belief's filter learned; returns whether there were some before.
     fn add_decisions(&mut self, contents: &Contents) -> Result<bool> {
         let (decisions, model) = LearnedDecisions::read(contents)?;
         if let Some(model) = model {
-            let (filter, kind) = if decisions.estimator.sees_own_state() {
-                (&mut self.own_filter, fit::OWN_KIND)
-            } else {
-                (&mut self.filter, fit::KIND)
-            };
-            let is_other = filter
-                .replace(model.clone())
-                .is_some_and(|filter| filter != model);
             ensure!(
-                !is_other,
-                "expected one {kind}, got two: that of the decisions, and another"
+                !self.add_filter(model),
+                "expected one filter, got two: that of the decisions, and another"
             );
         }
         Ok(self.decisions.replace(decisions).is_some())

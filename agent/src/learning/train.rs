@@ -1,7 +1,7 @@
 //! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
-//! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is read only for decisions on its belief. One message steps all robots.
+//! The learner is told the grid, the number of observations and each path's reward and frame; the model that a server
+//! may reveal is read only for decisions on the belief of a known model. One message steps all robots.
 //! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
 
 mod events;
@@ -57,8 +57,7 @@ pub fn train(
     stop: &AtomicBool,
 ) -> Result<TrainSummary> {
     let mut training_loop = TrainingLoop::attach(instance, spec, contents)?;
-    let deadline = spec.time_limit.map(|limit| Instant::now() + limit);
-    let outcome = training_loop.act(spec, stop, deadline);
+    let outcome = training_loop.act(spec, stop);
     let saved = training_loop.save(spec);
     training_loop.summary.times = training_loop.learner.times();
     match (outcome, saved) {
@@ -101,6 +100,13 @@ impl TrainingLoop {
         contents: Option<Contents>,
     ) -> Result<Self> {
         let place = spec.out.join(CHECKPOINT);
+        if let Some(contents) = &contents
+            && toml::to_string(&spec.config)? != contents.settings
+        {
+            tracing::warn!(
+                "settings: other than the checkpoint was trained with; these hold from here on"
+            );
+        }
         let connection = connect(instance)?;
         let claim = Claim {
             robots: spec.robots(connection.info())?,
@@ -144,13 +150,8 @@ impl TrainingLoop {
         })
     }
 
-    fn act(
-        &mut self,
-        spec: &TrainingSpec,
-        stop: &AtomicBool,
-        deadline: Option<Instant>,
-    ) -> Result<()> {
-        let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
+    fn act(&mut self, spec: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
+        let is_over = || spec.deadline.is_some_and(|end| Instant::now() >= end);
         let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();

@@ -1,6 +1,6 @@
 //! What each policy does, in a line.
 
-use super::named::{Choice, EstimatorKind, PlannerKind, Policy};
+use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy};
 use emberwatch_belief::planning::objective::Target;
 use emberwatch_belief::planning::options::OPTIONS;
 use protocol::Model;

@@ -1,199 +1,12 @@
-//! What a policy is, and policies by name.
+//! Policies by name: the ladder of the benchmark, and all others.
 
+use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
 use anyhow::{Context, Result, bail};
-use emberwatch_belief::planning::objective::{BEAM_BONUS, Objective, Target};
-use emberwatch_belief::planning::options::{OPTIONS, PathOption};
+use emberwatch_belief::planning::objective::{Objective, Target};
+use emberwatch_belief::planning::options::OPTIONS;
 use protocol::Model;
-use serde::{Deserialize, Serialize};
-use std::str::FromStr;
-
-/// In settings and checkpoints by [`EstimatorKind::label`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(into = "&'static str", try_from = "String")]
-pub enum EstimatorKind {
-    None,
-    /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
-    KnownModel,
-    /// The same, whose corrections reach the neighbours of visited cells.
-    Spatial,
-    /// A Bayes filter with learned parameters.
-    Learned,
-    /// The same, whose corrections reach the neighbours of visited cells.
-    LearnedSpatial,
-    /// [`Self::Learned`] with a kernel for each state that a cell itself can be in.
-    LearnedOwn,
-    /// [`Self::LearnedSpatial`] with a kernel for each state that a cell itself can be in.
-    LearnedOwnSpatial,
-    /// The paper's dynamic autoencoder (sections III.B and III.C).
-    Autoencoder,
-    /// The hidden state X_k, predicted one step ahead: an oracle.
-    Truth,
-    /// The hidden state X_{k+1} that the path will meet: a clairvoyant.
-    NextTruth,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum PlannerKind {
-    /// Uniform moves: the paper's baseline.
-    RandomWalk,
-    /// The best of many random paths (paper section III.D).
-    Shooting,
-    Beam,
-    /// Beam search over several paths, of which the first is flown.
-    BeamAhead,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub struct Policy {
-    /// Its name in commands, tables and files.
-    pub name: String,
-    pub estimator: EstimatorKind,
-    pub planner: PlannerKind,
-    pub objective: Objective,
-    pub choice: Choice,
-}
-
-/// What says what each path is for.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Choice {
-    /// The policy's objective, always.
-    Objective,
-    /// A DQN on the autoencoder's hidden vector, among objectives (paper section III.E).
-    Network,
-    /// One option, always.
-    Option(&'static PathOption),
-    /// The rule by hand, among options.
-    Rule,
-    /// A DQN that scores options by their features.
-    Scorer,
-}
-
-impl EstimatorKind {
-    /// Those whose beliefs options are planned on, with what names of policies begin with.
-    pub const FAMILIES: [(&'static str, Self); 7] = [
-        ("known", Self::KnownModel),
-        ("spatial", Self::Spatial),
-        ("learned", Self::Learned),
-        ("learned_spatial", Self::LearnedSpatial),
-        ("learned_own", Self::LearnedOwn),
-        ("learned_own_spatial", Self::LearnedOwnSpatial),
-        ("oracle", Self::Truth),
-    ];
-
-    /// Whether its kernels see the cell's own state.
-    pub fn sees_own_state(self) -> bool {
-        matches!(self, Self::LearnedOwn | Self::LearnedOwnSpatial)
-    }
-
-    /// Whether its corrections reach the neighbours of visited cells.
-    pub fn is_spatial(self) -> bool {
-        matches!(
-            self,
-            Self::Spatial | Self::LearnedSpatial | Self::LearnedOwnSpatial
-        )
-    }
-
-    pub fn knows_model(self) -> bool {
-        matches!(self, Self::KnownModel | Self::Spatial)
-    }
-
-    /// Whether its parameters, and so the meaning of its states, were learned.
-    pub fn is_learned(self) -> bool {
-        matches!(
-            self,
-            Self::Learned
-                | Self::LearnedSpatial
-                | Self::LearnedOwn
-                | Self::LearnedOwnSpatial
-                | Self::Autoencoder
-        )
-    }
-
-    /// Whether frames change its belief.
-    pub fn sees_frames(self) -> bool {
-        !matches!(self, Self::None | Self::Truth | Self::NextTruth)
-    }
-
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::KnownModel => "known_model",
-            Self::Spatial => "spatial_filter",
-            Self::Learned => "learned_filter",
-            Self::LearnedSpatial => "learned_spatial_filter",
-            Self::LearnedOwn => "learned_own_filter",
-            Self::LearnedOwnSpatial => "learned_own_spatial_filter",
-            Self::Autoencoder => "autoencoder",
-            Self::Truth => "truth",
-            Self::NextTruth => "next_truth",
-        }
-    }
-}
-
-impl From<EstimatorKind> for &'static str {
-    fn from(kind: EstimatorKind) -> Self {
-        kind.label()
-    }
-}
-
-impl FromStr for EstimatorKind {
-    type Err = String;
-
-    /// One on whose belief decisions can be learned, from frames alone.
-    fn from_str(name: &str) -> Result<Self, String> {
-        let kinds = Self::FAMILIES.map(|(_, kind)| kind).into_iter();
-        let mut kinds = kinds.filter(|kind| *kind != Self::Truth);
-        kinds
-            .clone()
-            .find(|kind| kind.label() == name)
-            .ok_or_else(|| {
-                let names: Vec<&str> = kinds.by_ref().map(Self::label).collect();
-                format!("expected one of {}, got {name:?}", names.join(", "))
-            })
-    }
-}
-
-impl TryFrom<String> for EstimatorKind {
-    type Error = String;
-
-    fn try_from(name: String) -> Result<Self, String> {
-        name.parse()
-    }
-}
-
-impl PlannerKind {
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::RandomWalk => "random_walk",
-            Self::Shooting => "shooting",
-            Self::Beam => "beam",
-            Self::BeamAhead => "beam_ahead",
-        }
-    }
-}
 
 impl Policy {
-    /// A policy with its planner's objective. Where states are learned, the agent puts the one that pays most in the
-    /// place of the target's.
-    pub fn new(name: &str, estimator: EstimatorKind, planner: PlannerKind, target: Target) -> Self {
-        let objective = match planner {
-            // The authors' for shooting; for beam search hardly any bonus.
-            PlannerKind::Shooting if target != Target::Coverage => Objective::paper(target),
-            PlannerKind::Beam | PlannerKind::BeamAhead => Objective {
-                coverage_bonus: BEAM_BONUS,
-                ..Objective::new(target)
-            },
-            PlannerKind::Shooting | PlannerKind::RandomWalk => Objective::new(target),
-        };
-        Self {
-            name: name.into(),
-            estimator,
-            planner,
-            objective,
-            choice: Choice::Objective,
-        }
-    }
-
     /// The policy of a name under a model.
     pub fn named(name: &str, model: &Model) -> Result<Self> {
         let all = Self::all(model);
@@ -232,9 +45,9 @@ impl Policy {
 
     /// All policies of a model: the ladder, then the others.
     pub fn all(model: &Model) -> Vec<Self> {
-        use EstimatorKind::*;
+        use EstimatorKind::{KnownModel, NextTruth};
         use PlannerKind::{Beam, BeamAhead, Shooting};
-        let (target, states) = (Target::State(model.target_state()), model.state_names());
+        let target = Target::State(model.target_state());
         let mut all = Self::ladder(model);
         all.extend([
             Self::new("beam_explore", KnownModel, Beam, Target::Entropy),
@@ -242,45 +55,52 @@ impl Policy {
             Self::new("clairvoyant_shooting", NextTruth, Shooting, target),
             Self::new("clairvoyant_ahead", NextTruth, BeamAhead, target),
         ]);
-        for (family, estimator) in [
-            ("learned", Learned),
-            ("learned_spatial", LearnedSpatial),
-            ("learned_own", LearnedOwn),
-            ("learned_own_spatial", LearnedOwnSpatial),
-        ] {
-            for planner in [Shooting, Beam] {
+        let families = || EstimatorKind::FAMILIES.into_iter();
+        for (family, estimator) in families().filter(|(_, estimator)| estimator.is_learned()) {
+            all.extend([Shooting, Beam].map(|planner| {
                 let name = format!("{family}_{}", planner.label());
-                all.push(Self::new(&name, estimator, planner, target));
-            }
+                Self::new(&name, estimator, planner, target)
+            }));
         }
-        let families = EstimatorKind::FAMILIES.into_iter();
-        all.extend(families.flat_map(|(family, estimator)| {
-            let mut policies = Self::of_options(family, estimator, target);
-            // That one is in the ladder.
-            policies.retain(|policy| estimator != Truth || policy.is_option());
-            policies
-        }));
-        all.extend([
-            Self::new(
-                "autoencoder_explore",
-                Autoencoder,
-                Shooting,
-                Target::Entropy,
-            ),
-            Self::new("autoencoder_exploit", Autoencoder, Shooting, target),
+        all.extend(
+            families().flat_map(|(family, estimator)| Self::of_options(family, estimator, target)),
+        );
+        all.extend(Self::of_autoencoder(target));
+        all.extend(Self::of_states(model));
+        all
+    }
+
+    fn of_autoencoder(target: Target) -> [Self; 4] {
+        use PlannerKind::{Beam, Shooting};
+        let policy =
+            |name, planner, target| Self::new(name, EstimatorKind::Autoencoder, planner, target);
+        [
+            policy("autoencoder_explore", Shooting, Target::Entropy),
+            policy("autoencoder_exploit", Shooting, target),
             Self {
                 choice: Choice::Network,
-                ..Self::new("autoencoder_policy", Autoencoder, Shooting, target)
+                ..policy("autoencoder_policy", Shooting, target)
             },
-            Self::new("autoencoder_beam", Autoencoder, Beam, target),
-        ]);
-        let of_state = |planner: PlannerKind, state: usize| {
-            let name = format!("{}_{}", planner.label(), states[state]);
-            Self::new(&name, KnownModel, planner, Target::State(state))
+            policy("autoencoder_beam", Beam, target),
+        ]
+    }
+
+    /// Of each state one on the known model, beside those of the ladder.
+    fn of_states(model: &Model) -> impl Iterator<Item = Self> {
+        let of_state = |planner: PlannerKind, state: usize, name: &str| {
+            let name = format!("{}_{name}", planner.label());
+            Self::new(
+                &name,
+                EstimatorKind::KnownModel,
+                planner,
+                Target::State(state),
+            )
         };
-        all.push(of_state(Shooting, model.target_state()));
-        all.extend((0..states.len()).map(|state| of_state(Beam, state)));
-        all
+        let (target, states) = (model.target_state(), model.state_names());
+        let shooting = of_state(PlannerKind::Shooting, target, &states[target]);
+        let beam = states.into_iter().enumerate();
+        let beam = beam.map(move |(state, name)| of_state(PlannerKind::Beam, state, &name));
+        std::iter::once(shooting).chain(beam)
     }
 
     /// The benchmark's ladder under a model, from the least to the most informed.
@@ -360,22 +180,6 @@ impl Policy {
         all.filter(is_on).collect()
     }
 
-    /// Whether it flies one option, or goes by the rule, on a belief.
-    pub fn is_option(&self) -> bool {
-        let is_rule = self.choice == Choice::Rule && self.estimator != EstimatorKind::Truth;
-        is_rule || matches!(self.choice, Choice::Option(_))
-    }
-
-    /// Whether a DQN decides.
-    pub fn is_decided(&self) -> bool {
-        matches!(self.choice, Choice::Network | Choice::Scorer)
-    }
-
-    /// Whether it acts on what `train` learned.
-    pub fn needs_checkpoint(&self) -> bool {
-        self.is_decided() || self.estimator.is_learned()
-    }
-
     /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
     /// state, then `entropy`; each named by its target, with the bonus of `shooting_*` and `beam_*`.
     pub fn choices(estimator: EstimatorKind, planner: PlannerKind, states: &[String]) -> Vec<Self> {
@@ -390,13 +194,6 @@ impl Policy {
         let states = numbered_states(n_states);
         Self::choices(EstimatorKind::Autoencoder, PlannerKind::Shooting, &states)
     }
-}
-
-/// Names of states that were learned.
-pub fn numbered_states(n_states: usize) -> Vec<String> {
-    (0..n_states)
-        .map(|state| format!("state {state}"))
-        .collect()
 }
 
 fn unknown(name: &str, expected: &[&str]) -> String {

@@ -207,10 +207,10 @@ impl Agent {
         Some(score(self.estimator.belief(), &likelihood, frame))
     }
 
-    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for upper bounds that must be told it.
+    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for oracles, which must be told it.
     ///
     /// # Errors
-    /// Also if an upper bound is not told. The belief is then as it was.
+    /// Also if an oracle is not told. The belief is then as it was.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
         self.estimator.correct(frame)?;
         if let Some(told) = self.estimator.told() {
@@ -240,7 +240,7 @@ impl Agent {
         }
     }
 
-    /// Tells an upper bound the state X_{k+1} that its next path will meet; others ignore it.
+    /// Tells an oracle the state X_{k+1} that its next path will meet; others ignore it.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
         self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }

@@ -44,7 +44,7 @@ pub trait Estimator: Send {
         None
     }
 
-    /// An upper bound, which must be told the hidden states.
+    /// An oracle, which must be told the hidden states.
     fn told(&mut self) -> Option<&mut dyn Told> {
         None
     }

@@ -51,8 +51,7 @@ pub const OPTIONS: [PathOption; 8] = [
 /// Numbers that describe an option: see [`feature_names`].
 pub const N_FEATURES: usize = 18 + OPTIONS.len();
 
-/// Rise in a cell's worth per cell nearer to the goal: over a path, nearer cells outweigh what lies aside, so the robot
-/// goes there by the way that promises most.
+/// Rise in a cell's worth per cell nearer to the goal, so that over a path nearer cells outweigh what lies aside.
 const SLOPE: f32 = 0.3;
 
 /// Rows and columns around the goal's centre between which nothing draws the robot.

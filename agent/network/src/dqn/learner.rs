@@ -105,7 +105,7 @@ impl DqnShape {
     }
 
     /// Candidates, each with numbers of its own, of which the network gives the candidate's value.
-    pub fn of_candidates(n_inputs: usize, n_candidates: usize) -> Self {
+    pub const fn of_candidates(n_inputs: usize, n_candidates: usize) -> Self {
         Self {
             n_inputs,
             n_outputs: 1,

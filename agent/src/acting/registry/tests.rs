@@ -165,6 +165,30 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
 }
 
 #[test]
+fn decisions_are_planned_with_the_beam_that_they_were_learned_with() {
+    let mut config = config(BasisKind::Predictor);
+    let scorer = Dqn::new(config.decisions.settings(), SHAPE, 0);
+    let learned = Learned {
+        decisions: Some(LearnedDecisions {
+            scorer: Arc::new(scorer),
+            estimator: EstimatorKind::KnownModel,
+            basis: BasisKind::Predictor,
+            beam_width: 30,
+        }),
+        ..Learned::default()
+    };
+    let mut plan = |policy, width| {
+        config.decisions.beam_width = width;
+        let mut agent = agent(policy, &config, &learned).expect("an agent");
+        agent.correct(&world(0).1, None).expect("possible");
+        agent.predict();
+        agent.plan(&[ROBOT], 0)
+    };
+    assert_ne!(plan("known_coverage", 1), plan("known_coverage", 30));
+    assert_eq!(plan("known_policy", 1), plan("known_policy", 30));
+}
+
+#[test]
 fn a_network_decides_on_what_it_was_learned_with() {
     let learned = network(BasisKind::Predictor, |_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");

@@ -6,13 +6,14 @@ use crate::learning::learned::Learned;
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit;
 use crate::learning::learners::{Learner, decisions, network};
+use crate::policy::EstimatorKind;
 use ::network::Device;
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::Instant;
 
 /// The checkpoint's name in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -24,8 +25,8 @@ pub struct TrainingSpec {
     pub takeover: bool,
     /// World steps to act for, of all worlds together; 0: until stopped.
     pub steps: u64,
-    /// Time to act for; `None`: until stopped.
-    pub time_limit: Option<Duration>,
+    /// When to end, with a filter that is learned first too; `None`: until stopped.
+    pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
     pub freeze: bool,
@@ -61,11 +62,6 @@ impl TrainingSpec {
             return Ok(None);
         }
         let (_, contents) = checkpoint::read(&place, &[kind])?;
-        if toml::to_string(&self.config)? != contents.settings {
-            tracing::warn!(
-                "settings: other than the checkpoint was trained with; these hold from here on"
-            );
-        }
         Ok(Some(contents))
     }
 
@@ -87,6 +83,19 @@ impl TrainingSpec {
         };
         filter.steps = decisions.filter_steps.saturating_sub(learned);
         Ok((filter.steps > 0).then_some(filter))
+    }
+
+    /// Whose belief decisions are to be learned on, if their training was left while its filter was learned.
+    pub fn estimator_of_filter(&self) -> Result<Option<EstimatorKind>> {
+        let place = self.filter_folder().join(CHECKPOINT);
+        if self.out.join(CHECKPOINT).exists() || !place.exists() {
+            return Ok(None);
+        }
+        let (_, contents) = checkpoint::read(&place, &[fit::KIND, fit::OWN_KIND])?;
+        let settings = contents.settings();
+        let settings = settings.with_context(|| format!("checkpoint {}", place.display()))?;
+        let estimator = settings.decisions.estimator;
+        Ok(estimator.is_learned().then_some(estimator))
     }
 
     /// Where [`Self::of_filter`] leaves its checkpoint.

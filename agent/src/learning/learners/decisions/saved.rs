@@ -20,17 +20,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// What a decision is made on, and among.
-pub const SHAPE: DqnShape = DqnShape {
-    n_inputs: N_FEATURES,
-    n_outputs: 1,
-    n_candidates: OPTIONS.len(),
-};
+pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
 /// More updates than a step of all worlds earns.
 const MOST_EARNED: f64 = 2e6;
 
-/// Steps for which no option is held longer: the limit of `longest_hold`.
-const MOST_HELD: u64 = 1000;
+/// Longest time for which an option is held, steps.
+const LONGEST_HOLD: u64 = 1000;
 
 /// Before the names of the filter's tensors.
 const FILTER: &str = "filter.";
@@ -170,10 +166,18 @@ impl SavedRun {
             check_numbers("worlds.last", features, N_FEATURES)?;
             check_numbers("worlds.last", &[*reward], 1)?;
         }
-        let (most, got) = (MOST_HELD, self.held.n_steps);
-        check(got <= most, "worlds.held", format!("at most {most}"), got)?;
-        let (most, got) = (OPTIONS.len(), self.held.option);
-        check(got < most, "worlds.held", format!("less than {most}"), got)
+        let Held { option, n_steps } = self.held;
+        let expected = format!(
+            "an option below {}, for at most {LONGEST_HOLD} steps",
+            OPTIONS.len()
+        );
+        let fits = option < OPTIONS.len() && n_steps <= LONGEST_HOLD;
+        check(
+            fits,
+            "worlds.held",
+            expected,
+            format!("{option} for {n_steps}"),
+        )
     }
 }
 
@@ -193,6 +197,8 @@ pub(super) fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = Named
 mod tests {
     use super::*;
     use crate::config::AgentConfig;
+    use protocol::Frame;
+    use protocol::message::{RobotResult, WorldResult};
 
     #[test]
     fn what_is_wrong_with_a_checkpoint_is_named() {
@@ -229,5 +235,31 @@ mod tests {
             "dqn.n_updates: expected at most",
         );
         refused(|saved| saved.earned = f64::NAN, "earned: expected 0 to");
+    }
+
+    #[test]
+    fn an_option_is_held_for_a_time_that_settings_may_have() {
+        let shape = Shape::new(2, 3).expect("test shape");
+        let observation = Observation {
+            world: WorldResult::default(),
+            robot: RobotResult::default(),
+            frame: Frame::empty(shape),
+        };
+        let dqn = Dqn::new(AgentConfig::default().decisions.settings(), SHAPE, 3);
+        let held = |option, n_steps| {
+            let run = SavedRun {
+                place: place(&observation),
+                frame: observation.frame.as_bytes().to_vec(),
+                belief: Vec::new(),
+                estimate: None,
+                memory: Memory::new(shape),
+                last: None,
+                track: dqn.track(),
+                held: Held { option, n_steps },
+            };
+            run.check(3, shape).is_ok()
+        };
+        assert!(held(OPTIONS.len() - 1, 1000));
+        assert!(!held(OPTIONS.len(), 1) && !held(0, 1001));
     }
 }

@@ -1,0 +1,217 @@
+//! What a policy is: a belief, a planner, an objective, and what chooses.
+
+use emberwatch_belief::planning::objective::{BEAM_BONUS, Objective, Target};
+use emberwatch_belief::planning::options::PathOption;
+use serde::{Deserialize, Serialize};
+use std::str::FromStr;
+
+/// In settings and checkpoints by [`EstimatorKind::label`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(into = "&'static str", try_from = "String")]
+pub enum EstimatorKind {
+    None,
+    /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
+    KnownModel,
+    /// The same, whose corrections reach the neighbours of visited cells.
+    Spatial,
+    /// A Bayes filter with learned parameters.
+    Learned,
+    /// The same, whose corrections reach the neighbours of visited cells.
+    LearnedSpatial,
+    /// [`Self::Learned`] with a kernel for each state that a cell itself can be in.
+    LearnedOwn,
+    /// [`Self::LearnedSpatial`] with a kernel for each state that a cell itself can be in.
+    LearnedOwnSpatial,
+    /// The paper's dynamic autoencoder (sections III.B and III.C).
+    Autoencoder,
+    /// The hidden state X_k, predicted one step ahead: an oracle.
+    Truth,
+    /// The hidden state X_{k+1} that the path will meet: a clairvoyant.
+    NextTruth,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PlannerKind {
+    /// Uniform moves: the paper's baseline.
+    RandomWalk,
+    /// The best of many random paths (paper section III.D).
+    Shooting,
+    Beam,
+    /// Beam search over several paths, of which the first is flown.
+    BeamAhead,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Policy {
+    /// Its name in commands, tables and files.
+    pub name: String,
+    pub estimator: EstimatorKind,
+    pub planner: PlannerKind,
+    pub objective: Objective,
+    pub choice: Choice,
+}
+
+/// What says what each path is for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Choice {
+    /// The policy's objective, always.
+    Objective,
+    /// A DQN on the autoencoder's hidden vector, among objectives (paper section III.E).
+    Network,
+    /// One option, always.
+    Option(&'static PathOption),
+    /// The rule by hand, among options.
+    Rule,
+    /// A DQN that scores options by their features.
+    Scorer,
+}
+
+impl EstimatorKind {
+    /// Those whose beliefs options are planned on, with what names of policies begin with.
+    pub const FAMILIES: [(&'static str, Self); 7] = [
+        ("known", Self::KnownModel),
+        ("spatial", Self::Spatial),
+        ("learned", Self::Learned),
+        ("learned_spatial", Self::LearnedSpatial),
+        ("learned_own", Self::LearnedOwn),
+        ("learned_own_spatial", Self::LearnedOwnSpatial),
+        ("oracle", Self::Truth),
+    ];
+
+    /// Whether its kernels see the cell's own state.
+    pub fn sees_own_state(self) -> bool {
+        matches!(self, Self::LearnedOwn | Self::LearnedOwnSpatial)
+    }
+
+    /// Whether its corrections reach the neighbours of visited cells.
+    pub fn is_spatial(self) -> bool {
+        matches!(
+            self,
+            Self::Spatial | Self::LearnedSpatial | Self::LearnedOwnSpatial
+        )
+    }
+
+    pub fn knows_model(self) -> bool {
+        matches!(self, Self::KnownModel | Self::Spatial)
+    }
+
+    /// Whether its parameters, and so the meaning of its states, were learned.
+    pub fn is_learned(self) -> bool {
+        matches!(
+            self,
+            Self::Learned
+                | Self::LearnedSpatial
+                | Self::LearnedOwn
+                | Self::LearnedOwnSpatial
+                | Self::Autoencoder
+        )
+    }
+
+    /// Whether frames change its belief.
+    pub fn sees_frames(self) -> bool {
+        !matches!(self, Self::None | Self::Truth | Self::NextTruth)
+    }
+
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::KnownModel => "known_model",
+            Self::Spatial => "spatial_filter",
+            Self::Learned => "learned_filter",
+            Self::LearnedSpatial => "learned_spatial_filter",
+            Self::LearnedOwn => "learned_own_filter",
+            Self::LearnedOwnSpatial => "learned_own_spatial_filter",
+            Self::Autoencoder => "autoencoder",
+            Self::Truth => "truth",
+            Self::NextTruth => "next_truth",
+        }
+    }
+}
+
+impl From<EstimatorKind> for &'static str {
+    fn from(kind: EstimatorKind) -> Self {
+        kind.label()
+    }
+}
+
+impl FromStr for EstimatorKind {
+    type Err = String;
+
+    /// One on whose belief decisions can be learned, from frames alone.
+    fn from_str(name: &str) -> Result<Self, String> {
+        let kinds = Self::FAMILIES.map(|(_, kind)| kind).into_iter();
+        let mut kinds = kinds.filter(|kind| *kind != Self::Truth);
+        kinds
+            .clone()
+            .find(|kind| kind.label() == name)
+            .ok_or_else(|| {
+                let names: Vec<&str> = kinds.by_ref().map(Self::label).collect();
+                format!("expected one of {}, got {name:?}", names.join(", "))
+            })
+    }
+}
+
+impl TryFrom<String> for EstimatorKind {
+    type Error = String;
+
+    fn try_from(name: String) -> Result<Self, String> {
+        name.parse()
+    }
+}
+
+impl PlannerKind {
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::RandomWalk => "random_walk",
+            Self::Shooting => "shooting",
+            Self::Beam => "beam",
+            Self::BeamAhead => "beam_ahead",
+        }
+    }
+}
+
+impl Policy {
+    /// A policy with its planner's objective. Where states are learned, the agent puts the one that pays most in the
+    /// place of the target's.
+    pub fn new(name: &str, estimator: EstimatorKind, planner: PlannerKind, target: Target) -> Self {
+        let objective = match planner {
+            // The authors' for shooting; for beam search hardly any bonus.
+            PlannerKind::Shooting if target != Target::Coverage => Objective::paper(target),
+            PlannerKind::Beam | PlannerKind::BeamAhead => Objective {
+                coverage_bonus: BEAM_BONUS,
+                ..Objective::new(target)
+            },
+            PlannerKind::Shooting | PlannerKind::RandomWalk => Objective::new(target),
+        };
+        Self {
+            name: name.into(),
+            estimator,
+            planner,
+            objective,
+            choice: Choice::Objective,
+        }
+    }
+
+    /// Whether it flies one option, or goes by the rule, on a belief.
+    pub fn is_option(&self) -> bool {
+        let is_rule = self.choice == Choice::Rule && self.estimator != EstimatorKind::Truth;
+        is_rule || matches!(self.choice, Choice::Option(_))
+    }
+
+    /// Whether a DQN decides.
+    pub fn is_decided(&self) -> bool {
+        matches!(self.choice, Choice::Network | Choice::Scorer)
+    }
+
+    /// Whether it acts on what `train` learned.
+    pub fn needs_checkpoint(&self) -> bool {
+        self.is_decided() || self.estimator.is_learned()
+    }
+}
+
+/// Names of states that were learned.
+pub fn numbered_states(n_states: usize) -> Vec<String> {
+    (0..n_states)
+        .map(|state| format!("state {state}"))
+        .collect()
+}
