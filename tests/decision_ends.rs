@@ -62,7 +62,7 @@ fn attach(server: &Server) -> Decider {
         instance: server.instance.clone(),
         worlds: 0..1,
         takeover: false,
-        estimator: EstimatorKind::KnownModel,
+        estimator: EstimatorKind::KNOWN,
         config: AgentConfig::default(),
         learned: Learned::default(),
     };

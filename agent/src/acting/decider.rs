@@ -354,7 +354,7 @@ fn agent_info(task: &Assignment, model: &Model, server: &ServerInfo) -> AgentInf
         max_steps: server.max_steps,
         states: model.state_names(),
         objectives: OPTIONS.iter().map(|option| option.name.into()).collect(),
-        estimator: task.estimator.label().into(),
+        estimator: task.estimator.label(),
         features: feature_names(),
     }
 }

@@ -359,7 +359,7 @@ impl Contestant {
         let n_repeated = tally.n_visited_each - tally.n_visited;
         PolicyRun {
             policy: policy.name.clone(),
-            estimator: policy.estimator.label().into(),
+            estimator: policy.estimator.label(),
             world_seed: world.seed,
             steps,
             mean_reward: mean(tally.reward),

@@ -76,9 +76,9 @@ impl ServeDecisionsCommand {
         let kind = match (self.estimator, &learned.decisions) {
             (Some(kind), _) => kind,
             (None, Some(decisions)) => decisions.estimator,
-            (None, None) if learned.filter.is_some() => EstimatorKind::Learned,
-            (None, None) if learned.own_filter.is_some() => EstimatorKind::LearnedOwn,
-            (None, None) => EstimatorKind::KnownModel,
+            (None, None) if learned.filter.is_some() => EstimatorKind::LEARNED,
+            (None, None) if learned.own_filter.is_some() => EstimatorKind::learned(true),
+            (None, None) => EstimatorKind::KNOWN,
         };
         ensure!(
             !kind.is_learned() || learned.filter(kind).is_some(),

@@ -136,7 +136,7 @@ fn predictions(guide: &str, policies: &[Policy], scores: &[Scores]) -> String {
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];
     for (index, policy) in policies.iter().enumerate() {
-        rows.push((policy.estimator.label().into(), scores(index)));
+        rows.push((policy.estimator.label(), scores(index)));
     }
     for (index, policy) in policies.iter().enumerate().skip(1) {
         let name = format!("{} - known_model", policy.estimator.label());

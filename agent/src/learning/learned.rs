@@ -90,10 +90,8 @@ impl Learned {
 impl Learned {
     pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
         match estimator {
-            EstimatorKind::Learned | EstimatorKind::LearnedSpatial => self.filter.as_ref(),
-            EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
-                self.own_filter.as_ref()
-            }
+            EstimatorKind::Learned { is_own: false, .. } => self.filter.as_ref(),
+            EstimatorKind::Learned { is_own: true, .. } => self.own_filter.as_ref(),
             _ => None,
         }
     }

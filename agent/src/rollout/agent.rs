@@ -302,7 +302,7 @@ impl Agent {
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
-            belief_from: self.policy.estimator.label().into(),
+            belief_from: self.policy.estimator.label(),
             objective: self.aim.clone(),
             states: self.state_names.clone(),
             plan_millis: planning.as_secs_f64() * 1e3,

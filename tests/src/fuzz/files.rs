@@ -172,7 +172,7 @@ fn decisions() -> Contents {
 
 fn base_of_filter() -> Base {
     let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
-    Base::learned(EstimatorKind::Learned, fit.learned(), worlds().shape)
+    Base::learned(EstimatorKind::LEARNED, fit.learned(), worlds().shape)
 }
 
 fn dqn() -> Dqn {

@@ -32,6 +32,17 @@ pub struct SpatialFilter {
     spread: Spread,
 }
 
+/// A filter, whose corrections reach the neighbours of visited cells if their correlations with a state are given.
+pub fn correcting(
+    filter: BayesFilter,
+    neighbours: Option<(usize, Correlations)>,
+) -> Box<dyn Estimator> {
+    match neighbours {
+        Some((state, correlations)) => Box::new(SpatialFilter::new(filter, state, correlations)),
+        None => Box::new(filter),
+    }
+}
+
 impl SpatialFilter {
     /// Spreads the probability of `state`, the one that pays, with correlations learned before, or from nothing.
     ///

@@ -206,7 +206,7 @@ mod tests {
         let dqn = Dqn::new(config.decisions.settings(), SHAPE, 3);
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: EstimatorKind::KnownModel,
+            estimator: EstimatorKind::KNOWN,
             model: None,
             world_steps: 7,
             earned: 0.5,
