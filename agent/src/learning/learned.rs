@@ -6,10 +6,10 @@ use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
 use crate::learning::learners::network;
 use crate::policy::{Choice, EstimatorKind, Policy};
-use ::network::Device;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::Dimensions;
-use protocol::Model;
+use emberwatch_network::Device;
+use emberwatch_protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 

@@ -4,7 +4,7 @@ use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
 use anyhow::{Context, Result, bail};
 use emberwatch_belief::planning::objective::{Objective, Target};
 use emberwatch_belief::planning::options::OPTIONS;
-use protocol::Model;
+use emberwatch_protocol::Model;
 
 impl Policy {
     /// The policy of a name under a model.

@@ -13,8 +13,8 @@ use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+use emberwatch_protocol::Frame;
 use ndarray::Array2;
-use protocol::Frame;
 use std::borrow::Cow;
 
 /// How ages and sums are written. The limit is more than any grid's.

@@ -5,10 +5,10 @@ use crate::learning::learners::Worlds;
 use crate::learning::learners::decisions::SHAPE;
 use crate::learning::learners::filter::fit::FilterFit;
 use crate::learning::learners::network::Progress;
-use ::network::{Device, Dqn, DqnSettings, DqnShape};
 use anyhow::Result;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Grid};
+use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Grid};
 use std::sync::Arc;
 
 const N_MOVES: usize = 6;

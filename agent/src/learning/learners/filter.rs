@@ -19,8 +19,8 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{Plan, Target};
-use protocol::client::Observation;
-use protocol::{Move, path};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::{Move, path};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 

@@ -14,10 +14,10 @@ use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
     BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
 };
-use protocol::client::Observation;
-use protocol::message::{RobotResult, WorldResult};
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
@@ -147,7 +147,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
             };
             vec![path(config, &policy, objective, belief, step)]
         });
-        let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
+        let progress = Progress::first(&worlds(), config, &emberwatch_network::Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check(learner, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);

@@ -6,7 +6,7 @@ use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
-use protocol::{Model, Shape};
+use emberwatch_protocol::{Model, Shape};
 
 /// What keeps the beliefs that decisions are made on, before a world's first frame.
 pub struct Base {
