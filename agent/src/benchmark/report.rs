@@ -12,6 +12,7 @@ mod number;
 mod policy_run;
 mod rewards;
 pub mod statistics;
+pub mod suite;
 pub mod table;
 mod teams;
 pub mod training;

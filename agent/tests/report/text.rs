@@ -294,7 +294,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
          mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
          steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
-         grid_seen_share\n"
+         grid_seen_share,log_likelihood\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();

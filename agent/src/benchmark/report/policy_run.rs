@@ -51,6 +51,8 @@ pub struct PolicyRun {
     pub front_distance: Option<f64>,
     /// Share of the grid that was ever seen.
     pub grid_seen_share: Option<f64>,
+    /// Mean `ln P(y)` of a visited cell under the prediction before the frame, where the estimator predicts frames.
+    pub log_likelihood: Option<f64>,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,
