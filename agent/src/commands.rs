@@ -6,6 +6,7 @@ mod evaluate;
 mod prior;
 mod run;
 mod shared;
+mod suite;
 mod train;
 mod worlds;
 
@@ -14,6 +15,7 @@ pub use decisions::ServeDecisionsCommand;
 pub use evaluate::EvaluateCommand;
 pub use prior::PriorCommand;
 pub use run::RunCommand;
+pub use suite::SuiteCommand;
 pub use train::TrainCommand;
 
 use emberwatch_agent::client::errors::refusal;
