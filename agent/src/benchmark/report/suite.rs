@@ -66,14 +66,17 @@ impl Aggregate {
 }
 
 impl TaskRuns {
-    /// A policy's reward of each world, scaled so that the random walk's mean is 0 and the oracle's 1.
+    /// A policy's reward of each world, scaled so that the random walk's mean is 0 and the oracle's 1; none if these
+    /// are missing, or the oracle's is no higher.
     pub fn scores(&self, policy: &str) -> Vec<f64> {
-        let [floor, ceiling] = [FLOOR, CEILING].map(|policy| self.mean(policy, reward));
-        let (Some(floor), Some(ceiling)) = (floor, ceiling) else {
+        let means = [FLOOR, CEILING].map(|policy| self.mean(policy, reward));
+        let [Some(floor), Some(ceiling)] = means else {
             return Vec::new();
         };
-        let runs = self.of(policy);
-        runs.map(|run| (run.mean_reward - floor) / (ceiling - floor))
+        let score = |run: &PolicyRun| (run.mean_reward - floor) / (ceiling - floor);
+        self.of(policy)
+            .filter(|_| ceiling > floor)
+            .map(score)
             .collect()
     }
 
