@@ -3,6 +3,7 @@
 mod compare;
 mod decisions;
 mod evaluate;
+mod leaderboard;
 mod prior;
 mod run;
 mod shared;
@@ -13,6 +14,7 @@ mod worlds;
 pub use compare::CompareCommand;
 pub use decisions::ServeDecisionsCommand;
 pub use evaluate::EvaluateCommand;
+pub use leaderboard::LeaderboardCommand;
 pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use suite::SuiteCommand;

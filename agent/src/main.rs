@@ -33,6 +33,8 @@ enum Command {
     /// Run policies on the test worlds of tasks: one score for each
     #[command(after_long_help = commands::policies())]
     Suite(commands::SuiteCommand),
+    /// Add an entry to the leaderboard, and make its page
+    Leaderboard(commands::LeaderboardCommand),
     /// Learn a model while acting: checkpoint and metrics
     Train(commands::TrainCommand),
     /// Score a checkpoint beside the known model
@@ -48,6 +50,7 @@ fn main() -> ExitCode {
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
         Command::Suite(command) => command.run(),
+        Command::Leaderboard(command) => command.run(),
         Command::Train(command) => command.run(),
         Command::Evaluate(command) => command.run(),
     };

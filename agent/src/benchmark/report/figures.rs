@@ -77,6 +77,18 @@ pub fn save(path: &Path, svg: &str) -> Result<()> {
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
 /// [`FIRE_CELLS_PER_STEP`].
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
+    let title = "Reward of each policy on the same worlds";
+    draw_bars(path, runs, title, ladder_note(runs), axis_label)
+}
+
+/// Draws a bar a policy, the best at the top, with a mark for each of its runs.
+pub(super) fn draw_bars(
+    path: &Path,
+    runs: &[PolicyRun],
+    title: &str,
+    note: String,
+    axis_label: &str,
+) -> Result<()> {
     ensure!(
         !runs.is_empty(),
         "ladder: expected at least one policy run, got none"
@@ -94,8 +106,8 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
         .collect();
     let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
     let ladder = Ladder {
-        title: "Reward of each policy on the same worlds".into(),
-        note: ladder_note(runs),
+        title: title.into(),
+        note,
         axis: axis_label.into(),
         legend: FAMILIES.into_iter().filter(is_used).collect(),
         bars,

@@ -11,7 +11,7 @@ use std::path::Path;
 pub const ALONE: &str = "alone";
 
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.

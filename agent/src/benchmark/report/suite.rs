@@ -93,7 +93,7 @@ impl TaskRuns {
 
 /// Each policy's score of each task and over all, then how well beliefs predict: a row a policy, a column a task.
 pub fn render_suite(tasks: &[TaskRuns]) -> String {
-    let policies = policies(tasks);
+    let policies = by_score(tasks);
     let names = || tasks.iter().map(|task| task.task.clone());
     let heading = |last: Option<&str>| {
         let last = last.map(String::from);
@@ -103,12 +103,10 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
             .chain(last)
             .collect::<Vec<String>>()
     };
-    let scores = markdown(
-        &heading(Some("score [95 %]")),
-        policies.iter().map(|policy| scores(tasks, policy)),
-    );
+    let rows = policies.iter().cloned().map(|policy| scores(tasks, policy));
+    let scores = markdown(&heading(Some("score [95 %]")), rows);
     let belief = |value: fn(&PolicyRun) -> Option<f64>| {
-        let row = |policy: &&str| {
+        let row = |(policy, _): &(&str, String)| {
             let means: Vec<Option<f64>> =
                 tasks.iter().map(|task| task.mean(policy, value)).collect();
             let cells = || {
@@ -132,44 +130,46 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
     )
 }
 
-/// The cells of a policy's row: its mean score of each task, and over all if it has all.
-fn scores(tasks: &[TaskRuns], policy: &str) -> Vec<String> {
-    let scores: Vec<Vec<f64>> = tasks.iter().map(|task| task.scores(policy)).collect();
-    let mean =
-        |scores: &Vec<f64>| Estimate::of(scores).map_or(NOTHING.into(), |it| number(it.mean, 3));
-    let all = Aggregate::of(&scores).map_or(NOTHING.into(), |Aggregate { mean, low, high }| {
+/// The cells of a policy's row: its mean score of each task, and over all.
+fn scores(tasks: &[TaskRuns], (policy, score): (&str, String)) -> Vec<String> {
+    let mean = |task: &TaskRuns| {
+        Estimate::of(&task.scores(policy)).map_or(NOTHING.into(), |it| number(it.mean, 3))
+    };
+    [policy.to_owned()]
+        .into_iter()
+        .chain(tasks.iter().map(mean))
+        .chain([score])
+        .collect()
+}
+
+/// All policies with their scores over tasks, the highest first; then those that lack a task, by name.
+pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, String)> {
+    let names = tasks
+        .iter()
+        .flat_map(|task| task.runs.iter().map(|run| &*run.policy));
+    let names: BTreeSet<&str> = names.collect();
+    let score = |name: &str| {
+        Aggregate::of(
+            &tasks
+                .iter()
+                .map(|task| task.scores(name))
+                .collect::<Vec<_>>(),
+        )
+    };
+    let mut all: Vec<_> = names.into_iter().map(|name| (name, score(name))).collect();
+    let mean = |score: Option<Aggregate>| score.map_or(f64::NEG_INFINITY, |score| score.mean);
+    all.sort_by(|a, b| mean(b.1).total_cmp(&mean(a.1)));
+    let text = |Aggregate { mean, low, high }| {
         format!(
             "{} [{}, {}]",
             number(mean, 3),
             number(low, 3),
             number(high, 3)
         )
-    });
-    [policy.to_owned()]
-        .into_iter()
-        .chain(scores.iter().map(mean))
-        .chain([all])
-        .collect()
-}
-
-/// All policies, those of the highest score first, then those that lack a task.
-fn policies(tasks: &[TaskRuns]) -> Vec<&str> {
-    let names = tasks
-        .iter()
-        .flat_map(|task| task.runs.iter().map(|run| &*run.policy));
-    let names: BTreeSet<&str> = names.collect();
-    let score = |name: &&str| {
-        let scores: Vec<Vec<f64>> = tasks.iter().map(|task| task.scores(name)).collect();
-        let has_all = scores.iter().all(|scores| !scores.is_empty());
-        if has_all {
-            interquartile_mean(scores.concat())
-        } else {
-            f64::NEG_INFINITY
-        }
     };
-    let mut names: Vec<&str> = names.into_iter().collect();
-    names.sort_by(|a, b| score(b).total_cmp(&score(a)).then(a.cmp(b)));
-    names
+    all.into_iter()
+        .map(|(name, score)| (name, score.map_or(NOTHING.into(), text)))
+        .collect()
 }
 
 fn reward(run: &PolicyRun) -> Option<f64> {
