@@ -1,0 +1,88 @@
+//! Parts of grids, as the network that keeps space takes them.
+
+use crate::unet::ALIGNMENT;
+use protocol::grid::Shape;
+use std::ops::RangeInclusive;
+
+/// Cells that a crop has beyond those to predict, on both sides together: what lies further away says little of them.
+const MARGINS: usize = 24;
+
+/// A part of a grid, with sides that the network's strides divide; it may reach beyond the grid's lower and right edge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Crop {
+    /// The row and column of its first cell.
+    pub first: [usize; 2],
+    /// Rows and columns.
+    pub sides: [usize; 2],
+}
+
+/// The first and the last row of some cells, then their columns.
+pub(crate) type Extent = [RangeInclusive<usize>; 2];
+
+impl Crop {
+    /// The whole of a grid.
+    pub fn whole(shape: Shape) -> Self {
+        let (height, width) = shape.dim();
+        Self {
+            first: [0, 0],
+            sides: [height, width].map(|side| side.next_multiple_of(ALIGNMENT)),
+        }
+    }
+
+    /// The sides of crops that hold cells of any of some extents.
+    pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
+        let whole = Self::whole(shape);
+        [0, 1].map(|axis| {
+            let spans = extents.iter().map(|extent| extent[axis].clone().count());
+            let side = spans.max().unwrap_or(0) + MARGINS;
+            side.next_multiple_of(ALIGNMENT).min(whole.sides[axis])
+        })
+    }
+
+    /// The one of such sides with an extent in its middle, as far as the grid goes.
+    pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
+        let whole = Self::whole(shape);
+        let first = [0, 1].map(|axis| {
+            let middle = (extent[axis].start() + extent[axis].end()).div_ceil(2);
+            let most = whole.sides[axis] - sides[axis];
+            let first = middle.saturating_sub(sides[axis] / 2).min(most);
+            // The strides fall as on the whole grid.
+            first / ALIGNMENT * ALIGNMENT
+        });
+        Self { first, sides }
+    }
+}
+
+/// The extent of some cells by their row-major index, at least one.
+pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize> + Clone) -> Extent {
+    let (_, width) = shape.dim();
+    let axis = |places: &mut dyn Iterator<Item = usize>| {
+        let range = places.fold(usize::MAX..=0, |range, at| {
+            at.min(*range.start())..=at.max(*range.end())
+        });
+        assert!(!range.is_empty(), "cells: expected at least one");
+        range
+    };
+    [
+        axis(&mut cells.clone().map(|cell| cell / width)),
+        axis(&mut cells.map(|cell| cell % width)),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crops_hold_their_cells_with_margins_up_to_the_edges() {
+        let shape = Shape::new(70, 30).expect("test shape");
+        let extents = [extent(shape, [33, 95].into_iter()), [50..=69, 0..=9]];
+        assert_eq!(extents[0], [1..=3, 3..=5]);
+        let sides = Crop::sides(shape, &extents);
+        assert_eq!(sides, [44, 32], "20 rows and margins; the whole width");
+        let first = |extent| Crop::around(shape, sides, extent).first;
+        assert_eq!(first(&extents[0]), [0, 0]);
+        assert_eq!(first(&extents[1]), [28, 0]);
+        assert_eq!(first(&[30..=49, 0..=9]), [16, 0]);
+    }
+}
