@@ -1,8 +1,8 @@
 //! What agents show of their beliefs, to readers of their channel.
 
-use protocol::agent_belief::AgentBelief;
-use protocol::message::AgentHeader;
-use protocol::observer::Observer;
+use emberwatch_protocol::agent_belief::AgentBelief;
+use emberwatch_protocol::message::AgentHeader;
+use emberwatch_protocol::observer::Observer;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, PATIENCE, Program, Server, eventually};

@@ -2,9 +2,9 @@
 
 use crate::commands::{agent, check};
 use crate::trainings::Place;
-use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learners::network::{KIND, SavedNetwork};
-use protocol::Move;
+use emberwatch_agent::learning::checkpoint::{self, Contents};
+use emberwatch_agent::learning::learners::network::{KIND, SavedNetwork};
+use emberwatch_protocol::Move;
 use std::path::Path;
 use tests::harness::{AGENT, Server, fly};
 

@@ -1,7 +1,7 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use agent::policy;
-use protocol::Model;
+use emberwatch_agent::policy;
+use emberwatch_protocol::Model;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, Program, SERVER, SMALL, Server, new_instance, run};

@@ -1,8 +1,8 @@
 //! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
 
 use crate::commands::agent;
-use env_server::world::{Source, World};
-use protocol::{Dynamics, Model, Shape};
+use emberwatch_protocol::{Dynamics, Model, Shape};
+use emberwatch_server::world::{Source, World};
 use std::path::Path;
 use tempfile::TempDir;
 use tests::harness::{Program, Server, repository};

@@ -2,17 +2,17 @@
 //! through the Rust crate and through the Python package.
 
 use crate::python::PythonWire;
-use protocol::Model;
-use protocol::channels::Instance;
-use protocol::control::{CoverageRule, Reply, Request, ServerInfo};
-use protocol::message::Status::{
+use emberwatch_protocol::Model;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::{CoverageRule, Reply, Request, ServerInfo};
+use emberwatch_protocol::message::Status::{
     self, BadMove, Early, Incomplete, Late, LeaseLost, NoLease, NoSuchRobot, NotPermitted,
     UnknownFlags, UnknownOperation, VersionMismatch, WrongLength, WrongPathLength,
 };
-use protocol::message::{
+use emberwatch_protocol::message::{
     ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, StepRequest, VERSION,
 };
-use protocol::payload::split_step_payload;
+use emberwatch_protocol::payload::split_step_payload;
 use tests::harness::{SMALL, Server};
 use tests::wire::{RawClient, Wire, control_header, observe_header, step_body, step_header};
 

@@ -1,13 +1,13 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
-use protocol::channels::{ChannelError, Instance};
-use protocol::client::Claim;
-use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request};
-use protocol::message::{Status, StepRequest};
-use protocol::observer::Observer;
-use protocol::payload::split_step_payload;
-use protocol::{Client, Connection};
+use emberwatch_protocol::channels::{ChannelError, Instance};
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::{Status, StepRequest};
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::{Client, Connection};
 use rustix::process::Signal;
 use std::time::Duration;
 use tests::harness::{

@@ -1,16 +1,16 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
-use agent::acting::decider::{Assignment, Decider};
-use agent::acting::mission::prepare;
-use agent::client::errors;
-use agent::config::AgentConfig;
-use agent::learning::learned::Learned;
-use agent::policy::EstimatorKind;
-use protocol::Client;
-use protocol::channels::{ChannelError, Instance};
-use protocol::client::Claim;
-use protocol::decisions::{Reply, Request};
-use protocol::message::Status;
+use emberwatch_agent::acting::decider::{Assignment, Decider};
+use emberwatch_agent::acting::mission::prepare;
+use emberwatch_agent::client::errors;
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::EstimatorKind;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::channels::{ChannelError, Instance};
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::decisions::{Reply, Request};
+use emberwatch_protocol::message::Status;
 use rustix::process::Signal;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -62,7 +62,7 @@ fn attach(server: &Server) -> Decider {
         instance: server.instance.clone(),
         worlds: 0..1,
         takeover: false,
-        estimator: EstimatorKind::KnownModel,
+        estimator: EstimatorKind::KNOWN,
         config: AgentConfig::default(),
         learned: Learned::default(),
     };

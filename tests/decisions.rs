@@ -1,9 +1,9 @@
 //! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
 
-use protocol::channels::ChannelError;
-use protocol::decisions::{Decision, Reply, Request};
-use protocol::message::{ControlRequest, Status, VERSION};
-use protocol::observer::Observer;
+use emberwatch_protocol::channels::ChannelError;
+use emberwatch_protocol::decisions::{Decision, Reply, Request};
+use emberwatch_protocol::message::{ControlRequest, Status, VERSION};
+use emberwatch_protocol::observer::Observer;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -373,7 +373,7 @@ fn a_model_that_is_not_the_servers_is_refused() {
 
 /// The wildfire, as a sensor sees it that takes smoke for nothing.
 fn model_of_two_observations() -> String {
-    let mut file = protocol::Model::wildfire().file().clone();
+    let mut file = emberwatch_protocol::Model::wildfire().file().clone();
     file.observations.remove(1);
     for state in &mut file.states {
         let smoke = state.observed_as.remove(1);

@@ -1,8 +1,8 @@
 //! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
 
-use protocol::client::{Claim, Observation};
-use protocol::observer::Observer;
-use protocol::{Client, Move};
+use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::{Client, Move};
 use tests::harness::{PATIENCE, Paths, Server, fly, reset};
 
 /// Seeds, one world each.

@@ -1,10 +1,10 @@
 //! Resets, episode ends and coverage, as every client sees them.
 
 use crate::random_robot::fly_at_random;
-use protocol::control::{Reply, Request, WorldInfo};
-use protocol::message::{Status, StepRequest};
-use protocol::payload::split_step_payload;
-use protocol::{Coverage, UNOBSERVED};
+use emberwatch_protocol::control::{Reply, Request, WorldInfo};
+use emberwatch_protocol::message::{Status, StepRequest};
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::{Coverage, UNOBSERVED};
 use tests::harness::{Paths, SMALL, Server, fly, reset, seed};
 use tests::wire::{RawClient, Wire, step_body, step_header};
 

@@ -1,9 +1,9 @@
 //! Observers: what `frames` and `truth` show, to whom, and that nobody waits for them.
 
-use protocol::channels::{FRAME_BUFFER, channel_directory};
-use protocol::message::{FrameHeader, VERSION};
-use protocol::observer::{Observer, Sample};
-use protocol::{Coverage, UNOBSERVED};
+use emberwatch_protocol::channels::{FRAME_BUFFER, channel_directory};
+use emberwatch_protocol::message::{FrameHeader, VERSION};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::{Coverage, UNOBSERVED};
 use tests::harness::{
     PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, path_of, reset,
     robots_of, seen_by, seen_in,

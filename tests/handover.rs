@@ -1,13 +1,13 @@
 //! What the next agent believes: what the last one left, or what the kept frames tell.
 
-use agent::client::left_belief::{leave_belief, left_belief};
+use emberwatch_agent::client::left_belief::{leave_belief, left_belief};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Handover};
-use protocol::control::{LeftPart, Reply, Request};
-use protocol::message::{FrameHeader, Status};
-use protocol::observer::Observer;
-use protocol::payload::split_step_payload;
-use protocol::{Client, Model, Move};
+use emberwatch_protocol::control::{LeftPart, Reply, Request};
+use emberwatch_protocol::message::{FrameHeader, Status};
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::{Client, Model, Move};
 use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, fly, frames_until, path_of, seed};
 use tests::wire::{RawClient, Wire, recall_header, step_body};
 

@@ -3,13 +3,13 @@
 //!
 //! `cargo test -p tests -- --ignored` sends a million messages, and thousands of observers.
 
-use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
-use protocol::client::Claim;
-use protocol::connection::ConnectionError;
-use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
-use protocol::message::{Status, StepRequest};
-use protocol::observer::Observer;
-use protocol::{Client, Connection};
+use emberwatch_protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
+use emberwatch_protocol::message::{Status, StepRequest};
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::{Client, Connection};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use std::time::Duration;
 use tests::attacker::Attacker;

@@ -18,7 +18,7 @@ fn programs_that_are_killed_at_any_moment_leave_nothing_in_the_way_of_others() {
     for instance in &left.instances {
         Server::start_on(instance, FLAGS).program.finish();
     }
-    protocol::cleanup::remove_leftovers().expect("a turn");
+    emberwatch_protocol::cleanup::remove_leftovers().expect("a turn");
     assert_eq!(files_of(&left), Vec::<PathBuf>::new());
 }
 

@@ -1,10 +1,10 @@
 //! Who may act: one holder a robot, ended by release, expiry or takeover; its world stays put.
 
-use protocol::client::Claim;
-use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request};
-use protocol::message::Status;
-use protocol::{Client, Connection, Move};
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::Status;
+use emberwatch_protocol::{Client, Connection, Move};
 use std::time::Duration;
 use tests::harness::{PATIENCE, Paths, SMALL, Server, fly, seed};
 use tests::wire::{RawClient, Wire};

@@ -1,8 +1,8 @@
 //! The protocol byte by byte through the Python package: `wire_driver.py` sends what it is told.
 
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
-use protocol::channels::Instance;
-use protocol::message::{ControlRequest, StepRequest};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::message::{ControlRequest, StepRequest};
 use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::io::{BufRead, BufReader, Write};

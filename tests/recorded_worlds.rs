@@ -2,16 +2,16 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::recording::{read, read_whole, start_recorder, start_replay, stop, truths};
-use agent::client::truth::TruthFeed;
+use emberwatch_agent::client::truth::TruthFeed;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::message::{Status, TruthHeader};
+use emberwatch_protocol::model::Description;
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::recording::Event;
+use emberwatch_protocol::{Client, Connection, Grid, Shape};
 use ndarray::{Array3, ArrayView2, Axis};
 use ndarray_npy::WriteNpyExt;
-use protocol::channels::Instance;
-use protocol::connection::ConnectionError;
-use protocol::message::{Status, TruthHeader};
-use protocol::model::Description;
-use protocol::observer::Sample;
-use protocol::recording::Event;
-use protocol::{Client, Connection, Grid, Shape};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use std::fs::File;
 use tempfile::TempDir;

@@ -1,11 +1,11 @@
 //! Recorders: what they keep, and what they and their files say when something is missing.
 
 use crate::commands::check_table;
-use protocol::channels::Instance;
-use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::{FrameHeader, Header, RobotResult, TruthHeader, VERSION};
-use protocol::observer::{Observer, Sample};
-use protocol::recording::{Event, Reader, Record, RecordingError, Writer};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::{CoverageRule, ServerInfo};
+use emberwatch_protocol::message::{FrameHeader, Header, RobotResult, TruthHeader, VERSION};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError, Writer};
 use rustix::process::Signal;
 use std::fs::File;
 use std::io::Read;

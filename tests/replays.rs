@@ -5,11 +5,11 @@ use crate::recording::{
     frames, new_file, read, read_whole, start_recorder, start_replay, stop, take, truths,
     write_recording,
 };
-use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request};
-use protocol::message::{FrameHeader, Status};
-use protocol::observer::{Observer, Sample};
-use protocol::{Client, Connection};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::{FrameHeader, Status};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::{Client, Connection};
 use rustix::process::Signal;
 use tests::harness::{
     PATIENCE, Paths, SERVER, SMALL, Server, fly, frames_until, new_instance, run, takeover,

@@ -1,10 +1,10 @@
 //! Servers that end: by signal, by kill, and what their agents and successors make of it.
 
+use emberwatch_protocol::channels::{Instance, Ipc, node_config};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::Request;
+use emberwatch_protocol::observer::Observer;
 use iceoryx2::prelude::{CallbackProgression, Service};
-use protocol::channels::{Instance, Ipc, node_config};
-use protocol::connection::ConnectionError;
-use protocol::control::Request;
-use protocol::observer::Observer;
 use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;

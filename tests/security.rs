@@ -2,12 +2,12 @@
 //!
 //! A thread plays the other user, which only root may let it do; elsewhere those tests say so and pass.
 
-use iceoryx2::node::NodeBuilder;
-use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
-use protocol::channels::{
+use emberwatch_protocol::channels::{
     Channel, ChannelError, Instance, Ipc, SHARED_MEMORY, Services, channel_directory, create_node,
 };
-use protocol::observer::Observer;
+use emberwatch_protocol::observer::Observer;
+use iceoryx2::node::NodeBuilder;
+use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::process::{Gid, Uid, getuid};
 use rustix::thread::{set_thread_groups, set_thread_res_gid, set_thread_res_uid};
 use std::fs::{DirBuilder, File, OpenOptions, remove_dir, remove_file};

@@ -1,13 +1,13 @@
 //! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
 
-use env_server::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
-use protocol::Client;
-use protocol::channels::Instance;
-use protocol::client::Observation;
-use protocol::connection::ConnectionError;
-use protocol::control::Request;
-use protocol::message::Status;
-use protocol::observer::Observer;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::Request;
+use emberwatch_protocol::message::Status;
+use emberwatch_protocol::observer::Observer;
+use emberwatch_server::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tests::harness::{

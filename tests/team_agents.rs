@@ -1,11 +1,11 @@
 //! Agents that fly robots of one world: by one plan without a word between them, in a world that goes on without them.
 
 use crate::commands::check;
-use agent::acting::mission::{Company, Mission};
-use agent::acting::run::{Summary, run};
-use agent::config::AgentConfig;
-use agent::learning::learned::Learned;
-use protocol::observer::Observer;
+use emberwatch_agent::acting::mission::{Company, Mission};
+use emberwatch_agent::acting::run::{Summary, run};
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_protocol::observer::Observer;
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;

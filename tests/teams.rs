@@ -2,11 +2,11 @@
 //! hangs, is replaced or is not allowed changes what the others fly and see.
 
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
-use protocol::control::{Reply, Request};
-use protocol::message::{FLAG_TEAM_FRAMES, Status, StepReply, StepRequest, WorldResult};
-use protocol::observer::Observer;
-use protocol::path::path_to_bytes;
-use protocol::payload::split_step_payload;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::{FLAG_TEAM_FRAMES, Status, StepReply, StepRequest, WorldResult};
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::path::path_to_bytes;
+use emberwatch_protocol::payload::split_step_payload;
 use rustix::process::Signal;
 use std::ops::Range;
 use std::time::Instant;

@@ -2,11 +2,11 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::Place;
-use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learners::filter::SavedFilter;
-use agent::learning::learners::filter::fit::FilterFit;
-use agent::learning::learners::filter::fit::KIND;
-use protocol::Move;
+use emberwatch_agent::learning::checkpoint::{self, Contents};
+use emberwatch_agent::learning::learners::filter::SavedFilter;
+use emberwatch_agent::learning::learners::filter::fit::FilterFit;
+use emberwatch_agent::learning::learners::filter::fit::KIND;
+use emberwatch_protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
 use std::path::Path;

@@ -1,15 +1,15 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
-use agent::config::AgentConfig;
-use agent::learning::filter::Optimiser;
-use agent::learning::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::learning::filter::Optimiser;
+use emberwatch_agent::learning::replay::Replay;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use protocol::path::fly;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Move, Shape};
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Move, Shape};
 
 const N_MOVES: u64 = 64;
 

@@ -3,9 +3,9 @@
 //!
 //! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.png`
 
-use agent::benchmark::report::save;
-use agent::config::{AgentConfig, StepSize};
-use figures::{Curve, Lines, Panel, Scale};
+use emberwatch_agent::benchmark::report::save;
+use emberwatch_agent::config::{AgentConfig, StepSize};
+use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 
 const ITERATIONS: u64 = 25_000;

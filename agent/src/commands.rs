@@ -16,10 +16,10 @@ pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use train::TrainCommand;
 
-use agent::client::errors::refusal;
-use agent::policy;
-use protocol::Model;
-use protocol::message::Status;
+use emberwatch_agent::client::errors::refusal;
+use emberwatch_agent::policy;
+use emberwatch_protocol::Model;
+use emberwatch_protocol::message::Status;
 use std::process::ExitCode;
 
 /// Exit code of a run whose lease was lost.

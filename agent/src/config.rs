@@ -14,7 +14,7 @@ use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::{
     Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
 };
-use protocol::program::read_text;
+use emberwatch_protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn settings_of_the_objective_reach_the_policies() {
-        let model = protocol::Model::wildfire();
+        let model = emberwatch_protocol::Model::wildfire();
         let policy = |name| Policy::named(name, &model).expect("a known name");
         let mut config = AgentConfig::default();
         for policy in Policy::ladder(&model) {

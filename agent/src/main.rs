@@ -4,7 +4,7 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
-use network::{Allocator, set_up_process};
+use emberwatch_network::{Allocator, set_up_process};
 use std::process::ExitCode;
 
 #[global_allocator]
@@ -38,7 +38,7 @@ enum Command {
 
 fn main() -> ExitCode {
     set_up_process();
-    protocol::program::start_logging();
+    emberwatch_protocol::program::start_logging();
     let result = match &Cli::parse().command {
         Command::Run(command) => command.run(),
         Command::ServeDecisions(command) => command.run(),

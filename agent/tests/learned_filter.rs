@@ -1,13 +1,13 @@
 //! The learned filter against the known-model filter, finite differences and itself.
 
-use agent::config::{AgentConfig, LearningConfig};
-use agent::learning::filter::{Optimiser, Recursion, Update};
-use agent::learning::replay::{Replay, Sighting};
+use emberwatch_agent::config::{AgentConfig, LearningConfig};
+use emberwatch_agent::learning::filter::{Optimiser, Recursion, Update};
+use emberwatch_agent::learning::replay::{Replay, Sighting};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Model, Probabilities, Shape};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Model, Probabilities, Shape};
 
 /// What a few cells of a made-up world show: no two frames see the same cells.
 fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {

@@ -1,13 +1,13 @@
 //! Kernels that see the cell's own state, learned from frames of worlds that have such kernels.
 
-use agent::config::AgentConfig;
-use agent::learning::learners::filter::fit::{FilterFit, LearnedModel};
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::learning::learners::filter::fit::{FilterFit, LearnedModel};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use protocol::path::fly;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
 
 const N_WORLDS: u32 = 4;
 const N_STEPS: u64 = 500;

@@ -1,8 +1,8 @@
 //! The subcommand `prior`: what it writes is what a filter of the same settings begins with.
 
 use emberwatch_belief::estimation::Prior;
+use emberwatch_protocol::{Model, Probabilities, Shape};
 use ndarray_npy::read_npy;
-use protocol::{Model, Probabilities, Shape};
 use std::path::Path;
 use std::process::{Command, Output};
 

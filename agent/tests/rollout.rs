@@ -1,16 +1,16 @@
 //! The step of agents that plan for one robot or several.
 
-use agent::acting::registry::{Task, agent};
-use agent::config::AgentConfig;
-use agent::learning::learned::Learned;
-use agent::policy::Policy;
-use agent::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
+use emberwatch_agent::acting::registry::{Task, agent};
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::Policy;
+use emberwatch_agent::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
 use emberwatch_belief::Belief;
-use protocol::client::Observation;
-use protocol::message::{RobotResult, WorldResult};
-use protocol::path::fly;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
 
 const N_MOVES: usize = 6;
 

@@ -5,13 +5,13 @@
 //! `cargo bench -p emberwatch-server --bench step -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use env_server::config::ServerConfig;
-use env_server::simulator::{ClientId, Outcome, ServerStats, Simulator, Stepped};
-use env_server::snapshot::decode;
-use protocol::control::{Reply, Request};
-use protocol::message::{Operation, Status, StepReply, StepRequest, VERSION};
-use protocol::payload::write_step_body;
-use protocol::randomness::split_mix;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::{Operation, Status, StepReply, StepRequest, VERSION};
+use emberwatch_protocol::payload::write_step_body;
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::simulator::{ClientId, Outcome, ServerStats, Simulator, Stepped};
+use emberwatch_server::snapshot::decode;
 use rayon::ThreadPoolBuilder;
 use std::time::Instant;
 

@@ -2,13 +2,15 @@
 
 use crate::states_file::{StatesError, StatesFile};
 use crate::world::{Recorded, Start};
-use protocol::channels::{ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS};
-use protocol::control::CoverageRule;
-use protocol::grid::ShapeError;
-use protocol::model::ModelError;
-use protocol::path::MAX_MOVES;
-use protocol::program::read_text;
-use protocol::{Model, Shape};
+use emberwatch_protocol::channels::{
+    ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
+};
+use emberwatch_protocol::control::CoverageRule;
+use emberwatch_protocol::grid::ShapeError;
+use emberwatch_protocol::model::ModelError;
+use emberwatch_protocol::path::MAX_MOVES;
+use emberwatch_protocol::program::read_text;
+use emberwatch_protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::Path;

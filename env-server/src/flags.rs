@@ -3,8 +3,8 @@
 use crate::config::{ConfigError, ServerConfig};
 use crate::world::Start;
 use clap::{Args, ValueEnum};
-use protocol::Cell;
-use protocol::control::CoverageRule;
+use emberwatch_protocol::Cell;
+use emberwatch_protocol::control::CoverageRule;
 use std::path::PathBuf;
 
 /// The settings of [`ServerConfig`] as flags; each overrides the file.

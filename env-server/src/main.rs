@@ -4,9 +4,9 @@ mod commands;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
-use env_server::flags::ServerFlags;
-use env_server::server::serve;
-use protocol::program::{start_logging, stop_on_signals};
+use emberwatch_protocol::program::{start_logging, stop_on_signals};
+use emberwatch_server::flags::ServerFlags;
+use emberwatch_server::server::serve;
 use std::process::ExitCode;
 
 /// Simulates worlds and serves them to agents over shared memory.

@@ -3,11 +3,11 @@
 //! An array's header is checked before its values are read or inflated. Memory grows with what is there, not with what
 //! is claimed, and each array stays where it was read to.
 
+use emberwatch_protocol::grid::Shape;
+use emberwatch_protocol::model::{Description, Model};
+use emberwatch_protocol::program::read_text;
 use ndarray::{Array3, ShapeBuilder};
 use ndarray_npy::npy::header::Header;
-use protocol::grid::Shape;
-use protocol::model::{Description, Model};
-use protocol::program::read_text;
 use std::ffi::OsStr;
 use std::fmt::Display;
 use std::fs::File;

@@ -1,7 +1,7 @@
 //! States files as NumPy writes them, and broken ones: one error each.
 
-use env_server::config::ServerConfig;
-use env_server::states_file::{Sequences, StatesFile};
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::states_file::{Sequences, StatesFile};
 use ndarray::{Array, Array3, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use std::fs::{create_dir, write};

@@ -4,7 +4,7 @@
 //! `cargo bench -p emberwatch-protocol --bench transition -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use protocol::{Dynamics, Model, Probabilities, Shape, Transition};
+use emberwatch_protocol::{Dynamics, Model, Probabilities, Shape, Transition};
 
 /// Steps before measuring: enough for all three states, in clusters, as in a world in use.
 const BURN_IN: u64 = 2_000;

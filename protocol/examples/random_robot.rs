@@ -5,10 +5,10 @@
 
 #![expect(clippy::print_stdout, reason = "what the robot found is the output")]
 
-use protocol::channels::Instance;
-use protocol::client::{Claim, STEP_TIMEOUT};
-use protocol::control::WorldSeed;
-use protocol::{Client, Connection, Move};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::{Claim, STEP_TIMEOUT};
+use emberwatch_protocol::control::WorldSeed;
+use emberwatch_protocol::{Client, Connection, Move};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::error::Error;

@@ -1,10 +1,10 @@
 //! Against vectors made by the authors' unmodified PyTorch code (`tests/data`): the operator `Phi`, the
 //! observation matrix, the reward and flown paths.
 
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::{Cell, Model, Move, Shape, Transition};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayD, NdFloat, OwnedRepr, s};
 use ndarray_npy::{NpzReader, ReadableElement};
-use protocol::path::fly;
-use protocol::{Cell, Model, Move, Shape, Transition};
 use std::fs::File;
 
 type Npz = NpzReader<File>;

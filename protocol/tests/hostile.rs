@@ -1,13 +1,13 @@
 //! What comes from outside is hostile: every decoder gives an error or a valid value, never a panic. What bytes can be
 //! damaged to, and what must hold of what is decoded, is in `tests/src/fuzz/`.
 
+use emberwatch_protocol::Model;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
+use emberwatch_protocol::model::parse_color;
+use emberwatch_protocol::payload::split_frame_payload;
 use proptest::collection::vec;
 use proptest::prelude::*;
-use protocol::Model;
-use protocol::control::{Reply, Request};
-use protocol::message::{FrameHeader, RobotResult, WorldResult};
-use protocol::model::parse_color;
-use protocol::payload::split_frame_payload;
 
 proptest! {
     // No file of failures: tests leave the source tree alone.

@@ -1,8 +1,8 @@
 //! docs/model-file.md: its example is a model, and it names every key with its limits.
 
-use protocol::model::{Description, MAX_KERNEL_SIDE, MAX_VALUES};
-use protocol::program::MAX_TEXT_BYTES;
-use protocol::{Model, Shape};
+use emberwatch_protocol::model::{Description, MAX_KERNEL_SIDE, MAX_VALUES};
+use emberwatch_protocol::program::MAX_TEXT_BYTES;
+use emberwatch_protocol::{Model, Shape};
 use std::collections::BTreeSet;
 use toml::{Table, Value};
 

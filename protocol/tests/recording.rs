@@ -1,13 +1,13 @@
 //! Recordings: what was written is what is read, and what is missing or damaged is said.
 
-use proptest::collection::vec;
-use proptest::prelude::*;
-use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::{FrameHeader, RobotResult, TruthHeader, VERSION, WorldResult};
-use protocol::observer::Sample;
-use protocol::recording::{
+use emberwatch_protocol::control::{CoverageRule, ServerInfo};
+use emberwatch_protocol::message::{FrameHeader, RobotResult, TruthHeader, VERSION, WorldResult};
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::recording::{
     Event, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError, Totals, Writer,
 };
+use proptest::collection::vec;
+use proptest::prelude::*;
 use std::io::Write;
 
 /// Robots of a world.

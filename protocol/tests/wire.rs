@@ -3,24 +3,24 @@
 mod document;
 
 use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
-use iceoryx2::prelude::ZeroCopySend;
-use protocol::channels::{
+use emberwatch_protocol::channels::{
     AGENT_BUFFER, Channel, FRAME_BUFFER, Instance, MAX_AGENT_READERS, MAX_CLIENTS, MAX_NODES,
     MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, TRUTH_BUFFER,
 };
-use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
-use protocol::decisions;
-use protocol::grid::MAX_SIDE;
-use protocol::message::{
+use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
+use emberwatch_protocol::decisions;
+use emberwatch_protocol::grid::MAX_SIDE;
+use emberwatch_protocol::message::{
     AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, FrameHeader,
     Operation, RobotResult, Status, StepReply, StepRequest, TruthHeader, VERSION, WorldResult,
 };
-use protocol::path::{MAX_MOVES, path_from_bytes};
-use protocol::payload::split_step_payload;
-use protocol::recording::{
+use emberwatch_protocol::path::{MAX_MOVES, path_from_bytes};
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::recording::{
     self, FileHeader, Kind, MAX_BODY_BYTES, MAX_STORED_BYTES, RecordHeader, Totals,
 };
-use protocol::{Coverage, Frame, Move, Shape, UNOBSERVED};
+use emberwatch_protocol::{Coverage, Frame, Move, Shape, UNOBSERVED};
+use iceoryx2::prelude::ZeroCopySend;
 use serde_json::Value;
 use std::collections::BTreeSet;
 

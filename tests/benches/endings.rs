@@ -3,10 +3,10 @@
 //! Peer: this process's own notice of the same death, by a pidfd. Then, how much of a replay at full speed
 //! reaches an observer that reads.
 
-use protocol::control::Request;
-use protocol::observer::Observer;
-use protocol::recording::Reader;
-use protocol::wait::sleep_until_readable;
+use emberwatch_protocol::control::Request;
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::recording::Reader;
+use emberwatch_protocol::wait::sleep_until_readable;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open};
 use std::fs::File;
 use std::os::fd::AsFd;

@@ -2,12 +2,12 @@
 
 use crate::harness::PATIENCE;
 use crate::wire::{RawClient, Wire, answer, step_body};
-use protocol::channels::Instance;
-use protocol::control::Reply;
-use protocol::message::{
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::Reply;
+use emberwatch_protocol::message::{
     ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Status, StepRequest, VERSION,
 };
-use protocol::payload::split_step_payload;
+use emberwatch_protocol::payload::split_step_payload;
 use rand::RngExt;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;

@@ -1,18 +1,18 @@
 //! Servers as children, on names of their own, and what tests do with them.
 
 use crate::wire::observe_header;
-use env_server::config::ServerConfig;
-use env_server::snapshot::{SnapshotWorld, WorldSpec, encode};
-use env_server::world::Episode;
-use protocol::channels::Instance;
-use protocol::client::{Claim, Observation};
-use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
-use protocol::message::{FrameHeader, RobotResult, WorldResult};
-use protocol::observer::{Observer, Sample};
-use protocol::path::path_from_bytes;
-use protocol::payload::{RobotSample, split_frame_payload};
-use protocol::{Client, Connection, Move};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
+use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::path::path_from_bytes;
+use emberwatch_protocol::payload::{RobotSample, split_frame_payload};
+use emberwatch_protocol::{Client, Connection, Move};
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::snapshot::{SnapshotWorld, WorldSpec, encode};
+use emberwatch_server::world::Episode;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

@@ -2,7 +2,7 @@
 
 use crate::harness::{Program, SERVER, Server, new_instance, run, status};
 use crate::meter::all_under;
-use protocol::channels::{Instance, SHARED_MEMORY};
+use emberwatch_protocol::channels::{Instance, SHARED_MEMORY};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

@@ -6,13 +6,15 @@ use crate::wire::{
 };
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use emberwatch_protocol::channels::{
+    Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error,
+};
+use emberwatch_protocol::decisions::{AgentInfo, Decision, Reply, Request};
+use emberwatch_protocol::message::{ControlReply, ControlRequest, Status, VERSION};
+use emberwatch_protocol::wait::{Waiter, descriptor, drain, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
-use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error};
-use protocol::decisions::{AgentInfo, Decision, Reply, Request};
-use protocol::message::{ControlReply, ControlRequest, Status, VERSION};
-use protocol::wait::{Waiter, descriptor, drain, sleep_until_readable};
 use std::time::Duration;
 
 pub struct Learner {

@@ -1,6 +1,6 @@
 //! What a process uses.
 
-use protocol::channels::SHARED_MEMORY;
+use emberwatch_protocol::channels::SHARED_MEMORY;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 

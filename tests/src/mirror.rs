@@ -2,16 +2,16 @@
 //! a server that goes as fast as it is checked so.
 
 use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
-use env_server::config::ServerConfig;
-use env_server::snapshot::WorldSpec;
-use env_server::world::{Episode, Flown, Robot, Rules};
-use protocol::client::Claim;
-use protocol::connection::ConnectionError;
-use protocol::control::ServerInfo;
-use protocol::message::{FrameHeader, RobotResult, Status, WorldResult};
-use protocol::observer::{Observer, Sample};
-use protocol::path::{path_from_bytes, path_to_bytes};
-use protocol::{Client, Coverage, Move};
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::{FrameHeader, RobotResult, Status, WorldResult};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::path::{path_from_bytes, path_to_bytes};
+use emberwatch_protocol::{Client, Coverage, Move};
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::snapshot::WorldSpec;
+use emberwatch_server::world::{Episode, Flown, Robot, Rules};
 use std::time::{Duration, Instant};
 
 /// A lease that ends by nothing but what a test does.

@@ -1,6 +1,6 @@
 //! Programs as children: started, waited for with deadlines, killed on drop.
 
-use protocol::channels::Instance;
+use emberwatch_protocol::channels::Instance;
 use rustix::process::{Pid, Signal, kill_process};
 use std::fs::File;
 use std::path::{Path, PathBuf};

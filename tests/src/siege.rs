@@ -4,9 +4,9 @@
 use crate::harness::{PATIENCE, Paths, Server, eventually};
 use crate::meter::{memory, n_descriptors};
 use crate::wire::{RawClient, Wire, step_body, step_header};
-use protocol::channels::{Instance, SHARED_MEMORY};
-use protocol::message::Status;
-use protocol::path::path_to_bytes;
+use emberwatch_protocol::channels::{Instance, SHARED_MEMORY};
+use emberwatch_protocol::message::Status;
+use emberwatch_protocol::path::path_to_bytes;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;

@@ -2,11 +2,11 @@
 
 use crate::programs::PATIENCE;
 use crate::wire::step_header;
-use protocol::Connection;
-use protocol::connection::StepAnswer;
-use protocol::control::{Reply, Request};
-use protocol::message::StepRequest;
-use protocol::payload::write_step_body;
+use emberwatch_protocol::Connection;
+use emberwatch_protocol::connection::StepAnswer;
+use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::message::StepRequest;
+use emberwatch_protocol::payload::write_step_body;
 use std::ops::Range;
 
 /// A connection that holds robots, and the request of their step.

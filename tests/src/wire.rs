@@ -2,20 +2,20 @@
 //! one, sends them. Nothing is filled in and nothing is checked.
 
 use crate::programs::PATIENCE;
+use emberwatch_protocol::channels::{
+    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
+};
+use emberwatch_protocol::control::{LeaseInfo, Reply, Request};
+use emberwatch_protocol::message::{
+    ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
+};
+use emberwatch_protocol::payload::write_step_body;
+use emberwatch_protocol::wait::Waiter;
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::AllocationStrategy;
-use protocol::channels::{
-    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
-};
-use protocol::control::{LeaseInfo, Reply, Request};
-use protocol::message::{
-    ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
-};
-use protocol::payload::write_step_body;
-use protocol::wait::Waiter;
 use std::convert::Infallible;
 use std::fmt::Debug;
 use std::ops::Range;

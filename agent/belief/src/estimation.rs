@@ -19,4 +19,4 @@ pub use correlations::Correlations;
 pub use estimator::{Estimator, EstimatorError, Handover, Told};
 pub use filter::BayesFilter;
 pub use prior::Prior;
-pub use spatial::SpatialFilter;
+pub use spatial::{SpatialFilter, correcting};

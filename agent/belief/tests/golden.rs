@@ -15,12 +15,12 @@ mod golden_file;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{Integration, Objective, Target};
+use emberwatch_protocol::frame::Frame;
+use emberwatch_protocol::grid::{Cell, Shape};
+use emberwatch_protocol::model::Model;
+use emberwatch_protocol::path::{Move, fly};
 use golden_file::{Golden, frame_from};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, s};
-use protocol::frame::Frame;
-use protocol::grid::{Cell, Shape};
-use protocol::model::Model;
-use protocol::path::{Move, fly};
 
 fn shape_of(dim: (usize, usize)) -> Shape {
     Shape::new(dim.0, dim.1).expect("test shape")

@@ -1,6 +1,6 @@
 //! Charts of data that nobody wished for: still XML, still a picture, nothing off the page.
 
-use figures::{
+use emberwatch_figures::{
     Bar, Color, Curve, Ladder, Lines, MOST_CURVES, Named, Panel, Scale, Shade, Snapshot, png,
 };
 use ndarray::{Array2, Array3};

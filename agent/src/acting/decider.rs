@@ -19,14 +19,14 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::options::feature_names;
 use emberwatch_belief::planning::{OPTIONS, Proposal, Target};
-use protocol::channels::Instance;
-use protocol::client::{Claim, Observation};
-use protocol::connection::ConnectionError;
-use protocol::control::{ServerInfo, WorldSeed};
-use protocol::decisions::{AgentInfo, Decision};
-use protocol::message::{Status, VERSION};
-use protocol::program::pid_namespace;
-use protocol::{Client, Model, Move};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::{ServerInfo, WorldSeed};
+use emberwatch_protocol::decisions::{AgentInfo, Decision};
+use emberwatch_protocol::message::{Status, VERSION};
+use emberwatch_protocol::program::pid_namespace;
+use emberwatch_protocol::{Client, Model, Move};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
@@ -354,7 +354,7 @@ fn agent_info(task: &Assignment, model: &Model, server: &ServerInfo) -> AgentInf
         max_steps: server.max_steps,
         states: model.state_names(),
         objectives: OPTIONS.iter().map(|option| option.name.into()).collect(),
-        estimator: task.estimator.label().into(),
+        estimator: task.estimator.label(),
         features: feature_names(),
     }
 }

@@ -4,9 +4,9 @@
 use crate::client::left_belief::{leave_belief, left_belief};
 use crate::rollout::{Rollout, Seen};
 use anyhow::Result;
-use protocol::Client;
-use protocol::connection::ConnectionError;
-use protocol::message::Status;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::message::Status;
 
 /// Frames that are recalled before the lease is renewed: much less than the shortest lease takes.
 const RENEW_AFTER: u64 = 500;

@@ -5,12 +5,12 @@ use crate::client::info::connect;
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
 use anyhow::{Result, bail, ensure};
-use protocol::Model;
-use protocol::channels::Instance;
-use protocol::client::Claim;
-use protocol::control::ServerInfo;
-use protocol::message::Status;
-use protocol::model::{Description, ModelError};
+use emberwatch_protocol::Model;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::Status;
+use emberwatch_protocol::model::{Description, ModelError};
 use std::ops::Range;
 use std::time::Duration;
 

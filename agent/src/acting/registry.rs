@@ -10,9 +10,9 @@ use crate::rollout::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
-use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_belief::planning::{BasisKind, Objective, Target};
-use protocol::{Model, Shape};
+use emberwatch_protocol::{Model, Shape};
 
 /// What a misfit is told of.
 const CHECKPOINT: &str = "checkpoint";
@@ -60,20 +60,17 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
 fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
     let prior = task.prior.clone();
     Ok(match policy.estimator {
-        EstimatorKind::KnownModel => Box::new(BayesFilter::known(task.model, prior)?),
-        EstimatorKind::Spatial => {
+        EstimatorKind::Known { is_spatial } => {
             let filter = BayesFilter::known(task.model, prior)?;
             let (state, nothing) = (task.model.target_state(), Correlations::default());
-            Box::new(SpatialFilter::new(filter, state, nothing))
+            correcting(filter, is_spatial.then_some((state, nothing)))
         }
-        EstimatorKind::Learned | EstimatorKind::LearnedOwn => {
-            Box::new(learned_filter(learned_model(policy, task)?, task))
-        }
-        EstimatorKind::LearnedSpatial | EstimatorKind::LearnedOwnSpatial => {
+        EstimatorKind::Learned { is_spatial, .. } => {
             let learned = learned_model(policy, task)?;
-            let filter = learned_filter(learned, task);
-            let correlations = learned.correlations.clone();
-            Box::new(SpatialFilter::new(filter, learned.target, correlations))
+            let prior = learned.tables.prior(task.shape);
+            let filter = BayesFilter::learned(&learned.tables, prior);
+            let neighbours = || (learned.target, learned.correlations.clone());
+            correcting(filter, is_spatial.then(neighbours))
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
@@ -142,11 +139,6 @@ fn learned_model<'a>(policy: &Policy, task: &Task<'a>) -> Result<&'a LearnedMode
     Ok(learned)
 }
 
-fn learned_filter(learned: &LearnedModel, task: &Task<'_>) -> BayesFilter {
-    let prior = learned.tables.prior(task.shape);
-    BayesFilter::learned(&learned.tables, prior)
-}
-
 fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator> {
     let learned = present(policy, task.learned.network.as_ref())?;
     let shape = learned.autoencoder.shape();
@@ -170,10 +162,8 @@ pub fn needs_checkpoint(policy: &Policy) -> String {
         estimator if policy.choice == Choice::Scorer => {
             &*format!("decisions on the belief of {}", estimator.label())
         }
-        EstimatorKind::Learned | EstimatorKind::LearnedSpatial => "a filter",
-        EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
-            "a filter by own state (--learner own_filter)"
-        }
+        estimator if estimator.sees_own_state() => "a filter by own state (--learner own_filter)",
+        EstimatorKind::Learned { .. } => "a filter",
         EstimatorKind::Autoencoder => "an autoencoder",
         _ => "decisions",
     };

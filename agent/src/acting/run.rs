@@ -5,7 +5,7 @@ use crate::acting::pilot::Pilot;
 use crate::client::errors::{is_outage, refusal};
 use crate::client::info::RETRY_INTERVAL;
 use anyhow::Result;
-use protocol::message::Status;
+use emberwatch_protocol::message::Status;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 

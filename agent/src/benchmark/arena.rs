@@ -17,10 +17,10 @@ use crate::rollout::agent::Agent;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
-use protocol::channels::Instance;
-use protocol::client::{Claim, Observation};
-use protocol::control::{CoverageRule, ServerInfo, WorldSeed};
-use protocol::{Client, Grid, Model, Move, Shape};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::control::{CoverageRule, ServerInfo, WorldSeed};
+use emberwatch_protocol::{Client, Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 

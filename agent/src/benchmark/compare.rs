@@ -15,10 +15,10 @@ use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
-use protocol::Model;
-use protocol::control::ServerInfo;
-use protocol::message::WorldResult;
-use protocol::path::{Flight, fly};
+use emberwatch_protocol::Model;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::WorldResult;
+use emberwatch_protocol::path::{Flight, fly};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -359,7 +359,7 @@ impl Contestant {
         let n_repeated = tally.n_visited_each - tally.n_visited;
         PolicyRun {
             policy: policy.name.clone(),
-            estimator: policy.estimator.label().into(),
+            estimator: policy.estimator.label(),
             world_seed: world.seed,
             steps,
             mean_reward: mean(tally.reward),

@@ -1,8 +1,8 @@
 //! What the errors of connections mean to an agent.
 
-use protocol::channels::ChannelError;
-use protocol::connection::ConnectionError;
-use protocol::message::Status;
+use emberwatch_protocol::channels::ChannelError;
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::message::Status;
 
 /// Whether a server is away, or the way to it is busy, and it may come.
 pub fn is_away(error: &ConnectionError) -> bool {

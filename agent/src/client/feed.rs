@@ -2,9 +2,9 @@
 
 use crate::rollout::Rollout;
 use emberwatch_belief::Belief;
-use protocol::agent_belief::{BeliefPublisher, Intent};
-use protocol::channels::{AGENT_BUFFER, Instance};
-use protocol::message::{AgentHeader, WorldResult};
+use emberwatch_protocol::agent_belief::{BeliefPublisher, Intent};
+use emberwatch_protocol::channels::{AGENT_BUFFER, Instance};
+use emberwatch_protocol::message::{AgentHeader, WorldResult};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 

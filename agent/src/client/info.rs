@@ -1,11 +1,11 @@
 //! Connections of this program, and what a server tells on one without a lease.
 
 use crate::client::errors::is_away;
-use protocol::Connection;
-use protocol::channels::Instance;
-use protocol::client::STEP_TIMEOUT;
-use protocol::connection::{ConnectionError, unexpected};
-use protocol::control::{Reply, Request};
+use emberwatch_protocol::Connection;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::STEP_TIMEOUT;
+use emberwatch_protocol::connection::{ConnectionError, unexpected};
+use emberwatch_protocol::control::{Reply, Request};
 use std::time::{Duration, Instant};
 
 /// How long to wait between attempts to reach a server that is away.

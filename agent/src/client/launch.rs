@@ -1,8 +1,8 @@
 //! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
 
 use anyhow::{Context, Result, bail, ensure};
-use protocol::channels::Instance;
-use protocol::connection::Connection;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::connection::Connection;
 use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher;
 use std::io::{BufRead, BufReader};

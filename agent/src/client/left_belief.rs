@@ -2,11 +2,11 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use protocol::Client;
-use protocol::client::STEP_TIMEOUT;
-use protocol::connection::{ConnectionError, unexpected};
-use protocol::control::{LeftPart, MAX_BELIEF_PART, Reply, Request};
-use protocol::message::WorldResult;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::client::STEP_TIMEOUT;
+use emberwatch_protocol::connection::{ConnectionError, unexpected};
+use emberwatch_protocol::control::{LeftPart, MAX_BELIEF_PART, Reply, Request};
+use emberwatch_protocol::message::WorldResult;
 
 /// Leaves a belief about a robot's world, as it stands after a result, for the robot's next agent.
 pub fn leave_belief(

@@ -1,10 +1,10 @@
 //! The hidden states of a batch of worlds, for evaluation: never for anything that learns.
 
 use anyhow::{Context, Result, bail};
-use protocol::channels::Instance;
-use protocol::message::TruthHeader;
-use protocol::observer::{Observer, Sample};
-use protocol::{Grid, Shape};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::message::TruthHeader;
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::{Grid, Shape};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 

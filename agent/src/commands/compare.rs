@@ -2,26 +2,26 @@
 
 use super::shared::{make_folder, make_folder_of, write};
 use super::worlds::WorldFlags;
-use agent::acting::registry::needs_checkpoint;
-use agent::benchmark::arena::Arena;
-use agent::benchmark::compare::{Comparison, Results, compare};
-use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
-use agent::benchmark::report::{
+use anyhow::{Context, Result, bail, ensure};
+use clap::Args;
+use emberwatch_agent::acting::registry::needs_checkpoint;
+use emberwatch_agent::benchmark::arena::Arena;
+use emberwatch_agent::benchmark::compare::{Comparison, Results, compare};
+use emberwatch_agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
+use emberwatch_agent::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
     render_table, write_csv, write_events,
 };
-use agent::benchmark::team::Team;
-use agent::client::launch::OwnDashboard;
-use agent::config::{AgentConfig, AgentFlags};
-use agent::learning::learned::Learned;
-use agent::policy::{Choice, EstimatorKind, Policy};
-use anyhow::{Context, Result, bail, ensure};
-use clap::Args;
+use emberwatch_agent::benchmark::team::Team;
+use emberwatch_agent::client::launch::OwnDashboard;
+use emberwatch_agent::config::{AgentConfig, AgentFlags};
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::{Choice, EstimatorKind, Policy};
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_network::DeviceKind;
+use emberwatch_protocol::Model;
+use emberwatch_protocol::channels::MAX_ROBOTS;
 use indicatif::{ProgressBar, ProgressStyle};
-use network::DeviceKind;
-use protocol::Model;
-use protocol::channels::MAX_ROBOTS;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 

@@ -1,16 +1,16 @@
 //! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
 
 use super::shared::{WaitFlag, model_named};
-use agent::acting::decider::Assignment;
-use agent::acting::decisions::serve_decisions;
-use agent::config::AgentFlags;
-use agent::learning::learned::Learned;
-use agent::policy::EstimatorKind;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use network::Device;
-use protocol::channels::Instance;
-use protocol::program::{WatchedProcess, stop_on_signals};
+use emberwatch_agent::acting::decider::Assignment;
+use emberwatch_agent::acting::decisions::serve_decisions;
+use emberwatch_agent::config::AgentFlags;
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::EstimatorKind;
+use emberwatch_network::Device;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::{WatchedProcess, stop_on_signals};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -76,9 +76,9 @@ impl ServeDecisionsCommand {
         let kind = match (self.estimator, &learned.decisions) {
             (Some(kind), _) => kind,
             (None, Some(decisions)) => decisions.estimator,
-            (None, None) if learned.filter.is_some() => EstimatorKind::Learned,
-            (None, None) if learned.own_filter.is_some() => EstimatorKind::LearnedOwn,
-            (None, None) => EstimatorKind::KnownModel,
+            (None, None) if learned.filter.is_some() => EstimatorKind::LEARNED,
+            (None, None) if learned.own_filter.is_some() => EstimatorKind::learned(true),
+            (None, None) => EstimatorKind::KNOWN,
         };
         ensure!(
             !kind.is_learned() || learned.filter(kind).is_some(),

@@ -3,19 +3,19 @@
 use super::compare::run_comparison;
 use super::shared::{make_folder_of, write};
 use super::worlds::WorldFlags;
-use agent::benchmark::arena::Arena;
-use agent::benchmark::compare::Comparison;
-use agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
-use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
-use agent::benchmark::team::Team;
-use agent::config::{AgentConfig, AgentFlags};
-use agent::learning::learned::Learned;
-use agent::policy::Policy;
 use anyhow::Result;
 use clap::Args;
+use emberwatch_agent::benchmark::arena::Arena;
+use emberwatch_agent::benchmark::compare::Comparison;
+use emberwatch_agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
+use emberwatch_agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
+use emberwatch_agent::benchmark::team::Team;
+use emberwatch_agent::config::{AgentConfig, AgentFlags};
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::Policy;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::RECENT_STEPS;
-use network::DeviceKind;
+use emberwatch_network::DeviceKind;
 use std::path::PathBuf;
 
 /// What rewards are paired against.
@@ -136,7 +136,7 @@ fn predictions(guide: &str, policies: &[Policy], scores: &[Scores]) -> String {
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];
     for (index, policy) in policies.iter().enumerate() {
-        rows.push((policy.estimator.label().into(), scores(index)));
+        rows.push((policy.estimator.label(), scores(index)));
     }
     for (index, policy) in policies.iter().enumerate().skip(1) {
         let name = format!("{} - known_model", policy.estimator.label());

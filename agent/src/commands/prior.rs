@@ -1,13 +1,13 @@
 //! `prior`: a filter's first belief as a file, for filters in other languages.
 
 use super::shared::model_named;
-use agent::estimation::first_belief::first_belief;
-use agent::file::{Readers, replace_file};
 use anyhow::{Result, ensure};
 use clap::Args;
+use emberwatch_agent::estimation::first_belief::first_belief;
+use emberwatch_agent::file::{Readers, replace_file};
 use emberwatch_belief::estimation::Prior;
+use emberwatch_protocol::Shape;
 use ndarray_npy::WriteNpyExt;
-use protocol::Shape;
 use rustix::fs::{Access, access};
 use std::path::{Path, PathBuf};
 

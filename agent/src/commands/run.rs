@@ -1,16 +1,16 @@
 //! `run`: act on one world of a running server.
 
 use super::shared::{WaitFlag, model_named, parse_range};
-use agent::acting::mission::{Company, Mission};
-use agent::acting::run::run;
-use agent::config::AgentFlags;
-use agent::learning::learned::Learned;
-use agent::policy::Policy;
 use anyhow::{Context, Result};
 use clap::Args;
-use network::DeviceKind;
-use protocol::channels::Instance;
-use protocol::program::stop_on_signals;
+use emberwatch_agent::acting::mission::{Company, Mission};
+use emberwatch_agent::acting::run::run;
+use emberwatch_agent::config::AgentFlags;
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::Policy;
+use emberwatch_network::DeviceKind;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::stop_on_signals;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;

@@ -1,11 +1,11 @@
 //! What several subcommands need: a server that may come, models by name, files and output.
 
-use agent::client::info::wait_for_server;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use protocol::Model;
-use protocol::channels::Instance;
-use protocol::program::read_text;
+use emberwatch_agent::client::info::wait_for_server;
+use emberwatch_protocol::Model;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::read_text;
 use std::io::Write;
 use std::ops::Range;
 use std::path::Path;

@@ -1,13 +1,13 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
 use super::shared::{WaitFlag, model_named, parse_range};
-use agent::benchmark::arena::{Arena, MAX_BATCH};
-use agent::client::launch::OwnServer;
 use anyhow::{Result, ensure};
 use clap::Args;
-use protocol::channels::Instance;
-use protocol::control::ServerInfo;
-use protocol::{Model, Shape};
+use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
+use emberwatch_agent::client::launch::OwnServer;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
 

@@ -1,10 +1,10 @@
 //! The sections of `config/agent.toml`, which says what each setting means.
 
 use crate::policy::EstimatorKind;
-use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::belief::EntropyKind;
 use emberwatch_belief::planning::BasisKind;
+use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 
 /// Below 1, so that Adam's means move.

@@ -2,12 +2,12 @@
 //! visited cells (eq. 10).
 
 use crate::estimation::follower::Follower;
-use ::network::{Autoencoder, NetworkError};
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
+use emberwatch_network::{Autoencoder, NetworkError};
+use emberwatch_protocol::Frame;
 use ndarray::Array2;
-use protocol::Frame;
 use std::borrow::Cow;
 
 pub struct AutoencoderEstimator {

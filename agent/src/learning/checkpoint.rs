@@ -6,11 +6,11 @@
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
-use ::network::NamedTensor;
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use emberwatch_belief::estimation::belief::Belief;
-use protocol::Shape;
+use emberwatch_network::NamedTensor;
+use emberwatch_protocol::Shape;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::Serialize;

@@ -6,10 +6,10 @@ use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
 use crate::learning::learners::network;
 use crate::policy::{Choice, EstimatorKind, Policy};
-use ::network::Device;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::Dimensions;
-use protocol::Model;
+use emberwatch_network::Device;
+use emberwatch_protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -90,10 +90,8 @@ impl Learned {
 impl Learned {
     pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
         match estimator {
-            EstimatorKind::Learned | EstimatorKind::LearnedSpatial => self.filter.as_ref(),
-            EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
-                self.own_filter.as_ref()
-            }
+            EstimatorKind::Learned { is_own: false, .. } => self.filter.as_ref(),
+            EstimatorKind::Learned { is_own: true, .. } => self.own_filter.as_ref(),
             _ => None,
         }
     }

@@ -19,11 +19,11 @@ use crate::learning::learners::Learner;
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, ModelUpdate, Tick};
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
-use protocol::Client;
-use protocol::channels::Instance;
-use protocol::client::{Claim, Observation};
-use protocol::connection::ConnectionError;
-use protocol::control::WorldSeed;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::WorldSeed;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 

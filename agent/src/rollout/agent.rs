@@ -2,7 +2,6 @@
 
 use crate::config::AgentConfig;
 use crate::policy::{PlannerKind, Policy};
-use ::network::Dqn;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
@@ -13,9 +12,10 @@ use emberwatch_belief::planning::{
     BasisKind, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan, Planner,
     Proposal, RandomWalk,
 };
-use protocol::agent_belief::Intent;
-use protocol::path::fly;
-use protocol::{Cell, Frame, Grid};
+use emberwatch_network::Dqn;
+use emberwatch_protocol::agent_belief::Intent;
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::{Cell, Frame, Grid};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -302,7 +302,7 @@ impl Agent {
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
-            belief_from: self.policy.estimator.label().into(),
+            belief_from: self.policy.estimator.label(),
             objective: self.aim.clone(),
             states: self.state_names.clone(),
             plan_millis: planning.as_secs_f64() * 1e3,

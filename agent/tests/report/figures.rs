@@ -1,14 +1,14 @@
 //! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
 
 use super::synthetic::{ladder, noise, run, teams};
-use agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
-use agent::benchmark::report::training::{FIGURES, draw_training};
-use agent::benchmark::report::{
+use emberwatch_agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
+use emberwatch_agent::benchmark::report::training::{FIGURES, draw_training};
+use emberwatch_agent::benchmark::report::{
     PolicyRun, Snapshot, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
 };
 use emberwatch_belief::Belief;
-use protocol::randomness::split_mix;
-use protocol::{Frame, Grid, Model, Move, Shape};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Frame, Grid, Model, Move, Shape};
 use std::path::{Path, PathBuf};
 
 fn target(name: &str) -> PathBuf {

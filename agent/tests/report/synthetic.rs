@@ -1,6 +1,6 @@
 //! Results made up for the tests.
 
-use agent::benchmark::report::PolicyRun;
+use emberwatch_agent::benchmark::report::PolicyRun;
 
 /// The ladder of the project's design notes: policy, estimator and about the mean measured there.
 pub const LADDER: [(&str, &str, f64); 12] = [
@@ -24,7 +24,7 @@ pub const LADDER: [(&str, &str, f64); 12] = [
 
 /// A number in `-1..1` that depends on nothing but its arguments.
 pub fn noise(seed: u64, index: u64) -> f64 {
-    let bits = protocol::randomness::split_mix(seed, index) >> 11;
+    let bits = emberwatch_protocol::randomness::split_mix(seed, index) >> 11;
     bits as f64 / (1_u64 << 52) as f64 - 1.0
 }
 

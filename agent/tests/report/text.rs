@@ -1,6 +1,6 @@
 use super::synthetic::{ladder, run, teams};
-use agent::benchmark::report::added::{check_settings, read_csv};
-use agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
+use emberwatch_agent::benchmark::report::added::{check_settings, read_csv};
+use emberwatch_agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {

@@ -1,9 +1,9 @@
 //! The last few thousand steps of each world, joined from what arrives on three channels. Pure.
 
 use crate::entry::{Belief, Entry, Key, States};
-use protocol::agent_belief::AgentBelief;
-use protocol::message::{AgentHeader, FrameHeader, TruthHeader};
-use protocol::observer::Sample;
+use emberwatch_protocol::agent_belief::AgentBelief;
+use emberwatch_protocol::message::{AgentHeader, FrameHeader, TruthHeader};
+use emberwatch_protocol::observer::Sample;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 

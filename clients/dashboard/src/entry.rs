@@ -1,12 +1,12 @@
 //! One step of a world: what it gave, what its robots did and saw, and what an agent made of it. Pure.
 
-use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::frame::UNOBSERVED;
-use protocol::message::{FrameHeader, RobotResult, WorldResult};
-use protocol::observer::Sample;
-use protocol::path::path_from_bytes;
-use protocol::payload::split_frame_payload;
-use protocol::{Cell, Move, Shape};
+use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
+use emberwatch_protocol::frame::UNOBSERVED;
+use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::path::path_from_bytes;
+use emberwatch_protocol::payload::split_frame_payload;
+use emberwatch_protocol::{Cell, Move, Shape};
 use std::time::Instant;
 
 /// One step of a world.

@@ -2,10 +2,10 @@
 
 use anyhow::{Context, Result, ensure};
 use clap::Parser;
-use dashboard::scene::{Scene, Stage};
-use dashboard::{player, server, watcher};
-use protocol::channels::Instance;
-use protocol::program::{WatchedProcess, start_logging, stop_on_signals};
+use emberwatch_dashboard::scene::{Scene, Stage};
+use emberwatch_dashboard::{player, server, watcher};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::{WatchedProcess, start_logging, stop_on_signals};
 use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -2,7 +2,7 @@
 
 use crate::album::Strip;
 use crate::entry::Entry;
-use protocol::frame::UNOBSERVED;
+use emberwatch_protocol::frame::UNOBSERVED;
 
 /// What each cell showed last.
 pub(crate) struct Memory {

@@ -8,8 +8,8 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use crate::memory::Memory;
 use crate::scene::{Info, Lost, Player, Scene};
-use protocol::control::ServerStatus;
-use protocol::frame::UNOBSERVED;
+use emberwatch_protocol::control::ServerStatus;
+use emberwatch_protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 

@@ -2,7 +2,7 @@
 
 use crate::scene::{Info, Lost, Player, Scene, Stage};
 use anyhow::{Context, Result};
-use protocol::recording::{Event, Reader, Record, RecordingError};
+use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;

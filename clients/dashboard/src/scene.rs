@@ -2,9 +2,9 @@
 
 use crate::album::Album;
 use crate::entry::States;
-use protocol::Model;
-use protocol::control::{CoverageRule, ServerInfo, ServerStatus};
-use protocol::model::Description;
+use emberwatch_protocol::Model;
+use emberwatch_protocol::control::{CoverageRule, ServerInfo, ServerStatus};
+use emberwatch_protocol::model::Description;
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
@@ -119,7 +119,7 @@ impl Info {
         };
         let model = model.and_then(Result::ok);
         let file = model.as_ref().map(Model::file);
-        let names = |of: fn(&protocol::model::StateEntry) -> &String| {
+        let names = |of: fn(&emberwatch_protocol::model::StateEntry) -> &String| {
             file.map(|file| file.states.iter().map(of).cloned().collect())
         };
         let colours = file.map(|file| file.observations.iter());

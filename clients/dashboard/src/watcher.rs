@@ -4,12 +4,12 @@
 
 use crate::scene::{Info, Stage};
 use anyhow::{Context, Result, bail};
-use protocol::agent_belief::AgentBelief;
-use protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
-use protocol::connection::{Connection, ConnectionError, unexpected};
-use protocol::control::{Reply, Request, ServerStatus};
-use protocol::message::{AgentHeader, FrameHeader, Header, TruthHeader};
-use protocol::observer::{Observer, Sample};
+use emberwatch_protocol::agent_belief::AgentBelief;
+use emberwatch_protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
+use emberwatch_protocol::connection::{Connection, ConnectionError, unexpected};
+use emberwatch_protocol::control::{Reply, Request, ServerStatus};
+use emberwatch_protocol::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use emberwatch_protocol::observer::{Observer, Sample};
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,13 +1,15 @@
 //! What browsers get, from what was published.
 
-use dashboard::album::{Album, MAX_ENTRIES};
-use dashboard::entry::States;
-use dashboard::picture::{Ask, picture};
-use dashboard::scene::Scene;
-use protocol::Probabilities;
-use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::message::{AgentHeader, FrameHeader, RobotResult, TruthHeader, WorldResult};
-use protocol::observer::Sample;
+use emberwatch_dashboard::album::{Album, MAX_ENTRIES};
+use emberwatch_dashboard::entry::States;
+use emberwatch_dashboard::picture::{Ask, picture};
+use emberwatch_dashboard::scene::Scene;
+use emberwatch_protocol::Probabilities;
+use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
+use emberwatch_protocol::message::{
+    AgentHeader, FrameHeader, RobotResult, TruthHeader, WorldResult,
+};
+use emberwatch_protocol::observer::Sample;
 use serde_json::Value;
 use std::time::{Duration, Instant};
 

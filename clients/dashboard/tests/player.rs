@@ -1,11 +1,11 @@
 //! A recording that is damaged is played up to the damage, and says so.
 
-use dashboard::player::play;
-use dashboard::scene::{Scene, Stage};
-use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::{FrameHeader, RobotResult};
-use protocol::observer::Sample;
-use protocol::recording::{Event, Record, Writer};
+use emberwatch_dashboard::player::play;
+use emberwatch_dashboard::scene::{Scene, Stage};
+use emberwatch_protocol::control::{CoverageRule, ServerInfo};
+use emberwatch_protocol::message::{FrameHeader, RobotResult};
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::recording::{Event, Record, Writer};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};

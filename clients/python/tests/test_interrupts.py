@@ -31,6 +31,11 @@ import emberwatch
 from emberwatch import ports
 from emberwatch.wrappers import BeliefObservation
 
+#: An interrupt within the end of a generator is reported and dropped by Python itself.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Exception ignored in. <generator:pytest.PytestUnraisableExceptionWarning"
+)
+
 PATH = ("frame", "robot", "age", "belief")
 MOVE = ("frame", "visited", "robot", "move", "age", "belief", "local", "recent")
 

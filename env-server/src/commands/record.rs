@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result};
 use clap::Args;
-use env_server::recording::{RecordOptions, RecordSummary, record};
-use protocol::channels::Instance;
-use protocol::program::stop_on_signals;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::stop_on_signals;
+use emberwatch_server::recording::{RecordOptions, RecordSummary, record};
 use std::path::PathBuf;
 
 /// Observe an instance and write what is published to a file.

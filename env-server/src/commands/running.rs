@@ -3,9 +3,9 @@
 use super::print::print;
 use anyhow::Result;
 use clap::Args;
-use protocol::Connection;
-use protocol::channels::Instance;
-use protocol::control::{Reply, Request, ServerStatus};
+use emberwatch_protocol::Connection;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::{Reply, Request, ServerStatus};
 use std::time::Duration;
 
 /// How long to wait for the server.

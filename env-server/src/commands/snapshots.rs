@@ -2,11 +2,11 @@
 
 use anyhow::{Result, bail};
 use clap::Args;
-use env_server::snapshot::read;
-use protocol::channels::Instance;
-use protocol::client::Claim;
-use protocol::control::{Reply, Request, WorldInfo};
-use protocol::{Client, Connection};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::control::{Reply, Request, WorldInfo};
+use emberwatch_protocol::{Client, Connection};
+use emberwatch_server::snapshot::read;
 use std::path::PathBuf;
 use std::time::Duration;
 

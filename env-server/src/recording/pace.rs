@@ -1,6 +1,6 @@
 //! When the samples of a recording are published. Pure: time comes in as an argument.
 
-use protocol::channels::FRAME_BUFFER;
+use emberwatch_protocol::channels::FRAME_BUFFER;
 use std::time::{Duration, Instant};
 
 /// Samples that are published at once: two bursts fit an observer's buffer.

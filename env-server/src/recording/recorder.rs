@@ -4,13 +4,13 @@
 //! counted by sequence numbers, in each record and in the end record.
 
 use anyhow::{Context, Result};
-use protocol::Connection;
-use protocol::channels::{ChannelError, FRAME_BUFFER, Instance};
-use protocol::connection::ConnectionError;
-use protocol::control::ServerInfo;
-use protocol::message::{FrameHeader, TruthHeader};
-use protocol::observer::{Observer, Sample};
-use protocol::recording::{Event, Record, RecordingError, Totals, Writer};
+use emberwatch_protocol::Connection;
+use emberwatch_protocol::channels::{ChannelError, FRAME_BUFFER, Instance};
+use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::{FrameHeader, TruthHeader};
+use emberwatch_protocol::observer::{Observer, Sample};
+use emberwatch_protocol::recording::{Event, Record, RecordingError, Totals, Writer};
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Error, ErrorKind};

@@ -1,10 +1,12 @@
 //! Replies to the clients of a replay: what the recorded server answered to `hello`, and its worlds at present.
 
-use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse};
-use protocol::message::{Status, VERSION};
-use protocol::payload::split_frame_payload;
-use protocol::program::pid_namespace;
-use protocol::recording::Event;
+use emberwatch_protocol::control::{
+    Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse,
+};
+use emberwatch_protocol::message::{Status, VERSION};
+use emberwatch_protocol::payload::split_frame_payload;
+use emberwatch_protocol::program::pid_namespace;
+use emberwatch_protocol::recording::Event;
 use std::collections::BTreeMap;
 use std::time::Instant;
 

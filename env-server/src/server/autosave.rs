@@ -7,7 +7,7 @@ use crate::snapshot::{
     refused,
 };
 use crate::world::Episode;
-use protocol::throttle::Throttle;
+use emberwatch_protocol::throttle::Throttle;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

@@ -1,10 +1,10 @@
 //! Which processes the clients and observers are, and whether they run; removes the files of dead ones.
 
 use crate::simulator::ClientId;
-use protocol::cleanup::remove_leftovers;
-use protocol::program::WatchedProcess;
-use protocol::throttle::Throttle;
-use protocol::wait::sleep_until_readable;
+use emberwatch_protocol::cleanup::remove_leftovers;
+use emberwatch_protocol::program::WatchedProcess;
+use emberwatch_protocol::throttle::Throttle;
+use emberwatch_protocol::wait::sleep_until_readable;
 use rustix::io::Errno;
 use std::collections::{HashMap, HashSet};
 use std::os::fd::BorrowedFd;
@@ -115,7 +115,7 @@ fn clean_up() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::wait::is_readable;
+    use emberwatch_protocol::wait::is_readable;
     use std::process::Command;
 
     #[test]

@@ -3,12 +3,12 @@
 
 use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
-use protocol::channels::{
+use emberwatch_protocol::channels::{
     ChannelError, FRAME_BUFFER, MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
     check_room,
 };
-use protocol::responder::JSON_SLICE;
-use protocol::shared_memory::MessageMemory;
+use emberwatch_protocol::responder::JSON_SLICE;
+use emberwatch_protocol::shared_memory::MessageMemory;
 
 /// Bytes that iceoryx2 adds to each message, at most.
 const MESSAGE_OVERHEAD: usize = 512;

@@ -4,9 +4,9 @@ use super::state::Server;
 use crate::simulator::PendingFile;
 use crate::snapshot::{Done, FileError, Job};
 use crate::world::Episode;
-use protocol::control::Reply;
-use protocol::message::Status;
-use protocol::responder::ActiveControl;
+use emberwatch_protocol::control::Reply;
+use emberwatch_protocol::message::Status;
+use emberwatch_protocol::responder::ActiveControl;
 use std::time::Instant;
 
 impl Server {

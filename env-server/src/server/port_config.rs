@@ -1,8 +1,8 @@
 //! What a server's ports must hold.
 
-use protocol::channels::Instance;
-use protocol::control::ServerInfo;
-use protocol::payload::ROBOT_BYTES;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::payload::ROBOT_BYTES;
 
 /// The instance, and the sizes of its messages.
 #[derive(Debug, Clone)]

@@ -6,6 +6,24 @@ use super::port_config::{PortConfig, frame_bytes};
 use super::taken::{Taken, once_free};
 use crate::config::Checked;
 use anyhow::Result;
+use emberwatch_protocol::channels::{
+    Channel, ChannelError, ControlService, Entries, FrameService, Ipc, RequestResponse, Services,
+    StepService, TruthService, create_node, ipc_error, lives_elsewhere,
+};
+use emberwatch_protocol::control::Reply;
+use emberwatch_protocol::failed_connections::FailedConnections;
+use emberwatch_protocol::message::{
+    FrameHeader, Header, Status, StepReply, StepRequest, TruthHeader,
+};
+use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use emberwatch_protocol::program::node_pid;
+use emberwatch_protocol::responder::{
+    Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
+};
+use emberwatch_protocol::shared_memory::fill_ports;
+use emberwatch_protocol::throttle::Throttle;
+use emberwatch_protocol::turn::Turn;
+use emberwatch_protocol::wait::{descriptor, drain};
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -16,22 +34,6 @@ use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::port_factory::server::ServerCreateError;
-use protocol::channels::{
-    Channel, ChannelError, ControlService, Entries, FrameService, Ipc, RequestResponse, Services,
-    StepService, TruthService, create_node, ipc_error, lives_elsewhere,
-};
-use protocol::control::Reply;
-use protocol::failed_connections::FailedConnections;
-use protocol::message::{FrameHeader, Header, Status, StepReply, StepRequest, TruthHeader};
-use protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
-use protocol::program::node_pid;
-use protocol::responder::{
-    Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
-};
-use protocol::shared_memory::fill_ports;
-use protocol::throttle::Throttle;
-use protocol::turn::Turn;
-use protocol::wait::{descriptor, drain};
 use std::cell::RefCell;
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;

@@ -3,8 +3,8 @@
 use super::ports::Ports;
 use crate::simulator::Simulator;
 use crate::world::Episode;
-use protocol::channels::FRAME_BUFFER;
-use protocol::message::{FrameHeader, TruthHeader, VERSION};
+use emberwatch_protocol::channels::FRAME_BUFFER;
+use emberwatch_protocol::message::{FrameHeader, TruthHeader, VERSION};
 use std::ops::Range;
 
 /// What has been published, and to whom.

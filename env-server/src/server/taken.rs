@@ -1,10 +1,10 @@
 //! An instance that another server has, or that a dead one left.
 //!
-//! Files of a dead process are removed in a turn (`protocol::turn`), which another process may hold for a while. Until
+//! Files of a dead process are removed in a turn (`emberwatch_protocol::turn`), which another process may hold for a while. Until
 //! then the dead process seems to have the instance.
 
 use anyhow::Result;
-use protocol::program::WatchedProcess;
+use emberwatch_protocol::program::WatchedProcess;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 

@@ -6,8 +6,8 @@ use super::lease::Refusal;
 use super::state::{Place, Simulator, Slot, within};
 use super::step::numbers;
 use crate::world::{Episode, Flown, Rules};
-use protocol::UNOBSERVED;
-use protocol::message::{
+use emberwatch_protocol::UNOBSERVED;
+use emberwatch_protocol::message::{
     FLAG_TEAM_FRAMES, RobotResult, Status, StepReply, StepRequest, VERSION, WorldResult,
 };
 use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};

@@ -1,8 +1,8 @@
 //! The barrier of a world: the paths for its next step, and who waits for it. It knows no leases and no clock.
 
 use super::lease::ClientId;
-use protocol::Move;
-use protocol::message::StepRequest;
+use emberwatch_protocol::Move;
+use emberwatch_protocol::message::StepRequest;
 use std::time::Instant;
 
 /// A step request that waits for its world to move.

@@ -8,12 +8,12 @@ use super::step::Stepped;
 use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown};
-use protocol::Move;
-use protocol::control::{Reply, Request, WorldSeed};
-use protocol::message::{
+use emberwatch_protocol::Move;
+use emberwatch_protocol::control::{Reply, Request, WorldSeed};
+use emberwatch_protocol::message::{
     FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION, WorldResult,
 };
-use protocol::payload::{split_step_payload, write_step_body};
+use emberwatch_protocol::payload::{split_step_payload, write_step_body};
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 

@@ -1,7 +1,7 @@
 //! Beliefs that agents leave for the next agents: bytes that the server does not interpret.
 
-use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
-use protocol::message::WorldResult;
+use emberwatch_protocol::control::{BeliefInfo, MAX_BELIEF_PART};
+use emberwatch_protocol::message::WorldResult;
 use std::ops::Range;
 
 /// States that a belief may have under any model, as learned ones have their own. It may have as many as the model.

@@ -3,14 +3,14 @@
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot, cells};
-use protocol::channels::MAX_CLIENTS;
-use protocol::control::{
+use emberwatch_protocol::channels::MAX_CLIENTS;
+use emberwatch_protocol::control::{
     LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus,
     parse,
 };
-use protocol::message::{Status, VERSION, WorldResult};
-use protocol::program::pid_namespace;
-use protocol::randomness::{Purpose, stream};
+use emberwatch_protocol::message::{Status, VERSION, WorldResult};
+use emberwatch_protocol::program::pid_namespace;
+use emberwatch_protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::ops::Range;
 use std::time::{Duration, Instant};

@@ -4,7 +4,7 @@
 //! process, or by a takeover; a robot taken from a lease stays lost to that lease, also when it
 //! is free again.
 
-use protocol::message::Status;
+use emberwatch_protocol::message::Status;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::time::{Duration, Instant};

@@ -1,7 +1,7 @@
 //! Leases that are given, kept and lost.
 
 use super::lease::{Claim, ClientId, Leases, Refusal};
-use protocol::message::Status;
+use emberwatch_protocol::message::Status;
 use std::collections::HashSet;
 use std::ops::Range;
 use std::time::{Duration, Instant};

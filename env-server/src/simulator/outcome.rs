@@ -3,8 +3,8 @@
 use super::lease::{ClientId, Refusal};
 use super::state::ResetJob;
 use crate::snapshot::Job;
-use protocol::control::{Reply, WorldInfo};
-use protocol::message::Status;
+use emberwatch_protocol::control::{Reply, WorldInfo};
+use emberwatch_protocol::message::Status;
 use std::ops::Range;
 use std::time::Duration;
 

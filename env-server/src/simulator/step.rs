@@ -5,11 +5,11 @@
 use super::barrier::{Ticket, Waiter, mask};
 use super::lease::{ClientId, Refusal};
 use super::state::{Simulator, within};
-use protocol::Coverage;
-use protocol::message::{
+use emberwatch_protocol::Coverage;
+use emberwatch_protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION,
 };
-use protocol::path::{MoveError, check_moves};
+use emberwatch_protocol::path::{MoveError, check_moves};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 

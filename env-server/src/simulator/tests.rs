@@ -6,9 +6,9 @@ use super::state::{ResetJob, Simulator};
 use super::step::Stepped;
 use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
-use protocol::control::{Reply, Request, WorldSeed};
-use protocol::message::{Operation, Status, StepRequest, VERSION};
-use protocol::payload::write_step_body;
+use emberwatch_protocol::control::{Reply, Request, WorldSeed};
+use emberwatch_protocol::message::{Operation, Status, StepRequest, VERSION};
+use emberwatch_protocol::payload::write_step_body;
 use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };

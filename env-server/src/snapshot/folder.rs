@@ -1,7 +1,7 @@
 //! A folder of an instance's last snapshot files.
 
 use super::file::{Durability, FileError, PART, create, failed, write};
-use protocol::channels::Instance;
+use emberwatch_protocol::channels::Instance;
 use std::io;
 use std::path::{Path, PathBuf};
 

@@ -11,8 +11,8 @@ use bincode::config::{Configuration, Fixint, LittleEndian};
 use bincode::error::DecodeError;
 use bincode::{Decode, Encode};
 use bytemuck::AnyBitPattern;
-use protocol::Grid;
-use protocol::path::path_to_bytes;
+use emberwatch_protocol::Grid;
+use emberwatch_protocol::path::path_to_bytes;
 
 /// What every snapshot begins with.
 pub const MAGIC: [u8; 8] = *b"EMBRSNAP";

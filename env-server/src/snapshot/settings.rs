@@ -4,7 +4,7 @@ use super::error::SnapshotError;
 use crate::config::Checked;
 use crate::world::Rules;
 use bincode::{Decode, Encode};
-use protocol::model::ModelError;
+use emberwatch_protocol::model::ModelError;
 use std::fmt::Display;
 
 /// The settings of a server that its worlds depend on.

@@ -5,7 +5,7 @@ use super::format::{HEADER_BYTES, MAGIC, NewEpisode, SnapshotWorld, VERSION, dec
 use super::settings::{Settings, WorldSpec};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown, Rules, SavedWorld};
-use protocol::Move;
+use emberwatch_protocol::Move;
 
 const NEW: NewEpisode = NewEpisode {
     seed: 7,

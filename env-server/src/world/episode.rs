@@ -11,9 +11,9 @@ use super::robot::Robot;
 use super::rules::Rules;
 use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
 use super::sensor::Sensor;
-use protocol::message::WorldResult;
-use protocol::path::path_from_bytes;
-use protocol::{Coverage, Frame, Grid};
+use emberwatch_protocol::message::WorldResult;
+use emberwatch_protocol::path::path_from_bytes;
+use emberwatch_protocol::{Coverage, Frame, Grid};
 
 /// One world's episode.
 #[derive(Debug, Clone)]
@@ -233,8 +233,8 @@ fn count(states: &Grid<u8>, wanted: u8) -> u32 {
 mod tests {
     use super::*;
     use crate::world::rules::Start;
-    use protocol::path::fly;
-    use protocol::{Cell, Model, Move, Shape};
+    use emberwatch_protocol::path::fly;
+    use emberwatch_protocol::{Cell, Model, Move, Shape};
 
     fn rules(max_steps: u64, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");

@@ -1,6 +1,6 @@
 //! What one step of a world is given.
 
-use protocol::{Coverage, Move};
+use emberwatch_protocol::{Coverage, Move};
 
 /// Which robots of a world fly in a step, and where. Of each mask, bit r is robot r of the world.
 #[derive(Debug, Clone, Copy)]

@@ -5,7 +5,7 @@
 //! burn-in B at k equals the one without burn-in at B + k.
 
 use super::recorded::Recorded;
-use protocol::{Dynamics, Grid};
+use emberwatch_protocol::{Dynamics, Grid};
 use std::sync::Arc;
 
 /// Where hidden states come from.
@@ -98,7 +98,7 @@ impl World {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::{Model, Shape};
+    use emberwatch_protocol::{Model, Shape};
 
     fn world(seed: u64, burn_in: u64, steps: u64) -> World {
         let shape = Shape::new(64, 48).expect("test shape");

@@ -1,8 +1,8 @@
 //! A world's last frames, kept so that the next agent can compute its belief from them.
 
 use super::robot::Robot;
-use protocol::Coverage;
-use protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::Coverage;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
 use std::collections::VecDeque;
 
 /// Least room for a world's frames, bytes: full frames share it, however many steps are to be kept.
@@ -145,8 +145,8 @@ mod tests {
     use super::*;
     use crate::world::rules::{Rules, Start};
     use crate::world::{Episode, Flown};
-    use protocol::frame::UNOBSERVED;
-    use protocol::{Model, Move, Shape};
+    use emberwatch_protocol::frame::UNOBSERVED;
+    use emberwatch_protocol::{Model, Move, Shape};
 
     #[test]
     fn the_last_frames_are_kept_as_they_were() {

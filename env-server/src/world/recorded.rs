@@ -1,8 +1,8 @@
 //! Hidden states that were recorded: which sequence a world shows, how it is turned, and from which recorded step on.
 
+use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_protocol::{Grid, Shape};
 use ndarray::{Array3, ArrayView2, Axis};
-use protocol::randomness::{Purpose, stream};
-use protocol::{Grid, Shape};
 use rand::RngExt;
 
 /// What the worlds of a server show.

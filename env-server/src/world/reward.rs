@@ -2,7 +2,7 @@
 
 use super::robot::Robot;
 use super::rules::Rules;
-use protocol::message::WorldResult;
+use emberwatch_protocol::message::WorldResult;
 
 /// Set in the count of a cell that the team was paid for.
 const PAID: u8 = 0x80;
@@ -50,8 +50,8 @@ pub(super) fn pay(
 mod tests {
     use super::*;
     use crate::world::rules::Start;
-    use protocol::randomness::split_mix;
-    use protocol::{Coverage, Model, Move, Shape};
+    use emberwatch_protocol::randomness::split_mix;
+    use emberwatch_protocol::{Coverage, Model, Move, Shape};
     use std::collections::BTreeSet;
 
     /// The reward of a set of cells.

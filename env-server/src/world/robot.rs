@@ -1,8 +1,8 @@
 //! One robot of a world: where it is, what it flew and what it saw.
 
-use protocol::message::RobotResult;
-use protocol::path::fly_into;
-use protocol::{Cell, Coverage, Frame, Move, Shape};
+use emberwatch_protocol::message::RobotResult;
+use emberwatch_protocol::path::fly_into;
+use emberwatch_protocol::{Cell, Coverage, Frame, Move, Shape};
 
 /// A robot after a step or a reset.
 #[derive(Debug, Clone)]

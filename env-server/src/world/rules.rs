@@ -3,9 +3,9 @@
 use super::hidden::Source;
 use super::recorded::Recorded;
 use super::sensor::Sensor;
-use protocol::model::ModelError;
-use protocol::randomness::{Purpose, stream};
-use protocol::{Cell, Dynamics, Model, Shape};
+use emberwatch_protocol::model::ModelError;
+use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_protocol::{Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

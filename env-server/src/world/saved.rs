@@ -2,9 +2,9 @@
 
 use super::history::{PastRobot, PastStep};
 use super::rules::Rules;
-use protocol::channels::MAX_ROBOTS;
-use protocol::message::{RobotResult, WorldResult};
-use protocol::{Cell, Coverage};
+use emberwatch_protocol::channels::MAX_ROBOTS;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::{Cell, Coverage};
 use std::fmt::Display;
 use thiserror::Error;
 

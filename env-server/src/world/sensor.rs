@@ -4,8 +4,8 @@
 //! step see the same. One ChaCha8 draw keys the step, SplitMix64 of that key gives each cell's
 //! number: constant work per cell looked at, nothing for the others.
 
-use protocol::randomness::{Purpose, split_mix, stream};
-use protocol::{Frame, Grid, Model};
+use emberwatch_protocol::randomness::{Purpose, split_mix, stream};
+use emberwatch_protocol::{Frame, Grid, Model};
 use rand_chacha::rand_core::Rng;
 
 /// `P(y | x)` as thresholds on a 32-bit number.
@@ -74,7 +74,7 @@ impl Sensor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::Shape;
+    use emberwatch_protocol::Shape;
 
     #[test]
     fn readings_follow_the_observation_matrix() {

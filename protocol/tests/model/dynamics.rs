@@ -4,7 +4,7 @@ use super::models::{
     check_draws, hash_after, model, one_hot, predicted, random_model, random_states, shape,
 };
 use super::statistics;
-use protocol::{Dynamics, Grid, Model};
+use emberwatch_protocol::{Dynamics, Grid, Model};
 
 /// Compares draws with `Phi` of the states, in double precision.
 fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {

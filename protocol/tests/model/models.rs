@@ -1,9 +1,9 @@
 //! Models other than the wildfire, random states and beliefs, and the checks of what becomes of them.
 
+use emberwatch_protocol::model::{KernelEntry, ModelFile};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Dynamics, Grid, Model, Shape, Transition};
 use ndarray::{Array3, Axis, NdFloat};
-use protocol::model::{KernelEntry, ModelFile};
-use protocol::randomness::split_mix;
-use protocol::{Dynamics, Grid, Model, Shape, Transition};
 
 /// A model with weights `weight(to, from, row, col)` and biases `bias(to)`.
 pub fn model(

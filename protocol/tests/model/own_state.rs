@@ -5,10 +5,10 @@ use super::models::{
     assert_close, check_draws, check_predictions, chi_square, hash_after, one_hot, predicted,
     random_belief, random_model, random_own_model, random_states, shape, unit,
 };
+use emberwatch_protocol::model::KernelEntry;
+use emberwatch_protocol::{Dynamics, Grid, Model};
 use ndarray::Array3;
 use proptest::prelude::*;
-use protocol::model::KernelEntry;
-use protocol::{Dynamics, Grid, Model};
 use std::collections::BTreeMap;
 
 /// `p`: each state's probability in each cell, from the entries of the model's file.

@@ -10,7 +10,7 @@
 //! - `new_fire_fraction_with_D_on_fire_before`: among cells with `X != fire`, `X' = fire` and a
 //!   neighbour D, that neighbour was on fire in `X`; likewise for latent
 
-use protocol::{Dynamics, Grid, Model, Shape};
+use emberwatch_protocol::{Dynamics, Grid, Model, Shape};
 use std::collections::BTreeMap;
 
 const SIDE: usize = 64;

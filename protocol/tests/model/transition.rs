@@ -1,9 +1,9 @@
 //! `Phi` on beliefs against its formula (paper eqs. 2-4), for any model and grid.
 
 use super::models::{check_predictions, random_belief, random_model, shape};
+use emberwatch_protocol::{Model, Transition};
 use ndarray::{Array3, Axis};
 use proptest::prelude::*;
-use protocol::{Model, Transition};
 
 /// The formula of eqs. 2-4 as it stands.
 fn formula(model: &Model, belief: &Array3<f64>) -> Array3<f64> {

@@ -1,8 +1,8 @@
 //! Agents that are killed at random moments, one after the other, on one server.
 
-use protocol::channels::Instance;
-use protocol::message::FrameHeader;
-use protocol::observer::{Observer, Sample};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::message::FrameHeader;
+use emberwatch_protocol::observer::{Observer, Sample};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

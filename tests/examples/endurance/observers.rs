@@ -1,11 +1,11 @@
 //! What observers cost: a step's time with 0, 1, 4 and 16 of them, one of them stopped.
 
-use protocol::Probabilities;
-use protocol::agent_belief::{BeliefPublisher, Intent};
-use protocol::channels::Instance;
-use protocol::message::AgentHeader;
-use protocol::observer::Observer;
-use protocol::path::path_to_bytes;
+use emberwatch_protocol::Probabilities;
+use emberwatch_protocol::agent_belief::{BeliefPublisher, Intent};
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::message::AgentHeader;
+use emberwatch_protocol::observer::Observer;
+use emberwatch_protocol::path::path_to_bytes;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tests::harness::{Paths, Program, Server};

@@ -1,7 +1,7 @@
 //! Servers that are killed at random moments and come back from their last snapshot.
 
-use protocol::Client;
-use protocol::client::Observation;
+use emberwatch_protocol::Client;
+use emberwatch_protocol::client::Observation;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -15,7 +15,7 @@ const FLAGS: &str = "--height 64 --width 64 --moves 64 --burn-in 1000 --worlds 2
 
 const N_MOVES: usize = 64;
 
-fn paths(step: u64) -> Vec<Vec<protocol::Move>> {
+fn paths(step: u64) -> Vec<Vec<emberwatch_protocol::Move>> {
     Paths::new(step).take(N_MOVES, 2)
 }
 

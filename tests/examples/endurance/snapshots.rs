@@ -1,6 +1,6 @@
 //! What `--snapshot-every 1000` costs a client that steps as fast as it can, with a folder where temporary files are.
 
-use protocol::path::path_to_bytes;
+use emberwatch_protocol::path::path_to_bytes;
 use std::time::Instant;
 use tempfile::TempDir;
 use tests::harness::{Paths, Server};

@@ -1,7 +1,7 @@
 //! Hours of agents and observers that come, go, are killed, stopped and taken over, snapshots among them;
 //! what the server uses, second by second, as CSV and as a figure.
 
-use figures::{Curve, Lines, Panel, Scale};
+use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -145,6 +145,6 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
             panel("shared memory, MiB in use", |used| used.shared as f64 / 1024.0),
         ],
     };
-    let picture = figures::png(&page.svg().expect("points")).expect("a picture");
+    let picture = emberwatch_figures::png(&page.svg().expect("points")).expect("a picture");
     std::fs::write(folder.join("soak.png"), picture).expect("write the figure");
 }

@@ -1,16 +1,16 @@
 //! A world whose robots are flown by a process each: these are killed, stopped, told to end and taken over at random
 //! moments, while this process flies one more robot, which paces the world, and checks each step.
 
-use agent::config::AgentConfig;
+use emberwatch_agent::config::AgentConfig;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
 use emberwatch_belief::planning::{
     CellValues, Objective, Planner, PlanningProblem, RandomWalk, Target,
 };
-use protocol::message::FrameHeader;
-use protocol::observer::Sample;
-use protocol::path::path_to_bytes;
-use protocol::{Cell, Shape};
+use emberwatch_protocol::message::FrameHeader;
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::path::path_to_bytes;
+use emberwatch_protocol::{Cell, Shape};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;

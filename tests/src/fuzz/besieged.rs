@@ -5,15 +5,17 @@
 
 use crate::mirror::step_again;
 use crate::wire::{step_body, step_header};
-use env_server::config::ServerConfig;
-use env_server::simulator::{
+use emberwatch_protocol::control::{CoverageRule, Reply, WorldStatus};
+use emberwatch_protocol::message::{
+    RobotResult, Status, StepReply, StepRequest, VERSION, WorldResult,
+};
+use emberwatch_protocol::path::path_to_bytes;
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::simulator::{
     ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
 };
-use env_server::world::Episode;
-use protocol::control::{CoverageRule, Reply, WorldStatus};
-use protocol::message::{RobotResult, Status, StepReply, StepRequest, VERSION, WorldResult};
-use protocol::path::path_to_bytes;
-use protocol::payload::split_step_payload;
+use emberwatch_server::world::Episode;
 use rayon::ThreadPoolBuilder;
 use std::cell::RefCell;
 use std::ops::Range;

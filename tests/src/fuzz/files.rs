@@ -1,23 +1,23 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
-use ::network::{Dqn, DqnSettings, DqnShape};
-use agent::config::AgentConfig;
-use agent::estimation::Follower;
-use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
-use agent::learning::learned::Learned;
-use agent::learning::learners::decisions::{self, Base, DecisionsLearner};
-use agent::learning::learners::filter::fit::{self, FilterFit};
-use agent::learning::learners::filter::{FilterLearner, SavedFilter};
-use agent::learning::learners::network::{self, Position, SavedNetwork};
-use agent::learning::learners::{Learner, Worlds};
-use agent::learning::reward::RewardEstimate;
-use agent::policy::EstimatorKind;
+use emberwatch_agent::config::AgentConfig;
+use emberwatch_agent::estimation::Follower;
+use emberwatch_agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::learning::learners::decisions::{self, Base, DecisionsLearner};
+use emberwatch_agent::learning::learners::filter::fit::{self, FilterFit};
+use emberwatch_agent::learning::learners::filter::{FilterLearner, SavedFilter};
+use emberwatch_agent::learning::learners::network::{self, Position, SavedNetwork};
+use emberwatch_agent::learning::learners::{Learner, Worlds};
+use emberwatch_agent::learning::reward::RewardEstimate;
+use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_network::{Dqn, DqnSettings, DqnShape};
+use emberwatch_protocol::model::ModelFile;
+use emberwatch_protocol::{Dynamics, Frame, Model, Shape, Transition};
 use ndarray::{Array3, Axis};
-use protocol::model::ModelFile;
-use protocol::{Dynamics, Frame, Model, Shape, Transition};
 use std::collections::BTreeMap;
 
 /// Steps that a model is simulated for.
@@ -172,7 +172,7 @@ fn decisions() -> Contents {
 
 fn base_of_filter() -> Base {
     let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
-    Base::learned(EstimatorKind::Learned, fit.learned(), worlds().shape)
+    Base::learned(EstimatorKind::LEARNED, fit.learned(), worlds().shape)
 }
 
 fn dqn() -> Dqn {

@@ -2,17 +2,17 @@
 
 use super::target::Seed;
 use bytemuck::{Pod, bytes_of};
-use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::control::{Reply, parse};
-use protocol::decisions;
-use protocol::message::{
+use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
+use emberwatch_protocol::control::{Reply, parse};
+use emberwatch_protocol::decisions;
+use emberwatch_protocol::message::{
     AgentHeader, FLAG_TEAM_FRAMES, FrameHeader, RobotResult, Status, StepReply, VERSION,
     WorldResult,
 };
-use protocol::observer::Sample;
-use protocol::path::{fly, path_from_bytes, path_to_bytes};
-use protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
-use protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::path::{fly, path_from_bytes, path_to_bytes};
+use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
+use emberwatch_protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::collections::HashSet;

@@ -8,11 +8,11 @@ use super::messages::{split_header, survives};
 use super::target::Seed;
 use crate::wire::step_body;
 use bytemuck::bytes_of;
-use env_server::simulator::{Outcome, PendingReply, Stepped};
-use protocol::control::{Reply, Request, parse};
-use protocol::message::{
+use emberwatch_protocol::control::{Reply, Request, parse};
+use emberwatch_protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepRequest, VERSION,
 };
+use emberwatch_server::simulator::{Outcome, PendingReply, Stepped};
 use std::time::Duration;
 
 /// What stands for the attacker's lease in a control request.

@@ -64,8 +64,8 @@ pub fn decode(name: &str, bytes: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::control::{Reply, Request, parse};
-    use protocol::{Model, decisions};
+    use emberwatch_protocol::control::{Reply, Request, parse};
+    use emberwatch_protocol::{Model, decisions};
     use std::path::Path;
 
     #[test]

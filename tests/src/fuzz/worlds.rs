@@ -1,17 +1,17 @@
 //! Files of worlds: snapshots, recordings and recorded states.
 
 use super::target::Seed;
-use env_server::config::ServerConfig;
-use env_server::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
-use env_server::states_file::Sequences;
-use env_server::world::{Episode, Flown};
+use emberwatch_protocol::Move;
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::{FrameHeader, RobotResult, VERSION};
+use emberwatch_protocol::observer::Sample;
+use emberwatch_protocol::recording::{Event, Reader, Record, Writer};
+use emberwatch_server::config::ServerConfig;
+use emberwatch_server::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
+use emberwatch_server::states_file::Sequences;
+use emberwatch_server::world::{Episode, Flown};
 use ndarray::{Array3, Axis};
 use ndarray_npy::WriteNpyExt;
-use protocol::Move;
-use protocol::control::ServerInfo;
-use protocol::message::{FrameHeader, RobotResult, VERSION};
-use protocol::observer::Sample;
-use protocol::recording::{Event, Reader, Record, Writer};
 use std::io::{Cursor, Write};
 use std::sync::OnceLock;
 use zip::write::SimpleFileOptions;

@@ -1,8 +1,8 @@
 //! Bayes' rule on the cells that a frame shows (paper eqs. 5 and 10).
 
 use crate::estimation::belief::Belief;
+use emberwatch_protocol::{Cell, Frame};
 use ndarray::Array2;
-use protocol::{Cell, Frame};
 use thiserror::Error;
 
 /// A frame that the belief holds impossible.

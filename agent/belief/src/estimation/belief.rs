@@ -3,9 +3,9 @@
 //! Estimators produce beliefs (the `u` and `p` of paper eqs. 5 and 6), objectives read them; the
 //! uncertainty that attracts an exploring robot is their entropy (eq. 14).
 
+use emberwatch_protocol::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
+use emberwatch_protocol::model::Model;
 use ndarray::{ArrayView2, ArrayView3, Axis};
-use protocol::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
-use protocol::model::Model;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 

@@ -6,8 +6,8 @@
 
 use crate::estimation::belief::Belief;
 use crate::estimation::innovation::Innovation;
+use emberwatch_protocol::{Cell, Frame};
 use ndarray::Array2;
-use protocol::{Cell, Frame};
 use serde::{Deserialize, Serialize};
 
 /// Cells further off than this, in rows or columns, are not corrected.

@@ -2,8 +2,8 @@
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
+use emberwatch_protocol::{Frame, Grid};
 use ndarray::Array2;
-use protocol::{Frame, Grid};
 use std::borrow::Cow;
 use std::error::Error as StdError;
 use thiserror::Error;

@@ -8,11 +8,11 @@ use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::parameters::Tables;
+use emberwatch_protocol::frame::Frame;
+use emberwatch_protocol::grid::Probabilities;
+use emberwatch_protocol::model::{Model, ModelError};
+use emberwatch_protocol::transition::Transition;
 use ndarray::{Array2, Array4};
-use protocol::frame::Frame;
-use protocol::grid::Probabilities;
-use protocol::model::{Model, ModelError};
-use protocol::transition::Transition;
 use std::borrow::Cow;
 
 /// Filter of one world.
@@ -156,7 +156,7 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::grid::Shape;
+    use emberwatch_protocol::grid::Shape;
 
     fn frame(shape: Shape, values: &[u8]) -> Frame {
         Frame::from_bytes(shape, 3, values).expect("test frame")

@@ -5,10 +5,10 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
+use emberwatch_protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Model, Shape};
 use ndarray::Array2;
-use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
-use protocol::randomness::split_mix;
-use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 

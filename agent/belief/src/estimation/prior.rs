@@ -1,10 +1,10 @@
 //! What a filter believes before its first frame: the predictor `u_0` of paper section III.A.
 
 use crate::estimation::belief::Belief;
-use protocol::dynamics::Dynamics;
-use protocol::grid::{Probabilities, Shape};
-use protocol::model::{Model, ModelError};
-use protocol::randomness::{Purpose, stream};
+use emberwatch_protocol::dynamics::Dynamics;
+use emberwatch_protocol::grid::{Probabilities, Shape};
+use emberwatch_protocol::model::{Model, ModelError};
+use emberwatch_protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 

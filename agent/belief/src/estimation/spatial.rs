@@ -13,8 +13,8 @@ use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+use emberwatch_protocol::Frame;
 use ndarray::Array2;
-use protocol::Frame;
 use std::borrow::Cow;
 
 /// How ages and sums are written. The limit is more than any grid's.
@@ -30,6 +30,17 @@ pub struct SpatialFilter {
     correlations: Correlations,
     ages: Ages,
     spread: Spread,
+}
+
+/// A filter, whose corrections reach the neighbours of visited cells if their correlations with a state are given.
+pub fn correcting(
+    filter: BayesFilter,
+    neighbours: Option<(usize, Correlations)>,
+) -> Box<dyn Estimator> {
+    match neighbours {
+        Some((state, correlations)) => Box::new(SpatialFilter::new(filter, state, correlations)),
+        None => Box::new(filter),
+    }
 }
 
 impl SpatialFilter {

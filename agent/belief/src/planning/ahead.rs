@@ -4,7 +4,7 @@
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use protocol::Grid;
+use emberwatch_protocol::Grid;
 
 /// Paths that are planned at once: of T = 12 moves, they reach most of a grid of 64 x 64 cells.
 const N_PATHS: usize = 6;
@@ -70,7 +70,7 @@ fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::Cell;
+    use emberwatch_protocol::Cell;
 
     #[test]
     fn a_promise_fades_with_the_way_to_it() {
@@ -102,6 +102,6 @@ mod tests {
             seed: 0,
             step: 0,
         });
-        assert_eq!(plan.moves, [protocol::Move::Down; 4]);
+        assert_eq!(plan.moves, [emberwatch_protocol::Move::Down; 4]);
     }
 }

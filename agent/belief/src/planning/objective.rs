@@ -2,9 +2,9 @@
 //! maximise (the costs `c_1` and `c_2` of paper eqs. 13 and 14, with the sign turned).
 
 use crate::estimation::belief::{Belief, EntropyKind};
+use emberwatch_protocol::grid::{Cell, Grid, Shape};
+use emberwatch_protocol::path::Move;
 use ndarray::ArrayView2;
-use protocol::grid::{Cell, Grid, Shape};
-use protocol::path::Move;
 use serde::{Deserialize, Serialize};
 
 /// Worth of a distinct cell to beam search beside its probability: just enough that a robot in the
@@ -152,7 +152,7 @@ impl CellValues {
         self.revisits
     }
 
-    /// Score of the path flown from `start` by [`protocol::path::fly`]'s rules.
+    /// Score of the path flown from `start` by [`emberwatch_protocol::path::fly`]'s rules.
     pub fn score(&self, start: Cell, moves: &[Move]) -> f32 {
         let mut seen = vec![false; self.shape.n_cells()];
         let mut cell = start;

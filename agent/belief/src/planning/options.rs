@@ -7,8 +7,8 @@ use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use protocol::path::fly;
-use protocol::{Cell, Grid};
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::{Cell, Grid};
 
 /// What a path is for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -265,8 +265,8 @@ mod tests {
     use super::*;
     use crate::estimation::belief::Belief;
     use crate::planning::memory::Memory;
-    use protocol::randomness::split_mix;
-    use protocol::{Frame, Move, Probabilities, Shape};
+    use emberwatch_protocol::randomness::split_mix;
+    use emberwatch_protocol::{Frame, Move, Probabilities, Shape};
 
     fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");

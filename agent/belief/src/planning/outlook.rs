@@ -2,8 +2,8 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::planning::memory::{Memory, Recent};
+use emberwatch_protocol::{Cell, Grid, Shape};
 use ndarray::Zip;
-use protocol::{Cell, Grid, Shape};
 
 /// A region is the cells within so many rows and columns of its centre, cut at the grid's edge.
 pub const REGION_RADIUS: usize = 6;
@@ -165,8 +165,9 @@ mod tests {
 
     fn outlook(height: usize, width: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");
-        let random =
-            |(row, col)| (protocol::randomness::split_mix(row as u64, col as u64) % 3) as u8;
+        let random = |(row, col)| {
+            (emberwatch_protocol::randomness::split_mix(row as u64, col as u64) % 3) as u8
+        };
         let states = Grid::from_shape_fn((height, width), random);
         let belief = Belief::from_states(&states, 3).expect("valid states");
         Outlook::new(&belief, 2, &Memory::new(shape), 12)

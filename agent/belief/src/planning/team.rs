@@ -5,9 +5,9 @@
 
 use crate::planning::objective::CellValues;
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use protocol::Cell;
-use protocol::path::fly;
-use protocol::randomness::split_mix;
+use emberwatch_protocol::Cell;
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::randomness::split_mix;
 
 /// How often each robot answers the others' paths.
 pub const ROUNDS: usize = 2;

@@ -2,9 +2,9 @@
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Move, Probabilities, Shape};
 use proptest::prelude::*;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Move, Probabilities, Shape};
 
 /// Seed and step of the planners' random numbers.
 pub const RANDOM: (u64, u64) = (3, 5);

@@ -5,9 +5,9 @@ use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
 use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
 };
+use emberwatch_protocol::path::fly;
+use emberwatch_protocol::{Cell, Move, Shape};
 use proptest::prelude::*;
-use protocol::path::fly;
-use protocol::{Cell, Move, Shape};
 use std::collections::BTreeSet;
 
 /// Robots, and what cells are worth to them.

@@ -13,13 +13,13 @@
 
 use crate::golden_file::{Golden, frame_from};
 use candle_core::Tensor;
-use ndarray::{Array, Array1, Array3, Array4, ArrayD, Axis, IxDyn};
-use network::{
+use emberwatch_network::{
     AdamSettings, Autoencoder, AutoencoderSettings, Device, Dropout, NetworkError, NetworkShape,
     Pass, Window,
 };
-use protocol::frame::{Frame, UNOBSERVED};
-use protocol::grid::Shape;
+use emberwatch_protocol::frame::{Frame, UNOBSERVED};
+use emberwatch_protocol::grid::Shape;
+use ndarray::{Array, Array1, Array3, Array4, ArrayD, Axis, IxDyn};
 use std::borrow::Borrow;
 
 fn names(golden: &mut Golden) -> Vec<String> {

@@ -1,9 +1,9 @@
 //! Arrays of the authors' runs, in this crate's `tests/data`.
 
+use emberwatch_protocol::frame::{Frame, UNOBSERVED};
+use emberwatch_protocol::grid::Shape;
 use ndarray::{Array, ArrayView2, Dimension};
 use ndarray_npy::{NpzReader, ReadableElement};
-use protocol::frame::{Frame, UNOBSERVED};
-use protocol::grid::Shape;
 use std::fs::File;
 
 pub struct Golden(pub NpzReader<File>);

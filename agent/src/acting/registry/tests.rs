@@ -5,10 +5,10 @@ use crate::learning::learners::Worlds;
 use crate::learning::learners::decisions::SHAPE;
 use crate::learning::learners::filter::fit::FilterFit;
 use crate::learning::learners::network::Progress;
-use ::network::{Device, Dqn, DqnSettings, DqnShape};
 use anyhow::Result;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Grid};
+use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Grid};
 use std::sync::Arc;
 
 const N_MOVES: usize = 6;
@@ -151,7 +151,7 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         learned.decisions = Some(LearnedDecisions {
             beam_width: 30,
             scorer: Arc::new(scorer),
-            estimator: EstimatorKind::KnownModel,
+            estimator: EstimatorKind::KNOWN,
             basis,
         });
         assert_eq!(plans("known_policy", &other, &learned), expected);
@@ -171,7 +171,7 @@ fn decisions_are_planned_with_the_beam_that_they_were_learned_with() {
     let learned = Learned {
         decisions: Some(LearnedDecisions {
             scorer: Arc::new(scorer),
-            estimator: EstimatorKind::KnownModel,
+            estimator: EstimatorKind::KNOWN,
             basis: BasisKind::Predictor,
             beam_width: 30,
         }),

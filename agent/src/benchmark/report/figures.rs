@@ -8,9 +8,9 @@ use crate::benchmark::report::teams::teams;
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::belief::Belief;
-use figures::{Bar, Color, Ladder, Named};
-use protocol::model::parse_color;
-use protocol::{Cell, Frame, Grid, Model};
+use emberwatch_figures::{Bar, Color, Ladder, Named};
+use emberwatch_protocol::model::parse_color;
+use emberwatch_protocol::{Cell, Frame, Grid, Model};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -69,7 +69,7 @@ pub fn save(path: &Path, svg: &str) -> Result<()> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
     match is_svg {
         true => replace_file(path, svg.as_bytes(), Readers::Any),
-        false => replace_file(path, &figures::png(svg)?, Readers::Any),
+        false => replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any),
     }
 }
 
@@ -204,7 +204,7 @@ pub fn draw_snapshot(
         .map(|it| named(&it.name, &it.color));
     let belief = snapshot.belief.as_ref().map(Belief::view);
     let beliefs = belief.iter().flat_map(|belief| belief.outer_iter());
-    let page = figures::Snapshot {
+    let page = emberwatch_figures::Snapshot {
         title: format!("{}, step k = {}", model.name(), snapshot.step),
         note: format!(
             "world seed {}, {} x {} cells",

@@ -4,7 +4,7 @@
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use figures::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
+use emberwatch_figures::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
 use std::collections::BTreeSet;
 
 /// More points are hardly seen, but fill files.

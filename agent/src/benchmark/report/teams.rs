@@ -3,7 +3,7 @@
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use figures::{Curve, Lines, Panel, Scale};
+use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::collections::BTreeSet;
 
 /// The page of these runs: a curve for each team of each policy, in the order given.

@@ -4,7 +4,7 @@ use crate::benchmark::report::figures::save;
 use crate::benchmark::report::statistics::Estimate;
 use crate::learning::metrics::Rows;
 use anyhow::{Context, Result};
-use figures::{Curve, Lines, Panel, Scale};
+use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 
 /// The figure's names in the folder of a training.

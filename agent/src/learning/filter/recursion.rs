@@ -11,7 +11,7 @@ use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::Operator;
 use crate::learning::replay::Sighting;
 use emberwatch_belief::estimation::parameters::Tables;
-use protocol::Shape;
+use emberwatch_protocol::Shape;
 use pulp::{Arch, Simd, WithSimd};
 
 #[derive(Debug, Clone, PartialEq)]

@@ -11,8 +11,8 @@ use crate::policy::Policy;
 use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Rollout, Seen};
 use emberwatch_belief::planning::Target;
-use protocol::client::Observation;
-use protocol::{Move, Shape};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 

@@ -19,8 +19,8 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{Plan, Target};
-use protocol::client::Observation;
-use protocol::{Move, path};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::{Move, path};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
@@ -109,12 +109,10 @@ impl FilterLearner {
 
     /// What robots that don't walk at random act by.
     fn policy(&self) -> Policy {
-        let (name, estimator) = match self.learned.tables.dimensions.sees_own_state {
-            false => ("learned_beam", EstimatorKind::Learned),
-            true => ("learned_own_beam", EstimatorKind::LearnedOwn),
-        };
+        let estimator = EstimatorKind::learned(self.learned.tables.dimensions.sees_own_state);
+        let name = format!("{}_beam", estimator.family());
         let target = Target::State(self.learned.target);
-        Policy::new(name, estimator, PlannerKind::Beam, target)
+        Policy::new(&name, estimator, PlannerKind::Beam, target)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen learner.

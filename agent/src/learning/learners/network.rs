@@ -20,10 +20,10 @@ use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
 use crate::policy::{Policy, numbered_states};
 use crate::rollout::{Rollout, predict_all, see_all};
-use ::network::{Transition, Window};
 use emberwatch_belief::estimation::belief::Belief;
-use protocol::client::Observation;
-use protocol::{Move, path};
+use emberwatch_network::{Transition, Window};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::{Move, path};
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "autoencoder";

@@ -14,10 +14,10 @@ use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
     BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
 };
-use protocol::client::Observation;
-use protocol::message::{RobotResult, WorldResult};
-use protocol::randomness::split_mix;
-use protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::randomness::split_mix;
+use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
@@ -67,7 +67,7 @@ fn learned_beam() -> Policy {
     let target = Target::State(0);
     Policy::new(
         "learned_beam",
-        EstimatorKind::Learned,
+        EstimatorKind::LEARNED,
         PlannerKind::Beam,
         target,
     )
@@ -147,7 +147,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
             };
             vec![path(config, &policy, objective, belief, step)]
         });
-        let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
+        let progress = Progress::first(&worlds(), config, &emberwatch_network::Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check(learner, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);
@@ -156,7 +156,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
         });
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
-        let base = Base::known(EstimatorKind::KnownModel, filter, &model);
+        let base = Base::known(EstimatorKind::KNOWN, filter, &model);
         let learner = DecisionsLearner::new(base, None, worlds(), config).expect("new");
         // The robot remembers what every step showed, and never earns.
         let memory = |step: u64| {
@@ -194,7 +194,10 @@ fn decisions_resume_bit_for_bit() {
         config.decisions.learning.batch,
         config.decisions.updates_per_step,
     ) = (4, 1.0);
-    for kind in [EstimatorKind::LearnedOwn, EstimatorKind::LearnedSpatial] {
+    for kind in [
+        EstimatorKind::learned(true),
+        EstimatorKind::LEARNED.spatial(),
+    ] {
         let dimensions = Dimensions {
             n_states: 3,
             n_observations: 3,

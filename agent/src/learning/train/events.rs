@@ -5,7 +5,7 @@ use crate::learning::metrics::{ModelUpdate, Tick, averages};
 use crate::learning::tensorboard::{EventFile, Value};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use figures::{Heat, heat};
+use emberwatch_figures::{Heat, heat};
 use std::path::Path;
 
 /// Steps of all worlds from one picture to the next.

@@ -11,8 +11,8 @@ use crate::learning::train::spec::TrainingSpec;
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use protocol::control::{CoverageRule, ServerInfo};
-use protocol::{Client, Model, Shape};
+use emberwatch_protocol::control::{CoverageRule, ServerInfo};
+use emberwatch_protocol::{Client, Model, Shape};
 use std::path::Path;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.

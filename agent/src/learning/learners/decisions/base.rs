@@ -5,8 +5,8 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
-use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
-use protocol::{Model, Shape};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use emberwatch_protocol::{Model, Shape};
 
 /// What keeps the beliefs that decisions are made on, before a world's first frame.
 pub struct Base {
@@ -51,13 +51,9 @@ impl Base {
     }
 
     pub(super) fn estimator(&self) -> Box<dyn Estimator> {
-        let filter = self.filter.clone();
-        if self.kind.is_spatial() {
-            let correlations = self.correlations.clone();
-            Box::new(SpatialFilter::new(filter, self.target, correlations))
-        } else {
-            Box::new(filter)
-        }
+        let neighbours = || (self.target, self.correlations.clone());
+        let neighbours = self.kind.is_spatial().then(neighbours);
+        correcting(self.filter.clone(), neighbours)
     }
 
     /// What a checkpoint's decisions are on, if that was learned.

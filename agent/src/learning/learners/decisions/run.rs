@@ -4,10 +4,10 @@ use super::saved::{Held, SavedRun};
 use crate::learning::checkpoint::check;
 use crate::learning::learners::base::place;
 use crate::rollout::Rollout;
-use ::network::{Dqn, Track, Transition};
 use anyhow::Result;
 use emberwatch_belief::planning::Proposal;
-use protocol::Move;
+use emberwatch_network::{Dqn, Track, Transition};
+use emberwatch_protocol::Move;
 
 pub(super) struct Run {
     pub(super) rollout: Rollout,

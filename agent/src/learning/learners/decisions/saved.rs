@@ -6,15 +6,15 @@ use crate::learning::checkpoint::{
 use crate::learning::learners::base::{Place, place};
 use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::EstimatorKind;
-use ::network::{Dqn, DqnShape, NamedTensor, SavedDqn, Track};
 use anyhow::Result;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_belief::planning::{BasisKind, Memory, OPTIONS};
-use protocol::Shape;
-use protocol::client::Observation;
+use emberwatch_network::{Dqn, DqnShape, NamedTensor, SavedDqn, Track};
+use emberwatch_protocol::Shape;
+use emberwatch_protocol::client::Observation;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -197,8 +197,8 @@ pub(super) fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = Named
 mod tests {
     use super::*;
     use crate::config::AgentConfig;
-    use protocol::Frame;
-    use protocol::message::{RobotResult, WorldResult};
+    use emberwatch_protocol::Frame;
+    use emberwatch_protocol::message::{RobotResult, WorldResult};
 
     #[test]
     fn what_is_wrong_with_a_checkpoint_is_named() {
@@ -206,7 +206,7 @@ mod tests {
         let dqn = Dqn::new(config.decisions.settings(), SHAPE, 3);
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: EstimatorKind::KnownModel,
+            estimator: EstimatorKind::KNOWN,
             model: None,
             world_steps: 7,
             earned: 0.5,

@@ -9,12 +9,12 @@ use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
-use ::network::NamedTensor;
 use anyhow::Result;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
-use protocol::{Frame, Shape};
+use emberwatch_network::NamedTensor;
+use emberwatch_protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
 
 pub const KIND: &str = "learned_filter";

@@ -9,14 +9,14 @@ use crate::learning::learners::base::{Place, Worlds, place};
 use crate::learning::reward::RewardEstimate;
 use crate::policy::Policy;
 use crate::rollout::Rollout;
-use ::network::{
-    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
-};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::BasisKind;
-use protocol::model::MAX_VALUES;
-use protocol::{Frame, Shape};
+use emberwatch_network::{
+    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
+};
+use emberwatch_protocol::model::MAX_VALUES;
+use emberwatch_protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
 
 /// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
