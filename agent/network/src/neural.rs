@@ -13,7 +13,7 @@ use crate::unet::UNet;
 use crate::variables::{Variables, build};
 use candle_core::{D, DType, Device, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
-use protocol::grid::Probabilities;
+use emberwatch_protocol::grid::Probabilities;
 use std::fmt;
 use std::sync::Arc;
 
@@ -78,6 +78,23 @@ impl NeuralBelief {
     /// Its parameters.
     pub fn variables(&self) -> &Variables {
         self.adam.variables()
+    }
+
+    /// Its parameters as plain numbers.
+    pub fn parameters(&self) -> Result<Vec<NamedTensor>, NetworkError> {
+        Ok(named_numbers(&[("", self.variables())])?)
+    }
+
+    /// Takes over what [`Self::parameters`] gave. `find` gives the numbers of a name and shape.
+    ///
+    /// # Errors
+    /// As of `find`, or where the device fails; nothing has changed then.
+    pub fn set_parameters<E: From<NetworkError>>(
+        &mut self,
+        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+    ) -> Result<(), E> {
+        let changes = found(&[("", self.variables())], find)?;
+        Ok(set(&changes).map_err(NetworkError::from)?)
     }
 
     /// The distribution of what each cell will show in the present step, `[O, H, W]`.
