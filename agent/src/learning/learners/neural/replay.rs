@@ -164,7 +164,9 @@ mod tests {
     /// Robots 3 and 4 see the steps' numbers, in cells of their own.
     fn replay(n_steps: usize, max_frames: usize) -> Replay {
         let mut replay = Replay::new(max_frames);
-        [3, 4].map(|robot| replay.begin(robot, shape()));
+        [3, 4]
+            .into_iter()
+            .for_each(|robot| replay.begin(robot, shape()));
         for step in 0..n_steps {
             for robot in [3, 4] {
                 let mut frame = Frame::empty(shape());
@@ -189,7 +191,7 @@ mod tests {
         for Lesson { before, frame } in lessons {
             let (cell, value) = frame[0];
             match before.last(cell) {
-                Some((last, age)) => assert_eq!((u32::from(last) + age) % 100, value.into()),
+                Some((last, age)) => assert_eq!((u32::from(last) + age) % 100, u32::from(value)),
                 None => assert_eq!(value, 0),
             }
             assert_eq!(before.last(1 - cell), None);
