@@ -363,8 +363,8 @@ mod tests {
         let words = "expected a checkpoint of others, got one of tests";
         assert_eq!(refused("others", "kernel", "kernel"), words);
         for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"3""#, "none")] {
-            let words = format!("emberwatch.format: expected 2, got {got}");
-            assert_eq!(refused("tests", r#"format":"2""#, to), words);
+            let words = format!("emberwatch.format: expected 3, got {got}");
+            assert_eq!(refused("tests", r#"format":"3""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
