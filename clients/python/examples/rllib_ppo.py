@@ -18,10 +18,11 @@ from ray.tune.registry import register_env
 
 
 def make(settings: dict[str, Any]) -> gymnasium.Env:
-    """Makes the environment, in the runner's process."""
+    """Makes the environment, in the runner's process; RLlib wants observations of one axis."""
     import emberwatch  # noqa: F401  (registers the environments there)
 
-    return gymnasium.make("emberwatch/WildfireObjective-v1", **settings)
+    env = gymnasium.make("emberwatch/WildfireObjective-v1", **settings)
+    return gymnasium.wrappers.FlattenObservation(env)
 
 
 def main() -> None:

@@ -253,7 +253,7 @@ mod tests {
 
     #[test]
     fn the_built_in_model_has_the_published_parameters() {
-        // DESIGN: g = 0.1, a0 = 0.9999, a1 = 0.99992, a2 = 0.999; the authors' kernel.
+        // Factors g = 0.1, a0 = 0.9999, a1 = 0.99992, a2 = 0.999; the authors' kernel.
         let model = Model::wildfire();
         let around = [[0.1, 0.1, 0.1], [0.1, 1.0, 0.1], [0.1, 0.1, 0.1]];
         let drift = [[0.12, 0.12, 0.12], [0.1, 1.0, 0.1], [0.08, 0.08, 0.08]];

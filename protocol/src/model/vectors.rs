@@ -12,7 +12,7 @@ pub fn vectorised<R>(work: impl FnMut() -> R) -> R {
 
 struct Work<F>(F);
 
-// For what is called by reference: calls of a closure by value are not inlined in any case.
+// By reference, as a closure called by value is not always inlined.
 impl<R, F: FnMut() -> R> WithSimd for Work<F> {
     type Output = R;
 

@@ -156,7 +156,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
             NodeState::Alive(node) => _ = living.insert(node.id().value()),
             NodeState::Inaccessible(id) => _ = living.insert(id.value()),
             NodeState::Dead(node) => dead.push(node),
-            // It died in its start, or it could not be read.
+            // Its process died while it started, or its files cannot be read.
             NodeState::Undefined(id) => unclear.push(id.value()),
         }
         CallbackProgression::Continue
@@ -174,7 +174,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
 /// Whether a node lives in another PID namespace: the process that holds its lock has another number here, or none.
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
-    // To close that of a node of this process would end its lock.
+    // The lock of a node of this process would end if its file were opened and closed here.
     if own_nodes::has(node) {
         return false;
     }

@@ -67,7 +67,7 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
 impl ChannelFiles {
     /// The first error ends it: what cannot be read may belong to a process that lives.
     fn remove_leftovers(&self, config: &Config) -> Result<usize, Error> {
-        // Files before nodes and their tags: what a client without turns makes meanwhile is not among them.
+        // Files are listed before nodes and tags, so that files made meanwhile by a client without turns are not in the list.
         let list = |folder: &str| entries(&self.root.join(folder));
         let (node_files, services) = (list("nodes")?, list("services")?);
         let mut ports = self.segments()?;
@@ -77,11 +77,11 @@ impl ChannelFiles {
         let mut n_removed = self.remove_unfinished(&used)?;
         for node in dead {
             let id = node.id().value();
-            // Unfinished tags were for nothing yet, but iceoryx2 could not remove the folder.
+            // iceoryx2 cannot remove a folder with unfinished tags; no service uses these yet.
             n_removed += remove_if(entries(&self.folder(id))?, is_writable)?;
             let has_details = node.details().is_some();
             let details = self.folder(id).join(format!("{}node.details", self.prefix));
-            // Else nothing of it is in memory that others use; the details go last.
+            // Without details it uses no service, as these are removed last.
             let is_shared =
                 has_details && !used.hashes.is_disjoint(&self.tags(id, ".service_tag")?);
             let is_unread = !has_details && metadata(&details)?.is_some();
@@ -100,7 +100,7 @@ impl ChannelFiles {
     fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
             let ids = self.ids(path);
-            // A port of another PID namespace, whose process cannot be asked for, may grow now.
+            // It may be of a port that grows now in another PID namespace, whose process cannot be checked.
             let is_of_living = ids.iter().any(|id| used.ids.contains(id));
             Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn an_unfinished_segment_is_waited_for_but_not_without_end() {
-        // Where nothing stays in the way of others if this process is killed.
+        // In the temporary folder: what is left there if this process is killed harms nobody.
         let files = ChannelFiles {
             shared: std::env::temp_dir(),
             ..files_of_test("unfinished")
@@ -253,7 +253,7 @@ mod tests {
         assert!(is_young, "ids are of our clock: {port}");
         let hash = "0123456789abcdef".repeat(3)[..40].to_owned();
         let segment = |name: String| files.shared.join(format!("{prefix}{hash}_{name}"));
-        // Grows now; is in the making by a client without turns; is connected to a living port.
+        // Three that stay: of a port that grows, of one that a client without turns makes, of a connection to a living one.
         make(segment(format!("{port}__2.data")), 0o200);
         make(segment(format!("{new}.dynamic")), 0o200);
         create_dir(root.join(format!("nodes/{new}"))).expect("a folder");

@@ -258,7 +258,7 @@ fn shake_hands(
         client: client.into(),
     };
     match ask(control, exchange, 1, &hello, timeout)? {
-        // A process of the server's number may be another one here.
+        // In another PID namespace, the server's process id names another process or none.
         Reply::Hello(info)
             if info
                 .pid_namespace

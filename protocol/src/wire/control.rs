@@ -95,7 +95,7 @@ pub enum Request {
         offset: u64,
     },
     /// What is the state of the server and its worlds?
-    // Braces, so that unknown keys are refused here too.
+    // A variant with braces: serde refuses unknown keys of it, but not of a unit variant.
     Status {},
     /// Stop the server.
     Shutdown {},

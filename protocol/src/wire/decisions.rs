@@ -27,7 +27,7 @@ pub enum Request {
         objectives: Vec<Option<u64>>,
     },
     /// What did the last decisions give? Changes nothing.
-    // Braces, so that unknown keys are refused here too.
+    // A variant with braces: serde refuses unknown keys of it, but not of a unit variant.
     Last {},
     /// Release the worlds and end the agent.
     Shutdown {},

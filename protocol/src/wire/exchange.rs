@@ -130,7 +130,7 @@ impl Exchange {
         let descriptors = [descriptor(&self.listener), self.server_process.descriptor()];
         let readable = sleep_until_readable(&descriptors, timeout)
             .map_err(ipc_error("wait for the server"))?;
-        // Now, as wake-ups that are left end the next sleep at once.
+        // Wake-ups that are left would end the next sleep at once.
         drain(&self.listener)?;
         Ok(readable[1])
     }
@@ -155,7 +155,7 @@ pub(super) fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // In the words of the commands that connect this way; not all of them can.
+                // Names the flag of the commands that connect this way; not all of them have it.
                 Status::Busy => format!(
                     "busy: held by pid {detail}; wait for its release, or take over with the flag \
                      --takeover of `emberwatch-agent run`"

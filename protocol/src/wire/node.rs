@@ -31,7 +31,7 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
         .signal_handling_mode(SignalHandlingMode::Disabled);
     let node = node.create().map_err(ipc_error("create a node"))?;
     own_nodes::add(node.id().value());
-    // Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
+    // iceoryx2 makes the counter of nodes, which comes with the first node, writable for everybody.
     own_segments(shared_memory, &prefix())?;
     Ok(node)
 }
@@ -77,7 +77,7 @@ impl<T> Drop for Opened<T> {
         let _turn = Turn::take_within(SHORT_WAIT);
         let ports = self.ports.take();
         if self.entries.check().is_err() {
-            // Files of the same names are other programs' by now.
+            // Other programs may have made files of the same names by now.
             std::mem::forget(ports);
         }
     }
@@ -92,7 +92,7 @@ fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelErr
         if !name.as_encoded_bytes().starts_with(prefix.as_bytes()) {
             continue;
         }
-        // What is gone by now belonged to a process that ended.
+        // A file that is gone by now belonged to a process that ended.
         let Ok(found) = entry.metadata() else {
             continue;
         };

@@ -62,7 +62,7 @@ pub fn node_pid(id: u128) -> i32 {
 /// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is no such process.
 pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
     let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;
-    // After its name, which may hold anything, in brackets.
+    // The state follows the name, which is in brackets and may hold brackets.
     Ok(stat.and_then(|stat| stat.rsplit_once(") ")?.1.chars().next()))
 }
 
@@ -71,7 +71,7 @@ pub(crate) fn if_there<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(found) => Ok(Some(found)),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-        // Of a file in `/proc` that was opened before its process ended.
+        // The process ended after its file in `/proc` was opened.
         Err(error) if error.raw_os_error() == Some(Errno::SRCH.raw_os_error()) => Ok(None),
         Err(error) => Err(error),
     }

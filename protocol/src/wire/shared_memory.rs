@@ -58,7 +58,7 @@ impl MessageMemory {
         let files = ChannelFiles::of_user();
         let wrong =
             |error: std::io::Error| directory_error(SHARED_MEMORY.as_ref(), error.to_string());
-        // Memory that may grow has the number of its first file in its name.
+        // iceoryx2 numbers the files of memory that may grow.
         let ends = [format!("_{port}.data"), format!("_{port}__0.data")];
         let is_of_port = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();

@@ -149,7 +149,7 @@ fn holder(file: &OwnedFd) -> Option<i32> {
     let (major, minor) = (major(found.st_dev), minor(found.st_dev));
     let inode = format!("{major:02x}:{minor:02x}:{}", found.st_ino);
     let locks = std::fs::read_to_string("/proc/locks").ok()?;
-    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; waiting processes have an arrow in front.
+    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a line of a waiting process begins with an arrow.
     locks.lines().find_map(|line| {
         let words: Vec<&str> = line.split_whitespace().collect();
         match words[..] {

@@ -12,7 +12,7 @@ const N_PATHS: usize = 6;
 /// Worth of a path's cells beside those of the path before it: what a later path finds may have burnt out by then.
 const DISCOUNT: f32 = 0.8;
 
-/// Plans [`N_PATHS`] paths and gives the first.
+/// Plans six paths and gives the first.
 #[derive(Debug)]
 pub struct Ahead(BeamSearch);
 

@@ -67,9 +67,10 @@ impl Snapshot {
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
-    match is_svg {
-        true => replace_file(path, svg.as_bytes(), Readers::Any),
-        false => replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any),
+    if is_svg {
+        replace_file(path, svg.as_bytes(), Readers::Any)
+    } else {
+        replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any)
     }
 }
 

@@ -236,6 +236,6 @@ fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
             small.push(over);
         }
     }
-    // What is left on either list is one but for rounding: such slots stay whole.
+    // The slots left on either list have a share of one but for rounding: they stay whole.
     slots
 }

@@ -141,7 +141,7 @@ pub(super) fn taps_that_weigh_alike(
     let is_own = |tap| kernels.len() > 1 && tap == (kernel_height / 2, kernel_width / 2);
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
-        // Sums within one state alone keep what all kernels alike have always predicted, to the bit.
+        // If all kernels are alike, sums are taken within one state alone: another order would change the last bits.
         let first = if kernels.len() > 1 { 0 } else { groups.len() };
         for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
             let columns = kernels
