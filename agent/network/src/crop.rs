@@ -2,7 +2,6 @@
 
 use crate::unet::ALIGNMENT;
 use emberwatch_protocol::grid::Shape;
-use std::ops::RangeInclusive;
 
 /// Cells that a crop has beyond those to predict, on both sides together: what lies further away says little of them.
 const MARGINS: usize = 24;
@@ -17,7 +16,7 @@ pub struct Crop {
 }
 
 /// The first and the last row of some cells, then their columns.
-pub(crate) type Extent = [RangeInclusive<usize>; 2];
+pub(crate) type Extent = [[usize; 2]; 2];
 
 impl Crop {
     /// The whole of a grid.
@@ -33,7 +32,7 @@ impl Crop {
     pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
         let whole = Self::whole(shape);
         [0, 1].map(|axis| {
-            let spans = extents.iter().map(|extent| extent[axis].clone().count());
+            let spans = extents.iter().map(|it| it[axis][1] + 1 - it[axis][0]);
             let side = spans.max().unwrap_or(0) + MARGINS;
             side.next_multiple_of(ALIGNMENT).min(whole.sides[axis])
         })
@@ -43,7 +42,7 @@ impl Crop {
     pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
         let whole = Self::whole(shape);
         let first = [0, 1].map(|axis| {
-            let middle = (extent[axis].start() + extent[axis].end()).div_ceil(2);
+            let middle = (extent[axis][0] + extent[axis][1]).div_ceil(2);
             let most = whole.sides[axis] - sides[axis];
             let first = middle.saturating_sub(sides[axis] / 2).min(most);
             // The strides fall as on the whole grid.
@@ -53,20 +52,19 @@ impl Crop {
     }
 }
 
-/// The extent of some cells by their row-major index, at least one.
-pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize> + Clone) -> Extent {
-    let (_, width) = shape.dim();
-    let axis = |places: &mut dyn Iterator<Item = usize>| {
-        let range = places.fold(usize::MAX..=0, |range, at| {
-            at.min(*range.start())..=at.max(*range.end())
-        });
-        assert!(!range.is_empty(), "cells: expected at least one");
-        range
-    };
-    [
-        axis(&mut cells.clone().map(|cell| cell / width)),
-        axis(&mut cells.map(|cell| cell % width)),
-    ]
+/// The extent of some cells by their row-major index.
+///
+/// # Panics
+/// If there is none.
+pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize>) -> Extent {
+    let mut extent = [[usize::MAX, 0]; 2];
+    for cell in cells.map(|cell| shape.cell(cell)) {
+        for ([first, last], at) in extent.iter_mut().zip([cell.row, cell.col]) {
+            (*first, *last) = (at.min(*first), at.max(*last));
+        }
+    }
+    assert!(extent[0][0] < usize::MAX, "cells: expected at least one");
+    extent
 }
 
 #[cfg(test)]
@@ -76,13 +74,13 @@ mod tests {
     #[test]
     fn crops_hold_their_cells_with_margins_up_to_the_edges() {
         let shape = Shape::new(70, 30).expect("test shape");
-        let extents = [extent(shape, [33, 95].into_iter()), [50..=69, 0..=9]];
-        assert_eq!(extents[0], [1..=3, 3..=5]);
+        let extents = [extent(shape, [33, 95].into_iter()), [[50, 69], [0, 9]]];
+        assert_eq!(extents[0], [[1, 3], [3, 5]]);
         let sides = Crop::sides(shape, &extents);
         assert_eq!(sides, [44, 32], "20 rows and margins; the whole width");
         let first = |extent| Crop::around(shape, sides, extent).first;
         assert_eq!(first(&extents[0]), [0, 0]);
         assert_eq!(first(&extents[1]), [28, 0]);
-        assert_eq!(first(&[30..=49, 0..=9]), [16, 0]);
+        assert_eq!(first(&[[30, 49], [0, 9]]), [16, 0]);
     }
 }

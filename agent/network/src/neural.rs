@@ -199,7 +199,7 @@ impl NeuralBelief {
 }
 
 impl Lesson {
-    fn cells(&self) -> impl Iterator<Item = usize> + Clone + '_ {
+    fn cells(&self) -> impl Iterator<Item = usize> {
         self.frame.iter().map(|(cell, _)| *cell)
     }
 }

@@ -9,7 +9,7 @@ use emberwatch_protocol::Shape;
 
 #[derive(Debug, Clone, PartialEq)]
 pub enum LearnedBelief {
-    Filter(LearnedModel),
+    Filter(Box<LearnedModel>),
     Neural(NeuralModel),
 }
 

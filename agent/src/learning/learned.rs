@@ -60,8 +60,8 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            fit::KIND => self.add_belief(LearnedBelief::Filter(filter(&contents, false)?)),
-            fit::OWN_KIND => self.add_belief(LearnedBelief::Filter(filter(&contents, true)?)),
+            fit::KIND => self.add_belief(filter(&contents, false)?),
+            fit::OWN_KIND => self.add_belief(filter(&contents, true)?),
             neural::KIND => {
                 let model = NeuralModel::read(&contents, device)?;
                 self.add_belief(LearnedBelief::Neural(model))
@@ -86,9 +86,9 @@ impl Learned {
         match belief {
             LearnedBelief::Neural(model) => put(&mut self.neural, model),
             LearnedBelief::Filter(model) if model.tables.dimensions.sees_own_state => {
-                put(&mut self.own_filter, model)
+                put(&mut self.own_filter, *model)
             }
-            LearnedBelief::Filter(model) => put(&mut self.filter, model),
+            LearnedBelief::Filter(model) => put(&mut self.filter, *model),
         }
     }
 
@@ -114,7 +114,8 @@ impl Learned {
             EstimatorKind::Neural => return self.neural.clone().map(LearnedBelief::Neural),
             _ => return None,
         };
-        filter.clone().map(LearnedBelief::Filter)
+        let filter = filter.clone().map(Box::new);
+        filter.map(LearnedBelief::Filter)
     }
 
     /// The policies that act on it: those of beliefs, of the autoencoder, and of decisions.
@@ -149,7 +150,7 @@ impl Learned {
     }
 }
 
-fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
+fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedBelief> {
     let mut saved = contents.state::<SavedFilter>()?.fit;
     let dimensions = Dimensions {
         sees_own_state,
@@ -158,5 +159,5 @@ fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
     let dimensions = dimensions.check();
     let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
     saved.load(contents, dimensions)?;
-    Ok(saved.learned())
+    Ok(LearnedBelief::Filter(Box::new(saved.learned())))
 }

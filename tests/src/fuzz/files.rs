@@ -173,7 +173,7 @@ fn decisions() -> Contents {
 
 fn base_of_filter() -> Base {
     let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
-    let belief = LearnedBelief::Filter(fit.learned());
+    let belief = LearnedBelief::Filter(Box::new(fit.learned()));
     Base::learned(EstimatorKind::LEARNED, belief, worlds().shape)
 }
 

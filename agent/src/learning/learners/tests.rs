@@ -218,7 +218,7 @@ fn decisions_resume_bit_for_bit() {
             sees_own_state,
         };
         let fit = FilterFit::new(dimensions, worlds().shape, &config);
-        LearnedBelief::Filter(fit.learned())
+        LearnedBelief::Filter(Box::new(fit.learned()))
     };
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let neural = NeuralModel { network, target: 1 };

@@ -20,7 +20,7 @@ pub struct Base {
 
 /// Where a belief begins.
 enum Start {
-    Known(BayesFilter),
+    Known(Box<BayesFilter>),
     Learned(LearnedBelief, Shape),
 }
 
@@ -31,7 +31,7 @@ impl Base {
             kind,
             target: model.target_state(),
             state_names: model.state_names(),
-            start: Start::Known(filter),
+            start: Start::Known(Box::new(filter)),
         }
     }
 
@@ -57,7 +57,7 @@ impl Base {
         match &self.start {
             Start::Known(filter) => {
                 let neighbours = || (self.target, Correlations::default());
-                Ok(correcting(filter.clone(), is_spatial.then(neighbours)))
+                Ok(correcting(*filter.clone(), is_spatial.then(neighbours)))
             }
             Start::Learned(belief, shape) => belief.estimator(is_spatial, *shape),
         }

@@ -70,7 +70,7 @@ pub(super) enum SavedBelief {
     Filter {
         dimensions: Dimensions,
         target: usize,
-        correlations: Correlations,
+        correlations: Box<Correlations>,
     },
     Neural {
         n_observations: usize,
@@ -115,7 +115,7 @@ impl SavedBelief {
             LearnedBelief::Filter(model) => Self::Filter {
                 dimensions: model.tables.dimensions,
                 target: model.target,
-                correlations: model.correlations.clone(),
+                correlations: Box::new(model.correlations.clone()),
             },
             LearnedBelief::Neural(model) => Self::Neural {
                 n_observations: model.network.n_observations(),
@@ -154,8 +154,8 @@ impl SavedDecisions {
                 for (at, shape) in dimensions.shapes().iter().enumerate() {
                     parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
                 }
-                let model = LearnedModel::new(parameters, *target, correlations.clone());
-                Ok(Some(LearnedBelief::Filter(model)))
+                let model = LearnedModel::new(parameters, *target, *correlations.clone());
+                Ok(Some(LearnedBelief::Filter(Box::new(model))))
             }
             &Some(SavedBelief::Neural {
                 n_observations,
