@@ -1,9 +1,9 @@
 //! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11)
-//! and the DQN (section III.E).
+//! and the DQN (section III.E); and the neural belief, which learns by the autoencoder's loss and keeps space.
 //!
 //! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`]
-//! (its updates and steps), [`Adam`], [`Dqn`]. Layers take their variables from a `VarBuilder` of
-//! [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence and decoder have an
+//! (its updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`]. Layers take their
+//! variables from a `VarBuilder` of [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence, decoder and U-Net have an
 //! operator of ours with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on
 //! GPUs.
 //!
