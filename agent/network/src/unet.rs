@@ -59,28 +59,22 @@ impl UNet {
             Layer::new(&vb.pp(name), channels, conv, is_stock, name == "head")
         };
         let (same, strided, point) = ([3, 1, 1], [3, 2, 1], [1, 1, 1]);
+        let pair = |name: &str, from: usize, to: usize, first| -> Result<[Layer; 2]> {
+            Ok([
+                layer(&format!("{name}.0"), [from, to], first)?,
+                layer(&format!("{name}.1"), [to, to], same)?,
+            ])
+        };
         Ok(Self {
             full: layer("full", [n_features, full], same)?,
             down: [
-                [
-                    layer("down.0.0", [full, half], strided)?,
-                    layer("down.0.1", [half, half], same)?,
-                ],
-                [
-                    layer("down.1.0", [half, quarter], strided)?,
-                    layer("down.1.1", [quarter, quarter], same)?,
-                ],
+                pair("down.0", full, half, strided)?,
+                pair("down.1", half, quarter, strided)?,
             ],
             wide: layer("wide", [quarter, quarter], [3, 1, 2])?,
             up: [
-                [
-                    layer("up.0.0", [quarter, half], point)?,
-                    layer("up.0.1", [half, half], same)?,
-                ],
-                [
-                    layer("up.1.0", [half, full], point)?,
-                    layer("up.1.1", [full, full], same)?,
-                ],
+                pair("up.0", quarter, half, point)?,
+                pair("up.1", half, full, point)?,
             ],
             head: layer("head", [full, n_observations], point)?,
         })

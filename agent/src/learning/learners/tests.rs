@@ -142,14 +142,15 @@ fn learners_plan_on_the_belief_that_settings_say() {
             sees_own_state: false,
         };
         let learner = FilterLearner::new(dimensions, worlds(), config);
-        check(learner, basis, |belief, target, step| {
+        let beam = |belief: &Belief, target: usize, step: u64| {
             let policy = learned_beam();
             let objective = Objective {
                 target: Target::State(target),
                 ..config.objective(&policy)
             };
             vec![path(config, &policy, objective, belief, step)]
-        });
+        };
+        check(learner, basis, beam);
         let progress = Progress::first(&worlds(), config, &Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check(learner, basis, |belief, _, step| {
@@ -158,18 +159,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
             choices.iter().map(path).collect()
         });
         let learner = NeuralLearner::new(None, worlds(), config, &Device::Cpu);
-        check(
-            learner.expect("a network"),
-            basis,
-            |belief, target, step| {
-                let policy = learned_beam();
-                let objective = Objective {
-                    target: Target::State(target),
-                    ..config.objective(&policy)
-                };
-                vec![path(config, &policy, objective, belief, step)]
-            },
-        );
+        check(learner.expect("a network"), basis, beam);
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
         let base = Base::known(EstimatorKind::KNOWN, filter, &model);

@@ -129,45 +129,51 @@ impl SavedDecisions {
     /// The belief that was learned, if it was; a network computes on `device`.
     pub fn belief(&self, contents: &Contents, device: &Device) -> Result<Option<LearnedBelief>> {
         let is_neural = matches!(self.belief, Some(SavedBelief::Neural { .. }));
-        let (expected, got) = match self.estimator {
-            EstimatorKind::Neural => ("a neural one", is_neural),
-            _ => ("that of its estimator", !is_neural),
-        };
-        check(got, "belief", expected, "another")?;
+        let fits = is_neural == (self.estimator == EstimatorKind::Neural);
+        check(fits, "belief", self.estimator.label(), "another")?;
         let find = |name: &str, shape: &[usize]| contents.tensor(&format!("{BELIEF}{name}"), shape);
-        match &self.belief {
-            None => Ok(None),
-            Some(SavedBelief::Filter {
+        let belief = self.belief.as_ref().map(|saved| match saved {
+            SavedBelief::Filter {
                 dimensions,
                 target,
                 correlations,
-            }) => {
-                let dimensions = Dimensions {
-                    sees_own_state: self.estimator.sees_own_state(),
-                    ..*dimensions
-                };
-                let dimensions = dimensions.check();
-                let dimensions =
-                    dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-                check_target(*target, dimensions.n_states)?;
-                let mut parameters = Parameters::zeros(dimensions);
-                for (at, shape) in dimensions.shapes().iter().enumerate() {
-                    parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
-                }
+            } => {
+                let parameters = self.parameters(*dimensions, find)?;
+                check_target(*target, parameters.dimensions.n_states)?;
                 let model = LearnedModel::new(parameters, *target, *correlations.clone());
-                Ok(Some(LearnedBelief::Filter(Box::new(model))))
+                Ok(LearnedBelief::Filter(Box::new(model)))
             }
-            &Some(SavedBelief::Neural {
+            &SavedBelief::Neural {
                 n_observations,
                 target,
-            }) => {
+            } => {
                 check_target(target, n_observations)?;
                 let mut network = new_network(n_observations, device)?;
                 network.set_parameters(find)?;
-                let model = NeuralModel { network, target };
-                Ok(Some(LearnedBelief::Neural(model)))
+                Ok(LearnedBelief::Neural(NeuralModel { network, target }))
             }
+        });
+        belief.transpose()
+    }
+
+    /// Those of the filter.
+    fn parameters(
+        &self,
+        dimensions: Dimensions,
+        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
+    ) -> Result<Parameters> {
+        let dimensions = Dimensions {
+            sees_own_state: self.estimator.sees_own_state(),
+            ..dimensions
+        };
+        let dimensions = dimensions.check();
+        let dimensions =
+            dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+        let mut parameters = Parameters::zeros(dimensions);
+        for (at, shape) in dimensions.shapes().iter().enumerate() {
+            parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
         }
+        Ok(parameters)
     }
 
     pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
