@@ -36,5 +36,6 @@ mod snapshots;
 mod team_agents;
 mod teams;
 mod trained_decisions;
+mod trained_neural;
 mod training;
 mod trainings;

@@ -3,6 +3,8 @@
 pub mod autoencoder;
 pub mod first_belief;
 pub mod follower;
+pub mod neural;
 
 pub use autoencoder::AutoencoderEstimator;
 pub use follower::Follower;
+pub use neural::NeuralEstimator;

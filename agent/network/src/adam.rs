@@ -21,6 +21,8 @@ pub struct AdamSettings {
     pub betas: [f32; 2],
     /// Added to the root of the second moment.
     pub epsilon: f32,
+    /// Larger gradients, by the root of the sum of all squares, are scaled to this.
+    pub max_norm: Option<f32>,
 }
 
 impl AdamSettings {
@@ -30,6 +32,7 @@ impl AdamSettings {
             learning_rate,
             betas: [0.5, 0.9],
             epsilon: 1e-8,
+            max_norm: None,
         }
     }
 }
@@ -120,10 +123,19 @@ impl Adam {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
         let rate = f64::from(settings.learning_rate) / bias[0];
+        let scale = match settings.max_norm {
+            Some(most) => (f64::from(most) / self.norm(gradients)?).min(1.0),
+            None => 1.0,
+        };
         let mut changes = Vec::new();
         for (name, var) in &self.variables {
             let Some(gradient) = gradients.get(var) else {
                 continue;
+            };
+            let gradient = &if scale < 1.0 {
+                (gradient * scale)?
+            } else {
+                gradient.clone()
             };
             let names = names(name);
             let [first, second] = names.each_ref().map(|name| &self.moments[name]);
@@ -138,6 +150,14 @@ impl Adam {
             changes.push((of_square, second.clone(), square));
         }
         Ok(changes)
+    }
+
+    /// The root of the sum of all gradients' squares.
+    fn norm(&self, gradients: &GradStore) -> Result<f64> {
+        let gradients = self.variables.values().filter_map(|var| gradients.get(var));
+        let squares = gradients.map(|it| it.sqr()?.sum_all()?.to_scalar::<f32>());
+        let squares = squares.map(|square| square.map(f64::from));
+        Ok(squares.sum::<Result<f64>>()?.sqrt())
     }
 
     /// What is learned.

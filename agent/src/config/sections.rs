@@ -41,6 +41,19 @@ pub struct LearningConfig {
     pub explore_share: f64,
 }
 
+/// How `train --learner neural` learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct NeuralConfig {
+    pub steps: u64,
+    pub episode_steps: u64,
+    pub replay_frames: usize,
+    pub batch: usize,
+    pub updates_per_step: f64,
+    pub rate: f64,
+    pub final_rate: f64,
+    pub explore_share: f64,
+}
+
 /// How the dynamic autoencoder learns (paper sections III.B and III.C).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AutoencoderConfig {
@@ -139,6 +152,21 @@ impl LearningConfig {
         let fallen = update.saturating_sub(self.steady_updates) as f64;
         let share = 1.0 - fallen / self.falling_updates.max(1) as f64;
         share.max(self.final_rate)
+    }
+}
+
+impl NeuralConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let ranges = [
+            ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
+            ("replay_frames", self.replay_frames as f64, 1.0, 1e6),
+            ("batch", self.batch as f64, 1.0, 1024.0),
+            ("updates_per_step", self.updates_per_step, 0.0, 16.0),
+            ("rate", self.rate, 0.0, 1.0),
+            ("final_rate", self.final_rate, 0.0, 1.0),
+            ("explore_share", self.explore_share, 0.0, 1.0),
+        ];
+        check("neural.", &ranges)
     }
 }
 
@@ -288,6 +316,8 @@ mod tests {
             ("learning.states = 1", "2 to 64, got 1"),
             ("learning.rate = nan", "0 to 1, got NaN"),
             ("learning.beta1 = 1.0", "0 to 0.999999, got 1"),
+            ("neural.batch = 0", "1 to 1024, got 0"),
+            ("neural.rate = nan", "0 to 1, got NaN"),
             ("autoencoder.replay_frames = 999", "1000 to 100000, got 999"),
             ("autoencoder.step_size.rate = 2.0", "0 to 1, got 2"),
             ("dqn.epsilon = 2.0", "0 to 1, got 2"),
