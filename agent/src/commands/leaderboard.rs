@@ -52,9 +52,13 @@ impl LeaderboardCommand {
         }
         let entries = read_entries(&self.entries)?;
         let table = render_page(&entries);
-        let page = std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
+        let page =
+            std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
         let (kept, _) = page.split_once(MADE).with_context(|| {
-            format!("{}: expected a line {MADE}, below which the page is made", self.page.display())
+            format!(
+                "{}: expected a line {MADE}, below which the page is made",
+                self.page.display()
+            )
         })?;
         let page = format!("{kept}{MADE}\n\n{table}");
         replace_file(&self.page, page.as_bytes(), Readers::Any)?;
@@ -76,11 +80,21 @@ impl LeaderboardCommand {
             "--training-seconds: expected 0 or more, got {}",
             about.training_seconds
         );
-        let files = std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
-        let files = files.map(|file| Ok(file?.path())).collect::<Result<BTreeSet<_>>>()?;
-        let files = files.iter().filter(|path| path.extension().is_some_and(|it| it == "csv"));
-        let tasks = files.map(|path| task(path, &about.policy)).collect::<Result<Vec<_>>>()?;
-        let tasks: Vec<TaskRuns> = tasks.into_iter().filter(|task| !task.runs.is_empty()).collect();
+        let files =
+            std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
+        let files = files
+            .map(|file| Ok(file?.path()))
+            .collect::<Result<BTreeSet<_>>>()?;
+        let files = files
+            .iter()
+            .filter(|path| path.extension().is_some_and(|it| it == "csv"));
+        let tasks = files
+            .map(|path| task(path, &about.policy))
+            .collect::<Result<Vec<_>>>()?;
+        let tasks: Vec<TaskRuns> = tasks
+            .into_iter()
+            .filter(|task| !task.runs.is_empty())
+            .collect();
         ensure!(
             !tasks.is_empty(),
             "--add {}: expected results of {:?}, got none",

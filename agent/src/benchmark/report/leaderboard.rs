@@ -228,7 +228,13 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let runs: Vec<PolicyRun> = runs.collect();
     let title = "Mean score of each policy over tasks";
     let note = format!("A mark for each of {} tasks", tasks.len());
-    draw_bars(path, &runs, title, note, "score: 0 is a random walk's, 1 an oracle's")
+    draw_bars(
+        path,
+        &runs,
+        title,
+        note,
+        "score: 0 is a random walk's, 1 an oracle's",
+    )
 }
 
 /// The tasks of the first entry and then those of others, each with the runs of all entries.
