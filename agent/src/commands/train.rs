@@ -75,7 +75,7 @@ pub struct TrainCommand {
     #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
     /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
-    #[arg(long, conflicts_with_all = ["instance", "states"])]
+    #[arg(long, conflicts_with_all = ["instance", "states", "task"])]
     burn_in: Option<u64>,
     #[command(flatten)]
     grid: GridFlags,
@@ -234,7 +234,7 @@ impl TrainCommand {
         let reveals = (decides && decisions.estimator.knows_model()).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
         arguments.extend(rest.map(String::from));
-        if decides {
+        if decides && self.grid.task.is_none() {
             let episode = decisions.episode_steps.to_string();
             arguments.extend(["--max-steps".into(), episode]);
         }
