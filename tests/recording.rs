@@ -115,6 +115,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
+        task: None,
         recorded_world: None,
         burn_in: 0,
         max_steps: 0,

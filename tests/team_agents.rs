@@ -24,6 +24,7 @@ fn fly(parts: &[Range<u32>], company: Company) -> (Vec<Vec<Vec<u8>>>, f64) {
     let _holder = server.acquire(0..4);
     let frames = Observer::frames(&server.instance).expect("the channel");
     let mission = |robots: &Range<u32>| Mission {
+        task: None,
         instance: server.instance.clone(),
         world: 0,
         robots: robots.clone(),

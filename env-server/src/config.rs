@@ -1,7 +1,7 @@
 //! The server's settings and their checks.
 
 use crate::states_file::{StatesError, StatesFile};
-use crate::world::{Recorded, Start};
+use crate::world::Recorded;
 use emberwatch_protocol::channels::{
     ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
 };
@@ -10,6 +10,7 @@ use emberwatch_protocol::grid::ShapeError;
 use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::path::MAX_MOVES;
 use emberwatch_protocol::program::read_text;
+use emberwatch_protocol::task::{Start, Task, TaskError};
 use emberwatch_protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -31,6 +32,7 @@ pub struct ServerConfig {
     pub worlds: u32,
     pub robots: u32,
     pub deadline_millis: u64,
+    pub task: String,
     pub model: String,
     pub states: String,
     pub states_symmetries: bool,
@@ -59,6 +61,8 @@ pub struct ServerConfig {
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
+    /// The name of the task, if the worlds are one.
+    pub task: Option<String>,
     /// That of recorded worlds has no changes.
     pub model: Model,
     pub shape: Shape,
@@ -94,6 +98,8 @@ pub enum ConfigError {
         got: String,
     },
     #[error(transparent)]
+    Task(#[from] TaskError),
+    #[error(transparent)]
     Channel(#[from] ChannelError),
     #[error(transparent)]
     Shape(#[from] ShapeError),
@@ -110,6 +116,7 @@ impl Default for ServerConfig {
             worlds: 1,
             robots: 1,
             deadline_millis: 0,
+            task: String::new(),
             model: WILDFIRE.into(),
             states: String::new(),
             states_symmetries: false,
@@ -136,9 +143,10 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Checks every setting; a states file decides model, grid and burn-in.
+    /// Checks every setting; a task decides all that makes worlds, a states file model, grid and burn-in.
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
+        let task = self.take_task()?;
         self.check_ranges()?;
         let (model, recorded) = if self.states.is_empty() {
             (None, None)
@@ -163,10 +171,25 @@ impl ServerConfig {
         Ok(Checked {
             config: self,
             instance,
+            task,
             model,
             shape,
             recorded,
         })
+    }
+
+    /// Takes the settings of the task, if there is one; its name.
+    fn take_task(&mut self) -> Result<Option<String>, ConfigError> {
+        if self.task.is_empty() {
+            return Ok(None);
+        }
+        let task = Task::named(&self.task)?;
+        (self.model, self.states) = (task.model, task.states);
+        (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
+        (self.height, self.width) = (task.height, task.width);
+        (self.moves, self.robots) = (task.moves, task.robots);
+        (self.burn_in, self.max_steps, self.start) = (task.burn_in, task.max_steps, task.start);
+        Ok(Some(task.name))
     }
 
     fn check_ranges(&self) -> Result<(), ConfigError> {
@@ -216,7 +239,7 @@ impl ServerConfig {
 
     /// The states file, which decides some of the settings.
     fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
-        let file = StatesFile::read(Path::new(&self.states))?;
+        let file = StatesFile::named(&self.states)?;
         (self.height, self.width) = file.shape.dim();
         (self.burn_in, self.model) = (0, String::new());
         let checksum = file.sequences.checksum();

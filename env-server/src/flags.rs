@@ -1,10 +1,10 @@
 //! The server's settings as flags.
 
 use crate::config::{ConfigError, ServerConfig};
-use crate::world::Start;
 use clap::{Args, ValueEnum};
 use emberwatch_protocol::Cell;
 use emberwatch_protocol::control::CoverageRule;
+use emberwatch_protocol::task::Start;
 use std::path::PathBuf;
 
 /// The settings of [`ServerConfig`] as flags; each overrides the file.
@@ -26,11 +26,16 @@ pub struct ServerFlags {
     /// no deadline [default: 0]
     #[arg(long, value_name = "MILLIS")]
     pub deadline_ms: Option<u64>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout` or the path of
+    /// Worlds of this task, which decides model or states, grid, moves, robots, burn-in, start and episodes: `wildfire`,
+    /// `small`, `sparse`, `latent`, `burnout`, `road-ice`, `team`, `jacksboro` or the path of a task file
+    #[arg(long, value_name = "NAME|FILE")]
+    pub task: Option<String>,
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `road-ice` or the path of
     /// a model file [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
-    /// Worlds show the recorded states of this .npz or .npy file or folder, which decides model, grid and burn-in
+    /// Worlds show the recorded states of this .npz or .npy file or folder, or `jacksboro`, which decide model, grid and
+    /// burn-in
     #[arg(long, value_name = "FILE|FOLDER")]
     pub states: Option<String>,
     /// Seeds choose among the symmetries of the grid, too
@@ -119,12 +124,24 @@ impl ServerFlags {
         set(&mut config.worlds, &self.worlds);
         set(&mut config.robots, &self.robots);
         set(&mut config.deadline_millis, &self.deadline_ms);
+        set(&mut config.task, &self.task);
         set(&mut config.model, &self.model);
         set(&mut config.states, &self.states);
         set(&mut config.states_symmetries, &self.states_symmetries);
         set(&mut config.states_offset, &self.states_offset);
-        if !config.states.is_empty() {
-            self.check_beside_states()?;
+        if !config.task.is_empty() {
+            self.check_beside("a task", &[])?;
+        } else if !config.states.is_empty() {
+            let left = [
+                "states",
+                "states_symmetries",
+                "states_offset",
+                "moves",
+                "robots",
+                "max_steps",
+                "start",
+            ];
+            self.check_beside("a states file", &left)?;
         }
         set(&mut config.height, &self.height);
         set(&mut config.width, &self.width);
@@ -146,26 +163,39 @@ impl ServerFlags {
         Ok(config)
     }
 
-    /// Refuses what a states file decides.
-    fn check_beside_states(&self) -> Result<(), ConfigError> {
-        let numbers = [
-            ("height", self.height.map(|it| it as u64)),
-            ("width", self.width.map(|it| it as u64)),
-            ("burn_in", self.burn_in),
+    /// Refuses flags for what a task or recorded states decide; the settings in `left` are left to flags.
+    fn check_beside(&self, what: &str, left: &[&str]) -> Result<(), ConfigError> {
+        let text = |value: Option<u64>| value.map(|it| it.to_string());
+        let of_worlds = [
+            ("model", self.model.clone()),
+            ("states", self.states.clone()),
+            (
+                "states_symmetries",
+                self.states_symmetries.map(|it| it.to_string()),
+            ),
+            ("states_offset", text(self.states_offset)),
+            ("height", text(self.height.map(|it| it as u64))),
+            ("width", text(self.width.map(|it| it as u64))),
+            ("moves", text(self.moves.map(|it| it as u64))),
+            ("robots", text(self.robots.map(u64::from))),
+            ("burn_in", text(self.burn_in)),
+            ("max_steps", text(self.max_steps)),
+            (
+                "start",
+                self.start.map(|it| format!("{it:?}").to_lowercase()),
+            ),
         ];
-        let mut given: Vec<_> = numbers
-            .into_iter()
-            .filter_map(|(setting, value)| Some((setting, value?.to_string())))
-            .collect();
-        given.extend(self.model.clone().map(|model| ("model", model)));
-        match given.into_iter().next() {
-            None => Ok(()),
-            Some((setting, got)) => Err(ConfigError::Range {
-                setting,
-                expected: "no flag beside a states file, which decides it".into(),
-                got,
-            }),
+        for (setting, got) in of_worlds {
+            if let Some(got) = got.filter(|_| !left.contains(&setting)) {
+                let expected = format!("no flag beside {what}, which decides it");
+                return Err(ConfigError::Range {
+                    setting,
+                    expected,
+                    got,
+                });
+            }
         }
+        Ok(())
     }
 }
 

@@ -11,10 +11,17 @@ use ndarray_npy::npy::header::Header;
 use std::ffi::OsStr;
 use std::fmt::Display;
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 use zip::ZipArchive;
+
+/// Those that ship, by name: archive and description.
+const BUILT_IN: [(&str, &[u8], &str); 1] = [(
+    "jacksboro",
+    include_bytes!("../landscapes/jacksboro/jacksboro.npz"),
+    include_str!("../landscapes/jacksboro/jacksboro.toml"),
+)];
 
 /// Most bytes of all arrays together: 4 GiB.
 const MAX_BYTES: u64 = 1 << 32;
@@ -57,12 +64,30 @@ pub struct StatesError {
 }
 
 impl StatesFile {
+    /// The built-in one of a name, or that of a path.
+    pub fn named(name: &str) -> Result<Self, StatesError> {
+        match BUILT_IN.iter().find(|(known, ..)| *known == name) {
+            Some((_, archive, description)) => Ok(read_built_in(archive, description)
+                .expect("invariant: built-in states are valid, as a test shows")),
+            None => Self::read(Path::new(name)),
+        }
+    }
+
     /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.
     pub fn read(path: &Path) -> Result<Self, StatesError> {
         read(path).map_err(|problem| StatesError {
             path: path.display().to_string(),
             problem,
         })
+    }
+
+    fn new((description, model): (Description, Model), sequences: Sequences) -> Self {
+        Self {
+            description,
+            model,
+            shape: shape_of(&sequences.arrays[0]),
+            sequences,
+        }
     }
 }
 
@@ -203,9 +228,9 @@ fn read(path: &Path) -> Result<StatesFile, String> {
             other.file_name().unwrap_or_default()
         ));
     }
-    let (description, model) = read_description(&description)
+    let described = read_description(&description)
         .map_err(|error| format!("description {}", at(&description, &error)))?;
-    let mut sequences = Sequences::new(model.n_states());
+    let mut sequences = Sequences::new(described.1.n_states());
     for file in &files {
         let added = add_file(&mut sequences, file);
         added.map_err(|problem| {
@@ -216,17 +241,23 @@ fn read(path: &Path) -> Result<StatesFile, String> {
             }
         })?;
     }
-    Ok(StatesFile {
-        description,
-        model,
-        shape: shape_of(&sequences.arrays[0]),
-        sequences,
-    })
+    Ok(StatesFile::new(described, sequences))
+}
+
+fn read_built_in(archive: &[u8], description: &str) -> Result<StatesFile, String> {
+    let described = described(description).map_err(|error| error.to_string())?;
+    let mut sequences = Sequences::new(described.1.n_states());
+    sequences.add_archive(Cursor::new(archive))?;
+    Ok(StatesFile::new(described, sequences))
 }
 
 fn read_description(path: &Path) -> anyhow::Result<(Description, Model)> {
     check_regular(path).map_err(anyhow::Error::msg)?;
-    let description: Description = toml::from_str(&read_text(path)?)?;
+    described(&read_text(path)?)
+}
+
+fn described(text: &str) -> anyhow::Result<(Description, Model)> {
+    let description: Description = toml::from_str(text)?;
     let model = description.unchanging()?;
     Ok((description, model))
 }

@@ -369,3 +369,12 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
         "{error}"
     );
 }
+
+#[test]
+fn built_in_states_are_those_of_their_files() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("landscapes/jacksboro");
+    let file = StatesFile::read(&folder.join("jacksboro.npz")).expect("a states file");
+    let built_in = StatesFile::named("jacksboro").expect("built in");
+    let of = |file: StatesFile| (file.sequences.checksum(), file.description, file.shape);
+    assert_eq!(of(built_in), of(file));
+}

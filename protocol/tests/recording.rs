@@ -27,6 +27,7 @@ fn server(height: usize, width: usize, n_moves: usize) -> Event {
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
+        task: None,
         recorded_world: None,
         burn_in: 20,
         max_steps: 0,

@@ -17,6 +17,8 @@ use std::time::Duration;
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
+    /// The name of the task that the server must have; `None`: any, or none.
+    pub task: Option<String>,
     pub world: u32,
     /// Which robots of the world to fly, on one belief.
     pub robots: Range<u32>,
@@ -57,6 +59,18 @@ impl Mission {
             takeover: self.takeover,
             ..Claim::new(numbers.clone())
         }
+    }
+
+    pub(super) fn check_task(&self, info: &ServerInfo) -> Result<()> {
+        let got = info.task.as_deref();
+        if let Some(expected) = self.task.as_deref().filter(|&task| got != Some(task)) {
+            bail!(
+                "instance {:?}: expected task {expected}, got {}",
+                self.instance.name(),
+                got.unwrap_or("none")
+            );
+        }
+        Ok(())
     }
 
     /// The numbers of its robots on a server.

@@ -49,6 +49,7 @@ impl Pilot {
     /// Acquires the robots where their world stands and takes in its last frame.
     pub fn attach(mission: &Mission) -> Result<Self> {
         let info = info_of(&mission.instance, &mission.worlds())?;
+        mission.check_task(&info)?;
         let numbers = mission.numbers(&info)?;
         let recorded = recorded_states(&info)?.filter(|_| mission.model.is_none());
         let is_recorded = recorded.is_some();

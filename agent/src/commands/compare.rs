@@ -43,7 +43,7 @@ pub struct CompareCommand {
     #[arg(long)]
     baseline: Option<String>,
     /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
-    #[arg(long, value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
+    #[arg(long, conflicts_with = "task", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
     robots: Vec<u32>,
     /// How the robots of a world act together, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
@@ -110,7 +110,7 @@ impl CompareCommand {
             let comparison = Comparison {
                 policies: self.policies_on(arena, &learned)?,
                 teams: self.team.clone(),
-                seeds: self.worlds.seeds.clone(),
+                seeds: self.worlds.seeds(),
                 steps: self.worlds.steps(arena.info())?,
                 recent_steps: self.recent_steps,
                 config: config.clone(),
@@ -223,7 +223,9 @@ impl CompareCommand {
 
     /// Whether there is more to compare than policies of a robot alone in its world.
     fn has_teams(&self) -> bool {
-        self.robots.iter().any(|&robots| robots > 1) || self.team != [Team::Alone]
+        let of_task = self.worlds.task().map(|task| task.robots);
+        let mut robots = self.robots.iter().copied().chain(of_task);
+        robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
     /// The one that was named; else one of the policies, if these are of teams or of options.

@@ -3,7 +3,7 @@
 use super::compare::run_comparison;
 use super::shared::{make_folder_of, write};
 use super::worlds::WorldFlags;
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::Arena;
 use emberwatch_agent::benchmark::compare::Comparison;
@@ -61,6 +61,11 @@ impl EvaluateCommand {
         }
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
+        let n_robots = self.worlds.task().map_or(1, |task| task.robots);
+        ensure!(
+            n_robots == 1,
+            "--task: expected one robot a world, got {n_robots}"
+        );
         let mut worlds = self.worlds.open(false, Some(1), |_| Ok(()))?;
         let arena = &mut worlds.arena;
         let steps = self.worlds.steps(arena.info())?;
@@ -70,7 +75,7 @@ impl EvaluateCommand {
         for guide in GUIDES {
             let evaluation = Evaluation {
                 guide,
-                seeds: self.worlds.seeds.clone(),
+                seeds: self.worlds.seeds(),
                 steps,
                 config: &config,
                 policies: &policies,
@@ -95,7 +100,7 @@ impl EvaluateCommand {
         let comparison = Comparison {
             policies,
             teams: vec![Team::Alone],
-            seeds: self.worlds.seeds.clone(),
+            seeds: self.worlds.seeds(),
             steps: self.worlds.steps(arena.info())?,
             recent_steps: RECENT_STEPS,
             config,

@@ -11,6 +11,7 @@ use emberwatch_agent::policy::Policy;
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
+use emberwatch_protocol::task::Task;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
@@ -24,6 +25,9 @@ pub struct RunCommand {
     instance: String,
     #[command(flatten)]
     wait: WaitFlag,
+    /// Refuse a server whose worlds are not this task
+    #[arg(long, value_name = "NAME|FILE", value_parser = Task::named)]
+    task: Option<Task>,
     /// The world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
@@ -75,6 +79,7 @@ impl RunCommand {
         }?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
+            task: self.task.as_ref().map(|task| task.name.clone()),
             world: self.world,
             robots: self
                 .robots

@@ -55,35 +55,54 @@ impl SuiteCommand {
     /// Runs what is missing, and tells all scores.
     pub fn run(&self) -> Result<()> {
         let names = self.policies.iter();
-        names.clone().try_for_each(|name| Policy::check_name(name))?;
+        names
+            .clone()
+            .try_for_each(|name| Policy::check_name(name))?;
         let config = self.settings.effective()?;
         let tasks = if self.tasks.is_empty() {
-            Task::built_in_names().map(Task::named).collect::<Result<Vec<_>, _>>()
+            Task::built_in_names()
+                .map(Task::named)
+                .collect::<Result<Vec<_>, _>>()
         } else {
             self.tasks.iter().map(|name| Task::named(name)).collect()
         };
         let tasks = tasks?;
         make_folder(&self.out)?;
-        let runs = tasks.iter().map(|task| self.runs(task, &config).with_context(|| format!("task {}", task.name)));
+        let runs = tasks.iter().map(|task| {
+            self.runs(task, &config)
+                .with_context(|| format!("task {}", task.name))
+        });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
     }
 
     /// All runs of a task; those that are missing are made and added to its file, policy by policy.
     fn runs(&self, task: &Task, config: &AgentConfig) -> Result<TaskRuns> {
         let path = self.out.join(&task.name).with_extension("csv");
-        let mut runs = if path.exists() { read_csv(&path).with_context(|| path.display().to_string())? } else { Vec::new() };
+        let mut runs = if path.exists() {
+            read_csv(&path).with_context(|| path.display().to_string())?
+        } else {
+            Vec::new()
+        };
         let learned = self.learned(task)?;
         let seeds = self.seeds(task);
-        let names = [FLOOR, CEILING].into_iter().chain(self.policies.iter().map(|name| &**name));
+        let names = [FLOOR, CEILING]
+            .into_iter()
+            .chain(self.policies.iter().map(|name| &**name));
         let missing: Vec<&str> = names
-            .filter(|name| can_run(name, task, &learned) && !is_done(&runs, name, &seeds, task.max_steps))
+            .filter(|name| {
+                can_run(name, task, &learned) && !is_done(&runs, name, &seeds, task.max_steps)
+            })
             .collect();
         if !missing.is_empty() {
             let (mut arena, _server) = self.open(task, &seeds)?;
             for name in missing {
                 let comparison = Comparison {
                     policies: vec![Policy::named(name, arena.model())?],
-                    teams: vec![if task.robots > 1 { Team::Shared } else { Team::Alone }],
+                    teams: vec![if task.robots > 1 {
+                        Team::Shared
+                    } else {
+                        Team::Alone
+                    }],
                     seeds: seeds.clone(),
                     steps: task.max_steps,
                     recent_steps: RECENT_STEPS,
@@ -97,19 +116,29 @@ impl SuiteCommand {
             }
         }
         runs.retain(|run| seeds.contains(&run.world_seed));
-        Ok(TaskRuns { task: task.name.clone(), runs })
+        Ok(TaskRuns {
+            task: task.name.clone(),
+            runs,
+        })
     }
 
     fn seeds(&self, task: &Task) -> Range<u64> {
         let all = task.test_seeds.clone();
-        all.start..self.worlds.map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
+        all.start
+            ..self
+                .worlds
+                .map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
     }
 
     fn learned(&self, task: &Task) -> Result<Learned> {
         let Some(folder) = &self.checkpoints else {
             return Ok(Learned::default());
         };
-        ensure!(folder.is_dir(), "--checkpoints: expected a folder, got {}", folder.display());
+        ensure!(
+            folder.is_dir(),
+            "--checkpoints: expected a folder, got {}",
+            folder.display()
+        );
         let place = folder.join(&task.name).join(CHECKPOINT);
         if !place.exists() {
             tracing::warn!("no {}: no learned policy for this task", place.display());
@@ -123,7 +152,17 @@ impl SuiteCommand {
         let n_seeds = (seeds.end - seeds.start) as u32;
         let worlds = n_seeds.min(MAX_BATCH).to_string();
         let seed = seeds.start.to_string();
-        let flags = ["--task", &task.source, "--worlds", &worlds, "--seed", &seed, "--coverage", "client", "--publish-truth"];
+        let flags = [
+            "--task",
+            &task.source,
+            "--worlds",
+            &worlds,
+            "--seed",
+            &seed,
+            "--coverage",
+            "client",
+            "--publish-truth",
+        ];
         let server = OwnServer::start(self.server.clone(), &flags.map(String::from))?;
         Ok((Arena::open(server.instance(), n_seeds, false)?, server))
     }
@@ -140,6 +179,9 @@ fn can_run(name: &str, task: &Task, learned: &Learned) -> bool {
 
 /// Whether a policy was run on all these worlds, for so many steps.
 fn is_done(runs: &[PolicyRun], policy: &str, seeds: &Range<u64>, steps: u64) -> bool {
-    let has = |seed| runs.iter().any(|run| (&*run.policy, run.world_seed, run.steps) == (policy, seed, steps));
+    let has = |seed| {
+        runs.iter()
+            .any(|run| (&*run.policy, run.world_seed, run.steps) == (policy, seed, steps))
+    };
     seeds.clone().all(has)
 }

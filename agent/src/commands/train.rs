@@ -76,7 +76,7 @@ pub struct TrainCommand {
     #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
     /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
-    #[arg(long, conflicts_with_all = ["instance", "states"])]
+    #[arg(long, conflicts_with_all = ["instance", "states", "task"])]
     burn_in: Option<u64>,
     #[command(flatten)]
     grid: GridFlags,
@@ -249,6 +249,8 @@ impl TrainCommand {
             LearnerKind::Neural => Some(training.config.neural.episode_steps),
             _ => None,
         };
+        // A task has its own.
+        let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
         let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
         arguments.extend(episode.into_iter().flatten());
         let server = OwnServer::start(self.server.clone(), &arguments)?;

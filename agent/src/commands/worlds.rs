@@ -7,15 +7,16 @@ use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
 use emberwatch_agent::client::launch::OwnServer;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::task::{MAX_SEEDS, Task};
 use emberwatch_protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
 
-const MAX_SEEDS: u64 = 100_000;
-
 const BENCHMARK_BURN_IN: u64 = 25_000;
 
 const BENCHMARK_STEPS: u64 = 1500;
+
+const BENCHMARK_SEEDS: Range<u64> = 0..8;
 
 /// Flags that say which worlds.
 #[derive(Debug, Args)]
@@ -25,14 +26,14 @@ pub struct WorldFlags {
     instance: Option<String>,
     #[command(flatten)]
     wait: WaitFlag,
-    /// World seeds, first..end
-    #[arg(long, value_parser = parse_seeds, default_value = "0..8")]
-    pub seeds: Range<u64>,
+    /// World seeds, first..end [default: 0..8, or those to test the task on]
+    #[arg(long, value_parser = parse_seeds)]
+    seeds: Option<Range<u64>>,
     /// Scored steps of each world [default: 1500, or as many as the shortest episode has]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     /// Steps simulated before the first scored one [default: 25000, or the running server's]
-    #[arg(long, conflicts_with = "states")]
+    #[arg(long, conflicts_with_all = ["states", "task"])]
     burn_in: Option<u64>,
     /// The server's program, if it is not beside this one
     #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
@@ -44,7 +45,12 @@ pub struct WorldFlags {
 /// Flags of a server that is started.
 #[derive(Debug, Args)]
 pub struct GridFlags {
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout` or a model
+    /// The task whose worlds the server that is started has: `wildfire`, `small`, `sparse`, `latent`, `burnout`,
+    /// `road-ice`, `team`, `jacksboro` or a task file
+    #[arg(long, value_name = "NAME|FILE", value_parser = Task::named,
+        conflicts_with_all = ["instance", "model", "height", "width", "moves", "states"])]
+    pub task: Option<Task>,
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `road-ice` or a model
     /// file, for the server that is started
     #[arg(long, default_value = "wildfire", conflicts_with = "instance")]
     model: String,
@@ -57,7 +63,8 @@ pub struct GridFlags {
     /// Moves in a path, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
-    /// A .npz or .npy file or folder of recorded states in the place of a model, for the server that is started
+    /// A .npz or .npy file or folder of recorded states, or `jacksboro`, in the place of a model, for the server that is
+    /// started
     #[arg(long, value_name = "FILE|FOLDER", conflicts_with_all = ["instance", "model", "height", "width"])]
     states: Option<String>,
     /// World seeds choose among the symmetries of the grid, too
@@ -93,7 +100,9 @@ impl WorldFlags {
             None => {
                 self.grid.check()?.as_ref().map_or(Ok(()), check)?;
                 let mut arguments = self.server_arguments(needs_scouts);
-                arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
+                if self.grid.task.is_none() {
+                    arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
+                }
                 let server = OwnServer::start(self.server.clone(), &arguments)?;
                 (server.instance().clone(), Some(server))
             }
@@ -125,15 +134,26 @@ impl WorldFlags {
         Ok(steps)
     }
 
-    pub fn n_seeds(&self) -> u32 {
-        (self.seeds.end - self.seeds.start) as u32
+    pub fn task(&self) -> Option<&Task> {
+        self.grid.task.as_ref()
+    }
+
+    pub fn seeds(&self) -> Range<u64> {
+        let of_task = || self.task().map(|task| task.test_seeds.clone());
+        let given = self.seeds.clone().or_else(of_task);
+        given.unwrap_or(BENCHMARK_SEEDS)
+    }
+
+    fn n_seeds(&self) -> u32 {
+        let seeds = self.seeds();
+        (seeds.end - seeds.start) as u32
     }
 
     fn server_arguments(&self, needs_scouts: bool) -> Vec<String> {
         let batch = self.n_seeds().min(MAX_BATCH);
         let worlds = batch * if needs_scouts { 2 } else { 1 } + 1;
         let burn_in = self.burn_in.unwrap_or(BENCHMARK_BURN_IN);
-        let mut arguments = self.grid.arguments(worlds, self.seeds.start, burn_in);
+        let mut arguments = self.grid.arguments(worlds, self.seeds().start, burn_in);
         let rest = ["--coverage", "client", "--publish-truth"];
         arguments.extend(rest.map(String::from));
         arguments
@@ -154,11 +174,14 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 impl GridFlags {
     /// The model, if it can be simulated on the grid; recorded states have none.
     pub fn check(&self) -> Result<Option<Model>> {
-        if self.states.is_some() {
-            return Ok(None);
-        }
-        let model = model_named(&self.model)?;
-        model.check_on(Shape::new(self.height, self.width)?)?;
+        let (model, height, width) = match &self.task {
+            Some(task) if task.is_recorded() => return Ok(None),
+            Some(task) => (&task.model, task.height, task.width),
+            None if self.states.is_some() => return Ok(None),
+            None => (&self.model, self.height, self.width),
+        };
+        let model = model_named(model)?;
+        model.check_on(Shape::new(height, width)?)?;
         Ok(Some(model))
     }
 
@@ -166,16 +189,18 @@ impl GridFlags {
     pub fn arguments(&self, worlds: u32, seed: u64, burn_in: u64) -> Vec<String> {
         let settings = [
             ("--worlds", worlds.to_string()),
-            ("--moves", self.moves.to_string()),
             ("--seed", seed.to_string()),
         ];
-        let of_worlds = match &self.states {
-            Some(states) => vec![
+        let of_worlds = match (&self.task, &self.states) {
+            (Some(task), _) => vec![("--task", task.source.clone())],
+            (None, Some(states)) => vec![
+                ("--moves", self.moves.to_string()),
                 ("--states", states.clone()),
                 ("--states-symmetries", self.states_symmetries.to_string()),
                 ("--states-offset", self.states_offset.to_string()),
             ],
-            None => vec![
+            (None, None) => vec![
+                ("--moves", self.moves.to_string()),
                 ("--model", self.model.clone()),
                 ("--height", self.height.to_string()),
                 ("--width", self.width.to_string()),

@@ -75,11 +75,12 @@ function drawState(state, note) {
   write(byId("note"), note ?? "");
 }
 
-function drawServer({ status, lost, instance, source }) {
+function drawServer({ info, status, lost, instance, source }) {
   const isLive = source === "live";
   write(byId("source"), isLive ? "instance" : "recording");
   write(byId("instance"), instance);
   byId("instance").title = instance;
+  write(byId("task"), info?.task ? `task ${info.task}` : "");
   for (const fact of document.querySelectorAll(".of-server")) fact.hidden = !isLive;
   write(byId("rate"), short(status?.steps_per_second));
   write(byId("observers"), whole(status?.n_observers));

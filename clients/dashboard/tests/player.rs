@@ -25,6 +25,7 @@ fn damaged() -> Vec<u8> {
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
+        task: None,
         recorded_world: None,
         burn_in: 0,
         max_steps: 0,

@@ -5,7 +5,7 @@ use anyhow::Result;
 use clap::Args;
 use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::control::{Reply, Request, ServerStatus};
+use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus};
 use std::time::Duration;
 
 /// How long to wait for the server.
@@ -38,11 +38,12 @@ struct Target {
 impl StatusCommand {
     /// Prints the answer.
     pub fn run(&self) -> Result<()> {
-        match self.target.ask(&Request::Status {})? {
+        let (info, reply) = self.target.ask(&Request::Status {})?;
+        match reply {
             Reply::Status(status) if self.target.json => {
                 print(&(serde_json::to_string_pretty(&status)? + "\n"))
             }
-            Reply::Status(status) => print(&describe(&self.target.instance, &status)),
+            Reply::Status(status) => print(&describe(&self.target.instance, &info, &status)),
             other => anyhow::bail!("expected a status, got {other:?}"),
         }
     }
@@ -56,17 +57,21 @@ impl StopCommand {
 }
 
 impl Target {
-    fn ask(&self, request: &Request) -> Result<Reply> {
+    /// What the server says of itself, and its answer.
+    fn ask(&self, request: &Request) -> Result<(ServerInfo, Reply)> {
         let instance = Instance::new(&self.instance)?;
         let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;
-        Ok(connection.control(request, TIMEOUT)?)
+        let reply = connection.control(request, TIMEOUT)?;
+        Ok((connection.info().clone(), reply))
     }
 }
 
-fn describe(instance: &str, status: &ServerStatus) -> String {
+fn describe(instance: &str, info: &ServerInfo, status: &ServerStatus) -> String {
+    let task = info.task.iter().map(|task| format!("task {task}, "));
+    let task: String = task.collect();
     let uptime = Duration::from_millis(status.uptime_millis).as_secs();
     let mut text = format!(
-        "instance {instance}: pid {}, up {uptime} s, {} steps, {:.0} steps/s, {} refused requests, {} clients, {} observers\n",
+        "instance {instance}: {task}pid {}, up {uptime} s, {} steps, {:.0} steps/s, {} refused requests, {} clients, {} observers\n",
         status.pid,
         status.n_steps,
         status.steps_per_second,

@@ -255,6 +255,7 @@ impl Simulator {
                 .collect(),
             model: (config.reveal_model && recorded.is_none())
                 .then(|| toml::to_string(file).expect("invariant: model files serialise")),
+            task: self.checked.task.clone(),
             recorded_world: recorded.as_ref().map(|states| RecordedWorld {
                 description: config.reveal_model.then(|| states.description.clone()),
                 n_sequences: states.recorded.n_sequences(),

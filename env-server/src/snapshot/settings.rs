@@ -7,6 +7,9 @@ use bincode::{Decode, Encode};
 use emberwatch_protocol::model::ModelError;
 use std::fmt::Display;
 
+/// Names the task; it stands last, and only where the worlds are one.
+const TASK: &str = "task";
+
 /// The settings of a server that its worlds depend on.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
 pub struct Settings {
@@ -75,7 +78,8 @@ impl Settings {
                 ("states_offset", text(&config.states_offset)),
             ]
         });
-        let others = others.into_iter().chain(of_states);
+        let task = checked.task.iter().map(|task| (TASK, task.clone()));
+        let others = others.into_iter().chain(of_states).chain(task);
         Self {
             model: model.expect("invariant: a model was read from TOML"),
             others: others.map(|(name, value)| (name.into(), value)).collect(),
@@ -98,7 +102,9 @@ impl Settings {
                 &format!("{got:?}"),
             ));
         }
-        for (index, (setting, expected)) in server.others.iter().enumerate() {
+        // The same worlds have the same settings, whether by a task or by flags.
+        let others = server.others.iter().filter(|(name, _)| name != TASK);
+        for (index, (setting, expected)) in others.enumerate() {
             let got = self
                 .others
                 .get(index)

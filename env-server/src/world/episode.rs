@@ -232,8 +232,8 @@ fn count(states: &Grid<u8>, wanted: u8) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::world::rules::Start;
     use emberwatch_protocol::path::fly;
+    use emberwatch_protocol::task::Start;
     use emberwatch_protocol::{Cell, Model, Move, Shape};
 
     fn rules(max_steps: u64, start: Start) -> Rules {

@@ -143,9 +143,10 @@ impl PastRobot {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::world::rules::{Rules, Start};
+    use crate::world::rules::Rules;
     use crate::world::{Episode, Flown};
     use emberwatch_protocol::frame::UNOBSERVED;
+    use emberwatch_protocol::task::Start;
     use emberwatch_protocol::{Model, Move, Shape};
 
     #[test]

@@ -49,8 +49,8 @@ pub(super) fn pay(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::world::rules::Start;
     use emberwatch_protocol::randomness::split_mix;
+    use emberwatch_protocol::task::Start;
     use emberwatch_protocol::{Coverage, Model, Move, Shape};
     use std::collections::BTreeSet;
 

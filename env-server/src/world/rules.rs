@@ -5,25 +5,10 @@ use super::recorded::Recorded;
 use super::sensor::Sensor;
 use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_protocol::task::Start;
 use emberwatch_protocol::{Cell, Dynamics, Model, Shape};
 use rand::RngExt;
-use serde::{Deserialize, Serialize};
 use std::sync::Arc;
-
-/// Where the robots of a world are after a reset.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Start {
-    /// The corners (0, 0), the opposite one, upper right, lower left; then the middles of the sides; and again.
-    Corner,
-    /// All in the middle.
-    Centre,
-    /// Cells drawn from the seed.
-    Random,
-    /// All in this cell.
-    #[serde(untagged)]
-    At(Cell),
-}
 
 /// What all episodes of a server share.
 #[derive(Debug, Clone)]

@@ -10,7 +10,7 @@ use super::grid::{Cell, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 
 /// The built-in models by name.
-const BUILT_IN: [(&str, &str); 5] = [
+const BUILT_IN: [(&str, &str); 6] = [
     ("wildfire", include_str!("../../models/wildfire.toml")),
     (
         "wildfire-sparse",
@@ -28,6 +28,7 @@ const BUILT_IN: [(&str, &str); 5] = [
         "wildfire-burnout",
         include_str!("../../models/wildfire-burnout.toml"),
     ),
+    ("road-ice", include_str!("../../models/road-ice.toml")),
 ];
 
 /// A checked model: every model that exists can be simulated and filtered.
@@ -47,8 +48,8 @@ impl Model {
         Self::built_in("wildfire").expect("invariant: the wildfire is built in")
     }
 
-    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or
-    /// `wildfire-burnout` (`config/models`).
+    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`,
+    /// `wildfire-burnout` or `road-ice` (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
         let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);
@@ -247,7 +248,7 @@ mod tests {
             assert_eq!(model.check_on(shape), Ok(()), "{name}");
             n_models += 1;
         }
-        assert_eq!(n_models, 5);
+        assert_eq!(n_models, 6);
         assert_eq!(Model::built_in("wildfire-dense"), None);
     }
 

@@ -192,6 +192,9 @@ pub struct ServerInfo {
     pub observations: Vec<String>,
     /// The model as TOML, if there is one and the server reveals it.
     pub model: Option<String>,
+    /// The task that the worlds are, by its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
     /// What worlds show whose hidden states were recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_world: Option<RecordedWorld>,

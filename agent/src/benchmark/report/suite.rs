@@ -47,7 +47,8 @@ impl Aggregate {
         let mut random = ChaCha8Rng::seed_from_u64(0);
         let mut draw = || {
             let again = tasks.iter().flat_map(|scores| {
-                let index = |_| (u64::from(random.next_u32()) * scores.len() as u64 >> 32) as usize;
+                let index =
+                    |_| ((u64::from(random.next_u32()) * scores.len() as u64) >> 32) as usize;
                 (0..scores.len())
                     .map(index)
                     .map(|index| scores[index])

@@ -26,6 +26,7 @@ from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVect
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
+from emberwatch.tasks import Task, built_in_tasks
 from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ __all__ = [
     "ServerStatus",
     "StepAnswer",
     "StepResult",
+    "Task",
     "Truth",
     "TruthReader",
     "WildfireEnv",
@@ -72,17 +74,38 @@ __version__ = VERSION
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-for _module, _kind, _version, _steps in (
-    ("env", "Wildfire", 0, MAX_EPISODE_STEPS),
-    ("moves_env", "WildfireMoves", 0, 64 * MAX_EPISODE_STEPS),
-    ("objective_env", "WildfireObjective", 1, MAX_EPISODE_STEPS),
-):
-    gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-        f"emberwatch/{_kind}-v{_version}",
-        entry_point=f"emberwatch.{_module}:{_kind}Env",
-        vector_entry_point=f"emberwatch.{_module}:{_kind}VectorEnv",
-        max_episode_steps=_steps,
-    )
+#: What the ids of each task begin with. Those of `wildfire` are the environments' own.
+_PREFIXES = {
+    "small": "WildfireSmall",
+    "sparse": "WildfireSparse",
+    "latent": "WildfireLatent",
+    "burnout": "WildfireBurnout",
+    "road-ice": "RoadIce",
+    "team": "WildfireTeam",
+    "jacksboro": "Jacksboro",
+}
+
+
+def _register(prefix: str, steps: int, n_moves: int, **keywords: Any) -> None:
+    """Registers the three environments with these keywords."""
+    for module, kind, version, episode in (
+        ("env", "", 0, steps),
+        ("moves_env", "Moves", 0, n_moves * steps),
+        ("objective_env", "Objective", 1, steps),
+    ):
+        gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
+            f"emberwatch/{prefix}{kind}-v{version}",
+            entry_point=f"emberwatch.{module}:Wildfire{kind}Env",
+            vector_entry_point=f"emberwatch.{module}:Wildfire{kind}VectorEnv",
+            max_episode_steps=episode,
+            kwargs=keywords,
+        )
+
+
+_register("Wildfire", MAX_EPISODE_STEPS, 64)
+for _name, _task in built_in_tasks().items():
+    if _name in _PREFIXES:
+        _register(_PREFIXES[_name], _task.max_steps, _task.n_moves, task=_name)
 
 
 #: Modules that are imported when they are first used.

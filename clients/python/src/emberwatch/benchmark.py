@@ -31,6 +31,7 @@ from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
+from emberwatch.tasks import Task
 from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
@@ -44,6 +45,8 @@ _PATHS: Final = "emberwatch/Wildfire-v0"
 
 #: Of `emberwatch-agent compare`.
 _BURN_IN: Final = 25_000
+_SEEDS: Final = range(8)
+_STEPS: Final = 1500
 
 #: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
 _TIMEOUT: Final = 30.0
@@ -111,8 +114,8 @@ def evaluate(
     policy: Any,
     *,
     name: str,
-    seeds: Iterable[int] = range(8),
-    steps: int = 1500,
+    seeds: Iterable[int] | None = None,
+    steps: int | None = None,
     burn_in: int | None = None,
     env: str = _MOVES,
     estimator: str | None = None,
@@ -130,10 +133,11 @@ def evaluate(
             of Stable-Baselines3. If it has a method `begin(n_worlds)`, that is called whenever
             other worlds begin.
         name: What the table calls it.
-        seeds: The worlds. Those below 1000 are test worlds.
-        steps: Scored steps, thus paths, of each world.
-        burn_in: Steps before the first scored one; None: 25,000, or as the running server has it.
-            Recorded worlds have none.
+        seeds: The worlds; None: those to test the task on, or 0 to 7. Those below 1000 are test
+            worlds.
+        steps: Scored steps, thus paths, of each world; None: those of the task, or 1,500.
+        burn_in: Steps before the first scored one; None: 25,000, or as the task or the running
+            server has it. Recorded worlds have none.
         env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
         estimator: What the table says of its belief; None: `known_model` where `observation` has
             a belief, else `none`.
@@ -146,15 +150,18 @@ def evaluate(
         csv: A file to write rows to. Rows of this policy that it has already are kept, and not
             run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
-        keywords: Of the environment: `model`, `height`, `width`, `n_moves`, `observation`, ...
+        keywords: Of the environment: `task`, `model`, `height`, `n_moves`, `observation`, ...
             With `robots` the policy acts for all robots of each world: rows are robots.
 
     Returns:
         A row for each seed, in order.
     """
+    task = None if keywords.get("task") is None else Task.named(keywords["task"])
+    seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
+    steps = (task.max_steps if task else _STEPS) if steps is None else steps
     chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
     act = _acting(policy, deterministic)
-    if burn_in is None and (keywords.get("instance"), keywords.get("states")) == (None, None):
+    if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
         burn_in = _BURN_IN
     keywords["burn_in"] = burn_in
     keywords.setdefault("timeout", _TIMEOUT)
@@ -164,20 +171,20 @@ def evaluate(
         has_belief = OF_BELIEF & set(names_of(keywords.get("observation")))
         estimator = "known_model" if has_belief else "none"
     file = None if csv is None else RowFile(Path(csv))
-    robots = keywords.get("robots") or 1
+    robots = task.robots if task else keywords.get("robots") or 1
     shares = robots > 1 and bool(OF_TEAM & set(names_of(keywords.get("observation"))))
     team = "shared" if shares else "alone"
     kind = (name, estimator, robots, team)
     done: dict[int, Row] = {}
     if file is not None:
-        done = file.done(kind, steps, _n_moves(env, keywords), recent_steps)
+        done = file.done(kind, steps, _n_moves(env, keywords, robots), recent_steps)
     missing = [seed for seed in chosen if seed not in done]
     report = _Progress(progress, name, chosen, len(missing) * steps)
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
         if hasattr(policy, "begin"):
             policy.begin(len(part))
-        tally = _play(env, keywords, act, part, steps, recent_steps, report)
+        tally = _play(env, keywords, robots, act, part, steps, recent_steps, report)
         rows = _rows(tally, part, steps, kind)
         done |= {row.world_seed: row for row in rows}
         if file is not None:
@@ -186,8 +193,7 @@ def evaluate(
     return [done[seed] for seed in chosen]
 
 
-def _make(env: str, keywords: dict[str, Any], n_worlds: int) -> Any:
-    n_robots = keywords.get("robots") or 1
+def _make(env: str, keywords: dict[str, Any], n_robots: int, n_worlds: int) -> Any:
     make: Any = {"num_envs": n_worlds * n_robots, "max_episode_steps": -1, **keywords}
     return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
 
@@ -200,9 +206,9 @@ def _publishes(instance: str | None) -> bool:
         return client.info.publish_truth
 
 
-def _n_moves(env: str, keywords: dict[str, Any]) -> int:
+def _n_moves(env: str, keywords: dict[str, Any], n_robots: int) -> int:
     """Moves of a path; starts no server."""
-    worlds = _make(env, keywords, 1)
+    worlds = _make(env, keywords, n_robots, 1)
     worlds.close()
     return worlds.unwrapped.n_moves
 
@@ -210,6 +216,7 @@ def _n_moves(env: str, keywords: dict[str, Any]) -> int:
 def _play(
     env: str,
     keywords: dict[str, Any],
+    n_robots: int,
     act: Policy,
     seeds: Sequence[int],
     steps: int,
@@ -217,9 +224,8 @@ def _play(
     report: _Progress,
 ) -> _Tally:
     """Flies so many paths in some worlds."""
-    worlds = _make(env, keywords, len(seeds))
+    worlds = _make(env, keywords, n_robots, len(seeds))
     try:
-        n_robots = worlds.num_envs // len(seeds)
         if worlds.unwrapped.world_spec.n_robots != n_robots:
             raise InvalidArgumentError(
                 f"robots: expected {worlds.unwrapped.world_spec.n_robots}, as the server's worlds "

@@ -84,7 +84,7 @@ class WildfireEnv(WorldEnv):
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` (1,000 unless `gymnasium.make` is
-    told otherwise), or after the running server's own `--max-steps`.
+    told otherwise), or after the steps of the task or of the running server's own `--max-steps`.
 
     ## Information
 
@@ -102,14 +102,18 @@ class WildfireEnv(WorldEnv):
     * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
     * `reward`: `"share"`, `"team"` or `"marginal"`.
     * `takeover`: take the world from its holder (False).
+    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"road-ice"`, `"team"`,
+      `"jacksboro"` or the path of a task file (`docs/environments/index.md`), which decides all
+      keywords from `model` to `states_offset`, `robots` and the length of episodes: none of them
+      may stand beside it. With `instance`: the name of the running server's.
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
       `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells), `"wildfire-burnout"` (what has
-      burnt doesn't burn again until it has regrown) or the path of a model file;
+      burnt doesn't burn again until it has regrown), `"road-ice"` or the path of a model file;
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.
     * `states`: recorded states in the place of a model (a `.npz` or `.npy` file or a folder, see
-      `docs/recorded-worlds.md`), which decide `height`, `width` and `burn_in`;
+      `docs/recorded-worlds.md`, or `"jacksboro"`), which decide `height`, `width` and `burn_in`;
       `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
     * `truth`: reveal the hidden states in `info` and pictures (False).
     * `timeout`: how long to wait for a step, or until the running server is there, seconds (5).

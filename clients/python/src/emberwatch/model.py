@@ -130,7 +130,7 @@ class Model(Description):
     @classmethod
     def checked(cls, name: str | PathLike[str]) -> Self:
         """The same of a name or file that the server has accepted already."""
-        source = built_in_models().get(fspath(name), Path(name))
+        source = built_in("models").get(fspath(name), Path(name))
         return cls.from_toml(source.read_text("utf-8"))
 
     @classmethod
@@ -166,9 +166,9 @@ class Model(Description):
         }
 
 
-def built_in_models() -> dict[str, Traversable]:
-    """The files of the models that have names, by name: those that the programs know."""
-    folder = resources.files("emberwatch") / "models"
+def built_in(kind: str) -> dict[str, Traversable]:
+    """The files of `models`, `tasks` or `landscapes` that the programs know by name, by name."""
+    folder = resources.files("emberwatch") / kind
     files = {file.name.removesuffix(".toml"): file for file in folder.iterdir()}
     return dict(sorted(files.items()))
 

@@ -38,7 +38,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     Arguments, all by keyword, are those of these environments, and:
 
-    * `robots`: how many (2); with `instance` as many as the server has.
+    * `robots`: how many (2); with `instance` or `task` as many as that has.
     * `action`: `"move"`, a `Discrete(4)` (the default), or `"path"`, a `MultiDiscrete([4] * T)`.
     * `observation`: parts, by default `"local"` for moves, `("frame", "robot")` for paths.
     * `reward`: `"share"` (the default), `"team"`, `"marginal"`, or for moves `"move"`.
@@ -58,7 +58,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """See the class. No server of its own runs before the first reset."""
         if action not in _ENVIRONMENTS:
             raise invalid("action", "'move' or 'path'", repr(action))
-        if world.get("instance") is None:
+        if world.get("instance") is None and world.get("task") is None:
             world.setdefault("robots", 2)
         keywords: dict[str, Any] = {"reward": reward, **world}
         keywords["observation"] = _OBSERVATIONS[action] if observation is None else observation

@@ -50,6 +50,8 @@ class ServerInfo:
     lease_millis: int
     #: How long the other robots have after the first path of a step; 0: as long as they hold it.
     deadline_millis: int
+    #: The task that its worlds are, by its name.
+    task: str | None = None
     #: None of simulated worlds.
     recorded_world: RecordedWorld | None = None
     #: That of the number `pid`.
@@ -199,7 +201,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
-        if name == "pid_namespace" and name not in given:
+        if name in ("pid_namespace", "task") and name not in given:
             continue
         if name == "recorded_world":  # it may be missing, too
             nested = given.get(name)

@@ -11,7 +11,7 @@ from typing import Any, Final, TypedDict, cast, get_type_hints
 import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.model import Description, Model
+from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import utf8
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
@@ -30,6 +30,7 @@ class WorldArguments(TypedDict, total=False):
     robot: int | None
     robots: int | None
     takeover: bool
+    task: str | Path | None
     model: str | Path | None
     states: str | Path | None
     states_symmetries: bool
@@ -53,6 +54,7 @@ class Settings:
     robot: int | None = None
     robots: int | None = None
     takeover: bool = False
+    task: str | Path | None = None
     model: str | Path | None = None
     states: str | Path | None = None
     states_symmetries: bool = False
@@ -79,9 +81,9 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise invalid(field.name, field.type, repr(value))
-        for name, path in (("model", self.model), ("states", self.states)):
-            if path is not None:
-                utf8(name, path)
+        for name in ("task", "model", "states"):
+            if getattr(self, name) is not None:
+                utf8(name, getattr(self, name))
         if self.robots is not None and self.robots < 1:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
@@ -114,6 +116,7 @@ class Settings:
         flags = {
             "worlds": n_worlds,
             "robots": self.robots,
+            "task": self.task,
             "model": self.model,
             "states": self.states,
             "height": self.height,
@@ -172,13 +175,15 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
             "takeover, world, robot: expected instance=..., a running server to attach to; a "
             f"private server has its own worlds, got world {settings.world}"
         )
-    robots = _robots(settings, n_rows, settings.robots or 1)
-    n_worlds = len(robots) // (settings.robots or 1)
-    checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
-    if settings.states is None:
-        described = Model.checked(settings.model or checked["model"])
+    n_robots = settings.robots or 1
+    if settings.task is not None:
+        n_robots = check_settings(settings.server_flags(1))["robots"]
+    robots = _robots(settings, n_rows, n_robots)
+    checked = check_settings(settings.server_flags(len(robots) // n_robots))
+    if checked["states"]:
+        described = _description(checked["states"])
     else:
-        described = _description(Path(settings.states))
+        described = Model.checked(checked["model"])
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
@@ -187,8 +192,8 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_observations=described.n_observations,
         burn_in=checked["burn_in"],
         n_robots=checked["robots"],
-        is_recorded=settings.states is not None,
-        description=None if settings.states is None else described,
+        is_recorded=bool(checked["states"]),
+        description=described if checked["states"] else None,
     )
     return spec, robots
 
@@ -203,6 +208,8 @@ def running_spec(
             raise InvalidArgumentError(
                 f"{name}: expected {default}, as the running server has its own"
             )
+    if settings.task not in (None, info.task):
+        raise invalid("task", f"{info.task!r}, as the server has, or None", repr(settings.task))
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
     for name in ("height", "width", "n_moves", "burn_in", "robots"):
@@ -231,9 +238,12 @@ def running_spec(
     return spec, robots
 
 
-def _description(states: Path) -> Description:
-    """That of recorded worlds whose states file the server has accepted."""
-    path = states / "states.toml" if states.is_dir() else states.with_suffix(".toml")
+def _description(states: str) -> Description:
+    """That of recorded worlds whose states the server has accepted."""
+    path = built_in("landscapes").get(states)
+    if path is None:
+        place = Path(states)
+        path = place / "states.toml" if place.is_dir() else place.with_suffix(".toml")
     return Description.from_toml(path.read_text("utf-8"))
 
 

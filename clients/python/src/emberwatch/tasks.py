@@ -1,0 +1,48 @@
+"""Tasks: worlds with a name, fixed completely, and the seeds to test on."""
+
+import tomllib
+from dataclasses import dataclass
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Self
+
+from emberwatch.model import built_in
+from emberwatch.paths import utf8
+from emberwatch.programs import check_settings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What is known of a task before its worlds are there."""
+
+    name: str
+    n_moves: int
+    robots: int
+    #: Steps of an episode.
+    max_steps: int
+    test_seeds: range
+
+    @classmethod
+    def named(cls, name: str | PathLike[str]) -> Self:
+        """The built-in task of a name, or that of a file, which the server checks first."""
+        utf8("task", name)
+        check_settings([f"--task={fspath(name)}"])
+        return cls.from_toml(built_in("tasks").get(fspath(name), Path(name)).read_text("utf-8"))
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """Reads the text of a file that a server has accepted."""
+        file = tomllib.loads(text)
+        return cls(
+            name=file["name"],
+            n_moves=file["moves"],
+            robots=file.get("robots", 1),
+            max_steps=file["max_steps"],
+            test_seeds=range(file["test_seeds"]["start"], file["test_seeds"]["end"]),
+        )
+
+
+def built_in_tasks() -> dict[str, Task]:
+    """The tasks that the programs know, by name."""
+    files = built_in("tasks").items()
+    return {name: Task.from_toml(file.read_text("utf-8")) for name, file in files}

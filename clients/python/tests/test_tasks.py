@@ -1,0 +1,176 @@
+"""Tasks: their names, ids and worlds, which are those of the same settings by hand."""
+
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from test_model import REPOSITORY
+from environments import assert_same, no_warnings, rollout, serving
+from failures import refuses
+from gymnasium.utils.env_checker import check_env
+
+import emberwatch
+from emberwatch.benchmark import evaluate
+from emberwatch.tasks import Task, built_in_tasks
+
+with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
+    from pettingzoo.test import parallel_api_test
+
+CONFIG = REPOSITORY / "config"
+
+PREFIXES = {
+    "wildfire": "Wildfire",
+    "small": "WildfireSmall",
+    "sparse": "WildfireSparse",
+    "latent": "WildfireLatent",
+    "burnout": "WildfireBurnout",
+    "road-ice": "RoadIce",
+    "team": "WildfireTeam",
+    "jacksboro": "Jacksboro",
+}
+
+#: Those that one robot flies in.
+ALONE = [name for name in PREFIXES if name != "team"]
+
+
+def by_hand(name: str) -> dict[str, Any]:
+    """The keywords that a task stands for."""
+    file = tomllib.loads((CONFIG / f"tasks/{name}.toml").read_text("utf-8"))
+    renamed = {"n_moves" if key == "moves" else key: value for key, value in file.items()}
+    not_keywords = ("name", "test_seeds", "max_steps")
+    return {key: value for key, value in renamed.items() if key not in not_keywords}
+
+
+def test_the_package_has_the_files_of_the_programs() -> None:
+    package = Path(emberwatch.__file__).parent
+    landscape = package / "landscapes/jacksboro.toml"
+    assert landscape.read_bytes() == (CONFIG / "landscapes/jacksboro/jacksboro.toml").read_bytes()
+    files = {file.stem: file for file in (CONFIG / "tasks").iterdir()}
+    assert set(files) == set(PREFIXES) == set(built_in_tasks())
+    for name, file in files.items():
+        assert file.read_bytes() == (package / "tasks" / file.name).read_bytes()
+        assert Task.named(name) == Task.named(file) == built_in_tasks()[name]
+    with refuses("task ash: No such file .*expected one, or wildfire, small, "):
+        Task.named("ash")
+
+
+@pytest.mark.parametrize("name", PREFIXES)
+def test_ids_end_episodes_with_the_task(name: str) -> None:
+    task = built_in_tasks()[name]
+    for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
+        spec = gymnasium.spec(f"emberwatch/{PREFIXES[name]}{kind}")
+        assert spec.max_episode_steps == n_moves * task.max_steps
+        assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_a_task_is_its_settings_by_hand(name: str) -> None:
+    for kind in ("-v0", "Moves-v0"):
+        steps = 3 if kind == "-v0" else 2 * by_hand(name)["n_moves"]
+        worlds: list[Any] = [
+            gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}"),
+            gymnasium.make(f"emberwatch/Wildfire{kind}", task=CONFIG / f"tasks/{name}.toml"),
+            gymnasium.make(f"emberwatch/Wildfire{kind}", **by_hand(name)),
+        ]
+        first, *others = [rollout(env, steps, seed=5) for env in worlds]
+        for other in others:
+            assert_same(first, other)
+        for env in worlds:
+            env.close()
+
+
+@pytest.mark.parametrize("name", PREFIXES)
+def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
+    n_rows = 2 * built_in_tasks()[name].robots
+    worlds: list[Any] = [
+        gymnasium.make_vec(f"emberwatch/{PREFIXES[name]}-v0", num_envs=n_rows),
+        gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=n_rows, **by_hand(name)),
+    ]
+    first, second = [rollout(envs, 3, seed=5) for envs in worlds]
+    assert_same(first, second)
+    for envs in worlds:
+        envs.close()
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_gymnasium_finds_no_fault(name: str) -> None:
+    for kind in ("-v0", "Moves-v0"):
+        with no_warnings():
+            env = gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}", disable_env_checker=True)
+            check_env(env.unwrapped, skip_render_check=True)
+            env.close()
+
+
+def test_pettingzoo_finds_no_fault_in_the_team() -> None:
+    with no_warnings():
+        env = emberwatch.parallel_env(task="team")
+        assert len(env.possible_agents) == 4
+        parallel_api_test(env, num_cycles=50)
+        env.close()
+
+
+def test_one_robot_flies_the_team_s_world_only_beside_others() -> None:
+    with refuses("robots: expected one robot in a world, got 4: fly one of them with robot="):
+        gymnasium.make("emberwatch/WildfireTeam-v0")
+    with serving(
+        task="team", **dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
+    ) as lab:
+        env = gymnasium.make("emberwatch/WildfireTeam-v0", instance=lab, robot=2)
+        env.reset()
+        env.close()
+
+
+def test_a_task_ends_episodes_in_any_environment() -> None:
+    env = gymnasium.make("emberwatch/Wildfire-v0", task="small")
+    *_, last = rollout(env, built_in_tasks()["small"].max_steps, seed=1)
+    assert last[3]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value", "setting"),
+    [
+        ("model", "wildfire", "model"),
+        ("states", "jacksboro", "states"),
+        ("states_symmetries", True, "states_symmetries"),
+        ("states_offset", 3, "states_offset"),
+        ("height", 16, "height"),
+        ("width", 16, "width"),
+        ("n_moves", 16, "moves"),
+        ("robots", 1, "robots"),
+        ("burn_in", 3000, "burn_in"),
+        ("start", "corner", "start"),
+    ],
+)
+def test_what_a_task_decides_is_refused_by_name(keyword: str, value: Any, setting: str) -> None:
+    with refuses(f"{setting}: expected no flag beside a task, which decides it, got"):
+        gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
+
+
+def test_a_running_server_must_have_the_task() -> None:
+    plain = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
+    with serving(task="small", **plain) as lab, emberwatch.connect(lab) as client:
+        assert client.info.task == "small"
+        env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
+        env.reset()
+        env.close()
+        with refuses("task: expected 'small', as the server has, or None, got 'sparse'"):
+            gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
+
+
+def test_an_evaluation_takes_seeds_and_steps_of_its_task(tmp_path: Path) -> None:
+    text = (CONFIG / "tasks/team.toml").read_text("utf-8")
+    own = tmp_path / "own.toml"
+    text = text.replace("max_steps = 300", "max_steps = 2").replace("end = 32", "end = 3")
+    own.write_text(text.replace('"team"', '"own"'), "utf-8")
+    rows = evaluate(
+        lambda seen: [0] * len(seen), name="up", task=own, observation="frame", progress=None
+    )
+    assert [(row.world_seed, row.steps, row.robots) for row in rows] == [
+        (0, 2, 4),
+        (1, 2, 4),
+        (2, 2, 4),
+    ]

@@ -1,0 +1,129 @@
+//! Tasks: the worlds of a name are those of the same flags, and all that knows the server names it.
+
+use crate::commands::{agent, check_table};
+use crate::recording::{read_whole, start_recorder, stop};
+use emberwatch_protocol::recording::Event;
+use tempfile::TempDir;
+use tests::harness::{AGENT, Paths, Program, SERVER, Server, fly, repository, reset, seen_by};
+
+/// The task `small`, by hand.
+const SMALL_BY_HAND: &str =
+    "--model wildfire-small --height 16 --width 16 --moves 16 --burn-in 3000 --max-steps 300";
+
+#[test]
+fn a_task_has_the_worlds_of_its_flags() {
+    let seen = |flags: &str| {
+        let server = Server::start(flags);
+        let (mut client, mut paths) = (server.acquire(0..1), Paths::new(1));
+        reset(&mut client, 7);
+        let step = |_| seen_by(&fly(&mut client, paths.next(16)));
+        let seen: Vec<_> = (0..20).map(step).collect();
+        (seen, server.info().max_steps)
+    };
+    let by_name = seen("--task small");
+    let file = repository().join("config/tasks/small.toml");
+    assert_eq!(by_name, seen(&format!("--task {}", file.display())));
+    assert_eq!(by_name, seen(SMALL_BY_HAND));
+}
+
+#[test]
+fn hello_status_and_recordings_name_the_task() {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("task.recording");
+    let server = Server::start("--task small");
+    assert_eq!(server.info().task.as_deref(), Some("small"));
+    let status = server.command("status").check(0).stdout;
+    assert!(status.contains(": task small, pid "), "{status}");
+    let recorder = start_recorder(&server.instance, &file, "");
+    fly(&mut server.acquire(0..1), Paths::new(1).next(16));
+    stop(recorder);
+    let named = |event: &Event| matches!(event, Event::Server(info) if info.task.as_deref() == Some("small"));
+    assert!(read_whole(&file).iter().any(|record| named(&record.event)));
+    assert_eq!(Server::start(SMALL_BY_HAND).info().task, None);
+}
+
+#[test]
+fn a_snapshot_of_a_task_fits_the_same_worlds_by_flags() {
+    let folder = TempDir::new().expect("a folder");
+    for (from, to) in [
+        ("--task small", SMALL_BY_HAND),
+        (SMALL_BY_HAND, "--task small"),
+    ] {
+        let file = folder.path().join("one.snapshot");
+        let server = Server::start(from);
+        server
+            .command(&format!("snapshot {}", file.display()))
+            .check(0);
+        let bytes = std::fs::read(&file).expect("a snapshot");
+        let names_it = bytes.windows(9).any(|part| part == b"task\x05small");
+        assert_eq!(names_it, from.contains("task"));
+        let other = Server::start(&format!("{to} --seed 9"));
+        other
+            .command(&format!("restore {}", file.display()))
+            .check(0);
+    }
+}
+
+#[test]
+fn an_agent_refuses_a_server_of_another_task() {
+    let server = Server::start("--task small");
+    let flags = "--steps 1 --policy coverage";
+    Program::agent(&server.instance, &format!("{flags} --task small")).ends(0);
+    let ended = Program::agent(&server.instance, &format!("{flags} --task team")).finish();
+    let words = "expected task team, got small";
+    assert!(ended.stderr.contains(words), "{}", ended.stderr);
+}
+
+#[test]
+fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
+    let folder = TempDir::new().expect("a folder");
+    let csv = folder.path().join("a.csv");
+    let own = folder.path().join("own.toml");
+    let text = std::fs::read_to_string(repository().join("config/tasks/team.toml"));
+    let text = text
+        .expect("the task")
+        .replace("max_steps = 300", "max_steps = 3");
+    std::fs::write(&own, text.replace("end = 32", "end = 2")).expect("write");
+    let task = format!("--task {}", own.display());
+    let policies = "--policies coverage --baseline coverage";
+    agent(&format!(
+        "compare {task} {policies} --csv {}",
+        csv.display()
+    ))
+    .check(0);
+    let rows = std::fs::read_to_string(&csv).expect("a table");
+    assert_eq!(rows.lines().count(), 1 + 2, "{rows}");
+    let out = folder.path().join("learned");
+    agent(&format!(
+        "train {task} --worlds 2 --steps 8 --out {}",
+        out.display()
+    ))
+    .check(0);
+    assert!(out.join("checkpoint.safetensors").exists());
+}
+
+#[test]
+fn flags_that_a_task_decides_are_refused_by_name() {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("task.toml");
+    std::fs::write(&file, "name = 'mine'\n").expect("write");
+    let table =
+        "--task small --height 3 => height: expected no flag beside a task, which decides it, got 3
+--task small --model wildfire => model: expected no flag beside a task
+--task small --robots 1 => robots: expected no flag beside a task
+--task small --max-steps 3 => max_steps: expected no flag beside a task
+--task small --start corner => start: expected no flag beside a task
+--task jacksboro --states-offset 3 => states_offset: expected no flag beside a task
+--task ash => task ash: No such file | expected one, or wildfire, small
+--task FILE => missing field `moves`";
+    let table = table.replace("FILE", &file.display().to_string());
+    check_table(SERVER, &table);
+    let table =
+        "compare --task small --height 3 => --task <NAME|FILE> | cannot be used with | --height
+compare --task small --robots 2 => --robots | cannot be used with | --task
+compare --task small --burn-in 2 => --burn-in | cannot be used with | --task
+train --task small --moves 3 --out x => --task <NAME|FILE> | cannot be used with | --moves
+evaluate --task ash --checkpoint x => task ash: No such file | expected one, or wildfire, small
+run --task ash => task ash: No such file";
+    check_table(AGENT, table);
+}
