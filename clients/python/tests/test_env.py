@@ -1,8 +1,10 @@
 """`emberwatch/Wildfire-v0`: Gymnasium's own checks, seeds, options, faults, wrappers."""
 
 import copy
+import dataclasses
 import os
 import pickle
+import pydoc
 import re
 import signal
 import subprocess
@@ -46,7 +48,9 @@ from emberwatch.errors import (
     ServerGoneError,
 )
 from emberwatch.model import Model
+from emberwatch.parallel import WildfireParallelEnv
 from emberwatch.programs import find
+from emberwatch.settings import Settings
 
 PARTS = ["frame", "robot", "age"]
 
@@ -100,7 +104,26 @@ def test_rewards_and_ends_are_plain_python() -> None:
     _, reward, terminated, truncated, info = env.step([0, 1, 2, 3])
     assert [type(value) for value in (reward, terminated, truncated)] == [float, bool, bool]
     assert info["step"] == 1 and type(info["step"]) is int
-    assert set(info) == {"step", "n_target_cells", "n_visited", "n_hits"}
+    assert set(info) == {"step", "n_visited"}
+    env = make(truth=True)
+    assert set(env.reset(seed=1)[1]) == {"step", "n_visited", "n_target_cells", "n_hits", "truth"}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        getattr(emberwatch, f"Wildfire{what}{shape}")
+        for what in ("", "Moves", "Objective")
+        for shape in ("Env", "VectorEnv")
+    ]
+    + [WildfireParallelEnv],
+)
+def test_help_shows_each_keyword_with_its_default(kind: type) -> None:
+    words = pydoc.render_doc(kind, renderer=pydoc.plaintext)
+    for field in dataclasses.fields(Settings):
+        shown = re.search(rf"\b{field.name}: [^=]+ = {re.escape(repr(field.default))}", words)
+        assert bool(shown) == (field.name != "reveals"), field.name
+    assert "**world" not in words
 
 
 def test_an_empty_observation_begins_an_episode() -> None:
@@ -108,7 +131,7 @@ def test_an_empty_observation_begins_an_episode() -> None:
     observation, info = env.reset(seed=4)
     assert (observation["frame"] == 255).all() and (observation["age"] == 255).all()
     assert observation["robot"].tolist() == [2, 3]
-    assert info["step"] == info["n_visited"] == info["n_hits"] == 0
+    assert info["step"] == info["n_visited"] == 0
 
 
 def test_the_robot_flies_and_sees_its_path() -> None:
@@ -118,7 +141,7 @@ def test_the_robot_flies_and_sees_its_path() -> None:
     seen = np.argwhere(observation["frame"][..., 0] != 255).tolist()
     assert seen == [[1, 3], [1, 4], [2, 4]]  # the last move but one left the grid
     assert observation["robot"].tolist() == [2, 4]
-    assert info["n_visited"] == 3 and reward == info["n_hits"]
+    assert info["n_visited"] == 3
 
 
 def test_ages_count_the_steps_since_a_cell_was_seen() -> None:
@@ -143,6 +166,7 @@ def test_truth_shows_the_states_that_paid() -> None:
         visited = observation["frame"][..., 0] != 255
         assert reward == (truth[visited] == 2).sum()
         assert info["n_target_cells"] == (truth == 2).sum()
+        assert info["n_hits"] == reward
 
 
 def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,7 +309,7 @@ def test_rust_and_python_see_the_same_frames() -> None:
             frames[frame.result.step] = frame
     seeds = {frame.result.seed for frame in frames.values()}
     assert len(seeds) == 1
-    env = make()
+    env = make(truth=True)
     env.reset(seed=seeds.pop())
     for step in range(1, n_steps + 1):
         theirs, (robot,) = frames[step].result, frames[step].robots

@@ -106,8 +106,7 @@ def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
             assert_same(outcome[0][agent], one)
             if len(others) > 1:
                 assert [part[agent] for part in outcome[1:4]] == [part[row] for part in others[:3]]
-            names = ("step", "n_target_cells", "n_visited", "n_hits")
-            info = {name: int(others[-1][name][row]) for name in names}
+            info = {name: int(others[-1][name][row]) for name in ("step", "n_visited")}
             assert_same(outcome[-1][agent], info)
     assert ours.agents == [] and all(outcomes[-1][3].values())
 
@@ -267,7 +266,7 @@ def test_robots_that_nobody_holds_hover() -> None:
             assert (seen["others"] == before).all() and before.sum() == 2 * 255
             assert (seen["team"] == seen["frame"]).all()
         other = alone(instance, 2)
-        assert other.reset()[1] == info | {"n_visited": 0, "n_hits": 0}
+        assert other.reset()[1] == info | {"n_visited": 0}
 
 
 def test_a_late_path_is_not_flown_and_told() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium
 import pytest
-from test_model import REPOSITORY
 from environments import assert_same, no_warnings, rollout, serving
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
@@ -19,7 +18,7 @@ from emberwatch.tasks import Task, built_in_tasks
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import parallel_api_test
 
-CONFIG = REPOSITORY / "config"
+CONFIG = Path(__file__).parents[3] / "config"
 
 PREFIXES = {
     "wildfire": "Wildfire",
@@ -68,16 +67,17 @@ def test_ids_end_episodes_with_the_task(name: str) -> None:
 
 @pytest.mark.parametrize("name", ALONE)
 def test_a_task_is_its_settings_by_hand(name: str) -> None:
-    for kind in ("-v0", "Moves-v0"):
-        steps = 3 if kind == "-v0" else 2 * by_hand(name)["n_moves"]
+    file = CONFIG / f"tasks/{name}.toml"
+    for kind, steps, other in (
+        ("-v0", 3, by_hand(name)),
+        ("Moves-v0", 2 * by_hand(name)["n_moves"], {"task": file}),
+    ):
         worlds: list[Any] = [
             gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}"),
-            gymnasium.make(f"emberwatch/Wildfire{kind}", task=CONFIG / f"tasks/{name}.toml"),
-            gymnasium.make(f"emberwatch/Wildfire{kind}", **by_hand(name)),
+            gymnasium.make(f"emberwatch/Wildfire{kind}", **other),
         ]
-        first, *others = [rollout(env, steps, seed=5) for env in worlds]
-        for other in others:
-            assert_same(first, other)
+        first, second = [rollout(env, steps, seed=5) for env in worlds]
+        assert_same(first, second)
         for env in worlds:
             env.close()
 

@@ -1,7 +1,6 @@
 """What the environments of one robot share: its session, its pictures, its beginning."""
 
 from collections.abc import Mapping
-from operator import attrgetter
 from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import gymnasium
@@ -21,16 +20,10 @@ NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
-#: Fields of a result that become `info`: not the seed, which gives the hidden states away.
-REPORTED: Final = {
-    "step": "world",
-    "n_target_cells": "world",
-    "n_visited": "robot",
-    "n_hits": "robot",
-}
-
-#: Their values, as a tuple.
-_reported: Final = attrgetter(*(f"{part}.{name}" for name, part in REPORTED.items()))
+#: Fields of a result that become `info`, and those that do beside hidden states; never the seed,
+#: which gives all of them away.
+REPORTED: Final = {"step": "world", "n_visited": "robot"}
+REVEALED: Final = REPORTED | {"n_target_cells": "world", "n_hits": "robot"}
 
 #: What a robot's step can pay, and the field of a result that says it.
 REWARDS: Final = {
@@ -111,7 +104,10 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        info: dict[str, Any] = dict(zip(REPORTED, _reported(result), strict=True))
+        fields = REVEALED if self._reveals else REPORTED
+        info: dict[str, Any] = {
+            name: getattr(getattr(result, part), name) for name, part in fields.items()
+        }
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:

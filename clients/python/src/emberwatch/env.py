@@ -12,7 +12,7 @@ from emberwatch.arguments import as_moves
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.observations import Observations, Parts, of_row
 from emberwatch.session import Session
-from emberwatch.settings import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.wire import StepAnswer, StepResult
 
@@ -88,9 +88,9 @@ class WildfireEnv(WorldEnv):
 
     ## Information
 
-    `step` (k), `n_target_cells` (cells burning on the whole grid), `n_visited` (distinct cells
-    visited), `n_hits` (of these, burning), and with `truth=True` the hidden `truth`, `(H, W)`
-    uint8. They are for reports and pictures: a learner that uses them cheats.
+    `step` (k) and `n_visited` (distinct cells visited). With `truth=True`, for reports and
+    pictures, as a learner that uses them cheats: `n_target_cells` (cells burning on the whole
+    grid), `n_hits` (of the visited, burning) and the hidden `truth`, `(H, W)` uint8.
 
     ## Arguments
 
@@ -129,6 +129,7 @@ class WildfireEnv(WorldEnv):
     * v0: the first.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,
@@ -147,7 +148,10 @@ class WildfireEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; see the class, *Starting State*."""
+        """Begins an episode; with `robot`, goes on from where the shared world stands.
+
+        See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
+        """
         self._answer = answer = self._begin(seed, options)
         self._observations.reset(ONE_ROW, answer.frames)
         seen = self._seen(answer, answer.result())
@@ -207,6 +211,7 @@ class WildfireVectorEnv(WorldVectorEnv):
     * `render_mode`: `"human"` shows the first world only.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,

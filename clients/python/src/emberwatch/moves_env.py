@@ -16,7 +16,7 @@ from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.flights import Flights
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
 from emberwatch.session import Session
-from emberwatch.settings import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
@@ -93,6 +93,7 @@ class WildfireMovesEnv(WorldEnv):
     * v0: the first.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,
@@ -116,7 +117,10 @@ class WildfireMovesEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`."""
+        """Begins an episode; with `robot`, goes on from where the shared world stands.
+
+        See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
+        """
         answer = self._begin(seed, options)
         self._observations.reset(ONE_ROW, answer.frames)
         self._begin_path(answer)
@@ -195,6 +199,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     `max_episode_steps` (moves), `autoreset_mode`.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,

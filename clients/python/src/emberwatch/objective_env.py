@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from emberwatch.agent_session import AgentSession, AgentSessionOwner, Features
 from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, WorldEnv
-from emberwatch.settings import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv
 from emberwatch.wire import StepAnswer
 
@@ -71,8 +71,8 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
       `"neural_belief"` is a network from what was seen in each cell. By default the checkpoint's,
       without one the known model's filter.
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
-    * `prior`: of the known model's filter, `"simulated"` (the default; takes a second to start),
-      `"initial"` or `"uniform"`.
+    * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
+      second), `"initial"` or `"uniform"`.
     * `agent`: `"own"` starts an agent on the world; `"running"` uses one that serves decisions
       already, for `world` of `instance`.
 
@@ -86,6 +86,7 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
     * v1: eight plans with features, on a belief of choice; v0 chose among states and entropy.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,
@@ -143,6 +144,7 @@ class WildfireObjectiveVectorEnv(AgentSessionOwner, WorldVectorEnv):
     `max_episode_steps`, `autoreset_mode`. With `agent="running"` that agent acts on these worlds.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,

@@ -20,7 +20,7 @@ from emberwatch.errors import invalid
 from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.observations import MovesParts, of_row
 from emberwatch.owner import state_of
-from emberwatch.settings import WorldArguments
+from emberwatch.settings import WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, info_of
 from emberwatch.view import RENDER_FPS, RENDER_MODES
 from emberwatch.wire import UNOBSERVED
@@ -45,6 +45,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     * `max_episode_steps`: truncate after so many moves or paths (1,000); None: never.
     """
 
+    @shows_keywords
     def __init__(
         self,
         *,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from inspect import signature
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Any, Final, TypedDict, cast, get_type_hints
+from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from emberwatch.wire import Shape
 
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
+
+_Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
@@ -96,9 +98,8 @@ class Settings:
         Raises:
             TypeError: If a keyword is unknown; names the most similar one, and all.
         """
-        parameters = signature(environment.__init__).parameters.values()
+        parameters = signature(environment).parameters.values()
         known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}
-        known |= set(WorldArguments.__annotations__)
         for name in world:
             if name not in known:
                 alike = get_close_matches(name, known, 1)
@@ -130,6 +131,24 @@ class Settings:
             "states-offset": self.states_offset or None,
         }
         return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
+
+
+def shows_keywords(init: _Init) -> _Init:
+    """Puts the keywords and their defaults in the place of ``**world``, for `help` and editors."""
+    plain: Any = init
+    own = signature(plain).parameters.values()
+    kinds = get_type_hints(Settings)
+    shared = [
+        Parameter(
+            each.name, Parameter.KEYWORD_ONLY, default=each.default, annotation=kinds[each.name]
+        )
+        for each in fields(Settings)
+        if each.name in WorldArguments.__annotations__
+    ]
+    plain.__signature__ = Signature(
+        [*(each for each in own if each.kind is not each.VAR_KEYWORD), *shared]
+    )
+    return init
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from emberwatch.agent_session import Features
 from emberwatch.arguments import as_array, as_integer, as_seed, told
-from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, as_options, wants_to_resume
+from emberwatch.base import (
+    NOTHING_TO_DRAW,
+    REPORTED,
+    REVEALED,
+    WorldEnv,
+    as_options,
+    wants_to_resume,
+)
 from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.owner import SessionOwner
@@ -285,7 +292,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of some rows, zero for the others, as Gymnasium stacks them."""
         infos: dict[str, Any] = {}
-        for name, part in REPORTED.items():
+        for name, part in (REVEALED if self._reveals else REPORTED).items():
             infos[name] = np.where(mask, self._results[part][name], 0).astype(np.int64)
             infos[f"_{name}"] = mask.copy()
         if self._truths is not None and self._reveals:
