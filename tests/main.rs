@@ -33,6 +33,7 @@ mod replays;
 mod restart;
 mod security;
 mod snapshots;
+mod suite;
 mod tasks;
 mod team_agents;
 mod teams;

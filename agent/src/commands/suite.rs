@@ -67,6 +67,13 @@ impl SuiteCommand {
             self.tasks.iter().map(|name| Task::named(name)).collect()
         };
         let tasks = tasks?;
+        if let Some(folder) = &self.checkpoints {
+            ensure!(
+                folder.is_dir(),
+                "--checkpoints: expected a folder, got {}",
+                folder.display()
+            );
+        }
         make_folder(&self.out)?;
         let runs = tasks.iter().map(|task| {
             self.runs(task, &config)
@@ -134,11 +141,6 @@ impl SuiteCommand {
         let Some(folder) = &self.checkpoints else {
             return Ok(Learned::default());
         };
-        ensure!(
-            folder.is_dir(),
-            "--checkpoints: expected a folder, got {}",
-            folder.display()
-        );
         let place = folder.join(&task.name).join(CHECKPOINT);
         if !place.exists() {
             tracing::warn!("no {}: no learned policy for this task", place.display());

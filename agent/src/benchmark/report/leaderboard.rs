@@ -226,6 +226,9 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
             .collect::<Vec<_>>()
     });
     let runs: Vec<PolicyRun> = runs.collect();
+    if runs.is_empty() {
+        return Ok(()); // of one end of the scale alone there are no scores
+    }
     let title = "Mean score of each policy over tasks";
     let note = format!("A mark for each of {} tasks", tasks.len());
     draw_bars(
