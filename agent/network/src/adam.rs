@@ -233,6 +233,24 @@ mod tests {
     }
 
     #[test]
+    fn large_gradients_are_scaled_to_the_norm_and_small_ones_are_not() {
+        for (g, expected) in [([3.0, 4.0], [0.3, 0.4]), ([0.3, 0.4], [0.15, 0.2])] {
+            let settings = AdamSettings {
+                max_norm: Some(1.0),
+                ..AdamSettings::paper(0.1)
+            };
+            let mut adam = Adam::new(variables()).expect("moments");
+            step(&mut adam, &settings, g);
+            let first: Vec<f32> = adam.moments["first.p"].to_vec1().expect("numbers");
+            let off = first
+                .iter()
+                .zip(expected)
+                .map(|(a, b): (&f32, f32)| (a - b).abs());
+            assert!(off.fold(0.0, f32::max) < 1e-6, "{first:?}");
+        }
+    }
+
+    #[test]
     fn moments_without_a_gradient_do_not_become_subnormal() {
         let settings = AdamSettings::paper(0.1);
         let mut adam = Adam::new(variables()).expect("moments");
