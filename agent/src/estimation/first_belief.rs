@@ -1,5 +1,6 @@
-//! A filter's first belief, announced, as simulating it may take long.
+//! A filter's first belief: simulating it may take long, so it is announced, and kept for later runs.
 
+use super::kept_belief::KeptBelief;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_protocol::model::ModelError;
@@ -15,15 +16,35 @@ pub fn first_belief(
     shape: Shape,
     seed: u64,
 ) -> Result<Belief, ModelError> {
-    if let Prior::Simulated { n_worlds, burn_in } = prior {
-        let cells = n_worlds as f64 * burn_in as f64 * shape.n_cells() as f64;
-        let seconds = cells / CELLS_PER_SECOND / rayon::current_num_threads() as f64;
-        tracing::info!(
-            worlds = n_worlds,
-            steps = burn_in,
-            about_seconds = seconds.ceil(),
-            "simulating the first belief"
-        );
+    let Prior::Simulated { n_worlds, burn_in } = prior else {
+        return prior.belief(model, shape, seed);
+    };
+    let kept = KeptBelief::new(key(prior, model, shape, seed), dim(model, shape));
+    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
+        return Ok(belief);
     }
-    prior.belief(model, shape, seed)
+    let cells = n_worlds as f64 * burn_in as f64 * shape.n_cells() as f64;
+    let seconds = cells / CELLS_PER_SECOND / rayon::current_num_threads() as f64;
+    tracing::info!(
+        worlds = n_worlds,
+        steps = burn_in,
+        about_seconds = seconds.ceil(),
+        "simulating the first belief"
+    );
+    let belief = prior.belief(model, shape, seed)?;
+    if let Some(kept) = kept {
+        kept.write(&belief);
+    }
+    Ok(belief)
+}
+
+/// All that a simulated belief depends on.
+fn key(prior: Prior, model: &Model, shape: Shape, seed: u64) -> String {
+    let version = env!("CARGO_PKG_VERSION");
+    let model = toml::to_string(model.file()).expect("invariant: model files serialise");
+    format!("emberwatch {version}: {prior:?}, {shape}, seed {seed}\n{model}\n")
+}
+
+fn dim(model: &Model, shape: Shape) -> (usize, usize, usize) {
+    (model.n_states(), shape.height(), shape.width())
 }
