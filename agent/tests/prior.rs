@@ -22,7 +22,7 @@ fn prior_with_cache(folder: &Path, cache: &Path, flags: &str) -> Output {
 
 #[test]
 fn the_file_holds_the_belief_that_a_filter_begins_with() {
-    let folder = tempfile::TempDir::new().expect("a folder");
+    let folder = TempDir::new().expect("a folder");
     let flags =
         "--model wildfire --height 5 --width 7 --burn-in 40 --worlds 9 --seed 3 --out p.npy";
     let path = folder.path().join("p.npy");
@@ -46,8 +46,8 @@ fn the_file_holds_the_belief_that_a_filter_begins_with() {
 
 #[test]
 fn a_belief_is_simulated_once_and_again_where_its_file_is_no_good() {
-    let (folder, cache) = (TempDir::new(), TempDir::new());
-    let (folder, cache) = (folder.expect("a folder"), cache.expect("a folder"));
+    let folder = TempDir::new().expect("a folder");
+    let cache = TempDir::new().expect("a folder");
     let flags = "--height 5 --width 7 --burn-in 40 --worlds 9";
     let run = |flags: &str| {
         let ended = prior_with_cache(
