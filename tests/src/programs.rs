@@ -60,6 +60,8 @@ impl Program {
             .stdout(file("stdout"))
             .stderr(file("stderr"))
             .env("RUST_LOG", "info")
+            // Not the user's; here nothing can be kept.
+            .env("XDG_CACHE_HOME", "/dev/null")
             .spawn();
         Self {
             child: child.expect("start the program"),

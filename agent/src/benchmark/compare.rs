@@ -329,7 +329,6 @@ impl World {
         let (agent, observation) = (&rollout.agent, rollout.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
-        let is_own = estimator.knows_model() || estimator.is_learned();
         let moves = &plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
@@ -339,7 +338,7 @@ impl World {
             truth: rollout.truth()?.clone(),
             frame: observation.frame.clone(),
             path_cells,
-            belief: is_own.then(|| agent.belief().clone()),
+            belief: estimator.sees_frames().then(|| agent.belief().clone()),
             learned_target: estimator.is_learned().then(|| agent.target()),
         })
     }

@@ -158,6 +158,7 @@ impl LearningConfig {
 impl NeuralConfig {
     pub(super) fn check(&self) -> Result<()> {
         let ranges = [
+            ("steps", self.steps as f64, 1.0, 1e12),
             ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
             ("replay_frames", self.replay_frames as f64, 1.0, 1e6),
             ("batch", self.batch as f64, 1.0, 1024.0),
@@ -233,6 +234,7 @@ impl DecisionsConfig {
     pub(super) fn check(&self) -> Result<()> {
         check_dqn("decisions.", &self.learning, 2e5)?;
         let ranges = [
+            ("filter_steps", self.filter_steps as f64, 1.0, 1e12),
             ("beam_width", self.beam_width as f64, 1.0, 1e4),
             ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
             ("longest_hold", self.longest_hold as f64, 1.0, 1e3),

@@ -1,5 +1,6 @@
 """A deadline for each test, and the end of what it opened."""
 
+import os
 import signal
 from collections.abc import Iterator
 from types import FrameType
@@ -15,6 +16,9 @@ settings.load_profile("emberwatch")
 # A shell may start this with signals ignored, which children would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+# Not the user's; here nothing can be kept.
+os.environ["XDG_CACHE_HOME"] = "/dev/null"
 
 #: A whole test, seconds.
 DEADLINE = 300

@@ -186,6 +186,7 @@ def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
     file = tmp_path / "tiny.toml"
     file.write_text(own)
     chosen: dict[str, Any] = {"name": "mine", "folder": tmp_path / "out", "progress": None}
+    chosen["observation"] = "frame"
 
     def down(frames: Any) -> Any:
         return np.full(len(frames), 2)

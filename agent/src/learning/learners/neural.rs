@@ -185,6 +185,7 @@ impl Learner for NeuralLearner {
             self.replay.forget();
             self.earned = 0.0;
         }
+        self.replay.end_others(&self.worlds.numbers);
         let n_gone_on = left.len();
         for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
             let run = match left.remove(&robot) {

@@ -11,6 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
 
 /// Frames of a block, at most.
 const BLOCK_FRAMES: usize = 256;
@@ -59,6 +60,16 @@ impl Replay {
         }
     }
 
+    /// Ends the tracks of all robots but these.
+    pub fn end_others(&mut self, robots: &Range<u32>) {
+        let open = std::mem::take(&mut self.open);
+        let (own, ended): (_, BTreeMap<_, _>) = open
+            .into_iter()
+            .partition(|(robot, _)| robots.contains(robot));
+        self.open = own;
+        self.full.extend(ended.into_values());
+    }
+
     /// Adds the next frame of a robot.
     ///
     /// # Panics
@@ -66,7 +77,7 @@ impl Replay {
     pub fn push(&mut self, robot: u32, frame: &Frame) {
         let block = self.open.get_mut(&robot).expect("a track that was begun");
         block.frames.push(frame.observed().collect());
-        if block.frames.len() == BLOCK_FRAMES {
+        if block.frames.len() >= BLOCK_FRAMES {
             let before = block.before_frame(BLOCK_FRAMES);
             self.open(robot, before);
         }
