@@ -307,7 +307,8 @@ impl Learner for NeuralLearner {
     }
 
     fn contents(&self) -> Result<Contents> {
-        let runs = self.runs.iter().map(SavedRun::of);
+        let runs = self.runs.iter();
+        let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
         // As `SavedNeural`, without a copy of the replay.
         let state = (

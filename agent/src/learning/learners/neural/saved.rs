@@ -1,11 +1,11 @@
 //! A neural belief in a checkpoint: what policies act on, and what learning goes on from.
 
-use super::Run;
 use super::behaviour::Behaviour;
 use super::replay::Replay;
 use crate::learning::checkpoint::{Contents, check, check_belief, check_counts};
 use crate::learning::learners::base::{Place, place};
 use crate::learning::reward::RewardEstimate;
+use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
@@ -117,8 +117,8 @@ impl SavedNeural {
 }
 
 impl SavedRun {
-    pub(super) fn of(run: &Run) -> Self {
-        let (agent, observation) = (&run.rollout.agent, run.rollout.observation());
+    pub(super) fn of(rollout: &Rollout, behaviour: Option<Behaviour>) -> Self {
+        let (agent, observation) = (&rollout.agent, rollout.observation());
         Self {
             place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),
@@ -128,7 +128,7 @@ impl SavedRun {
                 .map(|it| it.to_bytes())
                 .unwrap_or_default(),
             estimate: agent.estimate().cloned(),
-            behaviour: run.behaviour,
+            behaviour,
         }
     }
 
