@@ -220,13 +220,13 @@ def suite(
             raise InvalidArgumentError(f"{keyword}: expected none, as suite sets it")
     if worlds is not None and (as_integer(worlds) or 0) < 1:
         raise invalid("worlds", "at least 1", told(worlds))
-    by_task = policy if isinstance(policy, Mapping) else None
+    by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
     chosen = list(tasks or by_task or built_in_tasks())
     rows: dict[str, list[Row]] = {}
     for source in chosen:
         task = Task.named(source)
         if by_task is not None and task.name not in by_task:
-            raise invalid("policy", f"one for the task {task.name}", ", ".join(map(str, by_task)))
+            raise invalid("policy", f"one for the task {task.name}", ", ".join(by_task))
         rows[task.name] = evaluate(
             policy if by_task is None else by_task[task.name],
             name=name,
