@@ -3,7 +3,8 @@
 use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::figures::draw_bars;
 use crate::benchmark::report::number::number;
-use crate::benchmark::report::policy_run::PolicyRun;
+use crate::benchmark::report::policy_run::{ALONE, PolicyRun};
+use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::suite::{FLOOR, TaskRuns, by_score, render_suite};
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, ensure};
@@ -38,6 +39,7 @@ struct Row {
     code: String,
     commit: String,
     training_seconds: f64,
+    estimator: String,
     task: String,
     world_seed: u64,
     steps: u64,
@@ -114,6 +116,7 @@ impl Row {
             code,
             commit,
             training_seconds,
+            estimator: run.estimator.clone(),
             task: task.into(),
             world_seed: run.world_seed,
             steps: run.steps,
@@ -136,6 +139,9 @@ impl Row {
     fn run(self) -> PolicyRun {
         PolicyRun {
             policy: self.policy,
+            estimator: self.estimator,
+            robots: 1,
+            team: ALONE.into(),
             world_seed: self.world_seed,
             steps: self.steps,
             mean_reward: self.mean_reward,
@@ -208,16 +214,14 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let tasks = merged(entries);
     let runs = entries.iter().flat_map(|entry| {
         let policy = &entry.about.policy;
-        let score = move |(index, task): (usize, &TaskRuns)| {
-            let scores = task.scores(policy);
-            let mean_reward = scores.iter().sum::<f64>() / scores.len() as f64;
-            let run = PolicyRun {
-                policy: policy.clone(),
+        let any = entry.tasks.iter().flat_map(|task| &task.runs).next();
+        let score = |(index, task): (usize, &TaskRuns)| {
+            let mean = Estimate::of(&task.scores(policy))?.mean;
+            Some(PolicyRun {
                 world_seed: index as u64,
-                mean_reward,
-                ..PolicyRun::default()
-            };
-            (!scores.is_empty()).then_some(run)
+                mean_reward: mean,
+                ..any?.clone()
+            })
         };
         tasks
             .iter()
