@@ -184,3 +184,12 @@ def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     programs.dashboard(server.instance, port=dashboard.port)
     look.eventually(lambda: look.text("state") == "serving", "serving again")
     eventually(lambda: look.drawn() > drawn + 3, "pictures again")
+
+
+def test_the_task_is_named(programs, open_page):
+    by_task = dict.fromkeys(("height", "width", "moves", "burn_in"))
+    server = programs.server(task="small", **by_task)
+    look = open_page(programs.dashboard(server.instance))
+    look.eventually(
+        lambda: look.page.locator("#task").text_content() == "task small", "the task's name"
+    )

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import emberwatch
 from emberwatch.benchmark import evaluate
-from emberwatch.tasks import Task, built_in_tasks
+from emberwatch.task import Task, built_in_tasks
 
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import parallel_api_test

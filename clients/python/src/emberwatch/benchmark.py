@@ -31,7 +31,7 @@ from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
-from emberwatch.tasks import Task
+from emberwatch.task import Task
 from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
