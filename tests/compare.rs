@@ -16,7 +16,7 @@ const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
                       mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
                       steps_to_detection,burning_cells_at_detection,recent_steps,\
-                      burning_seen_share,front_distance,grid_seen_share";
+                      burning_seen_share,front_distance,grid_seen_share,log_likelihood";
 
 /// The rows of a CSV file without the time that plans took; its header is checked.
 fn rows(path: &Path) -> Vec<Vec<String>> {

@@ -83,7 +83,8 @@ fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
     let text = std::fs::read_to_string(repository().join("config/tasks/team.toml"));
     let text = text
         .expect("the task")
-        .replace("max_steps = 300", "max_steps = 3");
+        .replace("max_steps = 300", "max_steps = 3")
+        .replace("name = \"team\"", "name = \"mine\"");
     std::fs::write(&own, text.replace("end = 32", "end = 2")).expect("write");
     let task = format!("--task {}", own.display());
     let policies = "--policies coverage --baseline coverage";
@@ -108,6 +109,10 @@ fn flags_that_a_task_decides_are_refused_by_name() {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("task.toml");
     std::fs::write(&file, "name = 'mine'\n").expect("write");
+    let other = folder.path().join("other.toml");
+    let small = std::fs::read_to_string(repository().join("config/tasks/small.toml"));
+    let small = small.expect("the task").replace("moves = 16", "moves = 15");
+    std::fs::write(&other, small).expect("write");
     let table =
         "--task small --height 3 => height: expected no flag beside a task, which decides it, got 3
 --task small --model wildfire => model: expected no flag beside a task
@@ -116,8 +121,10 @@ fn flags_that_a_task_decides_are_refused_by_name() {
 --task small --start corner => start: expected no flag beside a task
 --task jacksboro --states-offset 3 => states_offset: expected no flag beside a task
 --task ash => task ash: No such file | expected one, or wildfire, small
---task FILE => missing field `moves`";
+--task FILE => missing field `moves`
+--task OTHER => name: expected one of its own, got small, which is built in";
     let table = table.replace("FILE", &file.display().to_string());
+    let table = table.replace("OTHER", &other.display().to_string());
     check_table(SERVER, &table);
     let table =
         "compare --task small --height 3 => --task <NAME|FILE> | cannot be used with | --height

@@ -84,7 +84,7 @@ fn decisions_and_their_filter_are_given_in_either_order() {
     let other = format!("{WORLDS} --learner filter --agent-seed 5 --steps 40");
     place.train("other", &other);
     let flag = |out: &str| format!("--checkpoint {}", place.checkpoint(out).display());
-    let [decisions, filter, other] = ["out", "out/filter", "other"].map(flag);
+    let [decisions, filter, other] = ["out", "out/belief", "other"].map(flag);
     let policies = "--policies learned_policy,learned_beam --baseline learned_beam";
     for both in [[&decisions, &filter], [&filter, &decisions]] {
         let [first, second] = both;
@@ -102,7 +102,7 @@ fn a_training_that_ends_before_its_filter_is_learned_goes_on_with_it() {
     let place = place();
     let first = format!("{WORLDS} --estimator learned_spatial_filter");
     let cut = place.words("out", &format!("{first} --time-limit 0"));
-    let words = "the filter is not learned yet: continue with --resume";
+    let words = "the belief is not learned yet: continue with --resume";
     check(AGENT, &cut, words);
     assert!(!place.checkpoint("out").exists());
     let resume = format!("{WORLDS} --resume --steps 20");
@@ -123,7 +123,7 @@ fn a_training_that_ends_before_its_filter_is_learned_goes_on_with_it() {
     );
     // From here on there are decisions to go on from.
     refused("--estimator learned_filter", other);
-    let filter = place.checkpoint("out/filter");
+    let filter = place.checkpoint("out/belief");
     let given = format!(
         "--estimator learned_spatial_filter --checkpoint {}",
         filter.display()
@@ -175,7 +175,7 @@ fn a_filter_that_was_given_is_the_estimator_s() {
         place.checkpoint("own").display()
     );
     for (more, words) in [
-        ("", "--checkpoint | a filter on which learned_filter acts"),
+        ("", "--checkpoint | what learned_filter acts on"),
         ("--estimator known_model", "--checkpoint | known_model"),
         (
             "--learner filter",
@@ -193,5 +193,5 @@ fn a_filter_that_was_given_is_the_estimator_s() {
         "given",
         &format!("{flags} --estimator learned_own_spatial_filter"),
     );
-    assert!(!place.path("given/filter").exists());
+    assert!(!place.path("given/belief").exists());
 }

@@ -3,17 +3,21 @@
 mod compare;
 mod decisions;
 mod evaluate;
+mod leaderboard;
 mod prior;
 mod run;
 mod shared;
+mod suite;
 mod train;
 mod worlds;
 
 pub use compare::CompareCommand;
 pub use decisions::ServeDecisionsCommand;
 pub use evaluate::EvaluateCommand;
+pub use leaderboard::LeaderboardCommand;
 pub use prior::PriorCommand;
 pub use run::RunCommand;
+pub use suite::SuiteCommand;
 pub use train::TrainCommand;
 
 use emberwatch_agent::client::errors::refusal;

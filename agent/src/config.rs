@@ -3,7 +3,8 @@
 mod sections;
 
 pub use sections::{
-    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, ObjectiveConfig, StepSize,
+    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig,
+    ObjectiveConfig, StepSize,
 };
 
 use self::sections::check;
@@ -44,6 +45,7 @@ pub struct AgentConfig {
     pub learner: LearnerKind,
     pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
+    pub neural: NeuralConfig,
     pub autoencoder: AutoencoderConfig,
     pub dqn: NetworkDqnConfig,
     pub decisions: DecisionsConfig,
@@ -58,9 +60,11 @@ pub enum LearnerKind {
     Filter,
     /// The same with a kernel for each state that a cell itself can be in
     OwnFilter,
+    /// A network that keeps space, from what was seen to what will be seen
+    Neural,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
-    /// A DQN that chooses among options on an estimator's belief; the filter is learned first, unless it is given
+    /// A DQN that chooses among options on an estimator's belief, which is learned first, unless it is given
     Decisions,
 }
 
@@ -144,6 +148,7 @@ impl AgentConfig {
         check("", &ranges)?;
         self.objective.check()?;
         self.learning.check()?;
+        self.neural.check()?;
         self.autoencoder.check()?;
         self.dqn.check()?;
         self.decisions.check()

@@ -4,6 +4,8 @@ pub mod autoencoder;
 pub mod first_belief;
 pub mod follower;
 mod kept_belief;
+pub mod neural;
 
 pub use autoencoder::AutoencoderEstimator;
 pub use follower::Follower;
+pub use neural::NeuralEstimator;

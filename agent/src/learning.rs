@@ -1,5 +1,6 @@
 //! Learning while acting: a filter's parameters, the paper's networks, decisions; and their checkpoints.
 
+pub mod belief;
 pub mod checkpoint;
 pub mod filter;
 pub mod learned;

@@ -30,6 +30,11 @@ enum Command {
     /// Compare policies on the same worlds: table, CSV and figures
     #[command(after_long_help = commands::policies())]
     Compare(commands::CompareCommand),
+    /// Run policies on the test worlds of tasks: one score for each
+    #[command(after_long_help = commands::policies())]
+    Suite(commands::SuiteCommand),
+    /// Add an entry to the leaderboard, and make its page
+    Leaderboard(commands::LeaderboardCommand),
     /// Learn a model while acting: checkpoint and metrics
     Train(commands::TrainCommand),
     /// Score a checkpoint beside the known model
@@ -44,6 +49,8 @@ fn main() -> ExitCode {
         Command::ServeDecisions(command) => command.run(),
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
+        Command::Suite(command) => command.run(),
+        Command::Leaderboard(command) => command.run(),
         Command::Train(command) => command.run(),
         Command::Evaluate(command) => command.run(),
     };

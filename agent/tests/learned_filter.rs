@@ -146,9 +146,10 @@ fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64
                 false => 0.0,
             };
         }
-        let share = match dimensions.sees_own_state {
-            true => belief[own * n_cells + cell],
-            false => 1.0,
+        let share = if dimensions.sees_own_state {
+            belief[own * n_cells + cell]
+        } else {
+            1.0
         };
         let sum: f64 = weights.iter().sum();
         for (to, weight) in weights.iter().enumerate() {

@@ -126,6 +126,13 @@ impl Task {
             format!("{error}: expected one, or {}", names.join(", "))
         })?;
         let mut task = Self::from_toml(&text)?;
+        let same_name = BUILT_IN.iter().find(|(name, _)| *name == task.name);
+        if same_name.is_some_and(|(_, text)| Self::from_toml(text).as_ref() != Ok(&task)) {
+            return Err(format!(
+                "name: expected one of its own, got {}, which is built in",
+                task.name
+            ));
+        }
         let folder = path.parent().unwrap_or(Path::new(""));
         for file in [&mut task.model, &mut task.states] {
             let beside = folder.join(&*file);

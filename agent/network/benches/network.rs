@@ -1,11 +1,11 @@
-//! Time of the autoencoder at the paper's size: 64 x 64 cells, windows of 1,000 frames, hidden 16.
+//! Time of the networks at the paper's size, 64 x 64 cells; of the autoencoder with windows of 1,000 frames, hidden 16.
 //!
 //! The authors' code on torch with two threads: an update 1,156 to 1,240 ms, an inference step 0.95 ms.
 
 use criterion::{Criterion, criterion_group};
 use emberwatch_network::{
-    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, NetworkShape,
-    Transition, Window, set_up_process,
+    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, Lesson,
+    NetworkShape, NeuralBelief, Sightings, Transition, Window, set_up_process,
 };
 use emberwatch_protocol::frame::Frame;
 use emberwatch_protocol::grid::Shape;
@@ -113,7 +113,35 @@ fn dqn(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, updates, steps, dqn);
+/// 16 whole grids an update, as paths of 64 moves need them.
+fn neural_belief(c: &mut Criterion) {
+    let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+    let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());
+    for step in 0..200 {
+        let frame: Vec<_> = path_frame(step).observed().collect();
+        if step >= 184 {
+            lessons.push(Lesson {
+                before: before.clone(),
+                frame: frame.clone(),
+            });
+        }
+        for (cell, value) in frame {
+            before.see_cell(cell, value);
+        }
+        before.pass();
+    }
+    let mut group = c.benchmark_group("neural belief");
+    group.sample_size(20);
+    group.bench_function("update (torch, one thread: 40 ms)", |b| {
+        b.iter(|| network.update(2e-3, &lessons).expect("finite"));
+    });
+    group.bench_function("prediction (torch, one thread: 0.88 ms)", |b| {
+        b.iter(|| network.predict(&before).expect("a prediction"));
+    });
+    group.finish();
+}
+
+criterion_group!(benches, updates, steps, dqn, neural_belief);
 
 fn main() {
     set_up_process();

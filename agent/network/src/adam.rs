@@ -21,6 +21,8 @@ pub struct AdamSettings {
     pub betas: [f32; 2],
     /// Added to the root of the second moment.
     pub epsilon: f32,
+    /// Larger gradients, by the root of the sum of all squares, are scaled to this.
+    pub max_norm: Option<f32>,
 }
 
 impl AdamSettings {
@@ -30,6 +32,7 @@ impl AdamSettings {
             learning_rate,
             betas: [0.5, 0.9],
             epsilon: 1e-8,
+            max_norm: None,
         }
     }
 }
@@ -120,10 +123,19 @@ impl Adam {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
         let rate = f64::from(settings.learning_rate) / bias[0];
+        let scale = match settings.max_norm {
+            Some(most) => (f64::from(most) / self.norm(gradients)?).min(1.0),
+            None => 1.0,
+        };
         let mut changes = Vec::new();
         for (name, var) in &self.variables {
             let Some(gradient) = gradients.get(var) else {
                 continue;
+            };
+            let gradient = &if scale < 1.0 {
+                (gradient * scale)?
+            } else {
+                gradient.clone()
             };
             let names = names(name);
             let [first, second] = names.each_ref().map(|name| &self.moments[name]);
@@ -138,6 +150,14 @@ impl Adam {
             changes.push((of_square, second.clone(), square));
         }
         Ok(changes)
+    }
+
+    /// The root of the sum of all gradients' squares.
+    fn norm(&self, gradients: &GradStore) -> Result<f64> {
+        let gradients = self.variables.values().filter_map(|var| gradients.get(var));
+        let squares = gradients.map(|it| it.sqr()?.sum_all()?.to_scalar::<f32>());
+        let squares = squares.map(|square| square.map(f64::from));
+        Ok(squares.sum::<Result<f64>>()?.sqrt())
     }
 
     /// What is learned.
@@ -209,6 +229,24 @@ mod tests {
                 exact[index] -= 0.1 * m_hat / (v_hat.sqrt() + 1e-8);
                 assert!((f64::from(got[index]) - exact[index]).abs() < 1e-6);
             }
+        }
+    }
+
+    #[test]
+    fn large_gradients_are_scaled_to_the_norm_and_small_ones_are_not() {
+        for (g, expected) in [([3.0, 4.0], [0.3, 0.4]), ([0.3, 0.4], [0.15, 0.2])] {
+            let settings = AdamSettings {
+                max_norm: Some(1.0),
+                ..AdamSettings::paper(0.1)
+            };
+            let mut adam = Adam::new(variables()).expect("moments");
+            step(&mut adam, &settings, g);
+            let first: Vec<f32> = adam.moments["first.p"].to_vec1().expect("numbers");
+            let off = first
+                .iter()
+                .zip(expected)
+                .map(|(a, b): (&f32, f32)| (a - b).abs());
+            assert!(off.fold(0.0, f32::max) < 1e-6, "{first:?}");
         }
     }
 

@@ -1,9 +1,9 @@
 //! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11)
-//! and the DQN (section III.E).
+//! and the DQN (section III.E); and the neural belief, which learns by the autoencoder's loss and keeps space.
 //!
 //! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`]
-//! (its updates and steps), [`Adam`], [`Dqn`]. Layers take their variables from a `VarBuilder` of
-//! [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence and decoder have an
+//! (its updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`]. Layers take their
+//! variables from a `VarBuilder` of [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence, decoder and U-Net have an
 //! operator of ours with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on
 //! GPUs.
 //!
@@ -13,6 +13,7 @@
 mod adam;
 mod autoencoder;
 mod batch_norm;
+mod crop;
 mod decoder;
 mod device;
 mod dqn;
@@ -21,13 +22,16 @@ mod encoder;
 mod error;
 mod gru;
 mod model;
+mod neural;
 mod observation_matrix;
 mod ops;
 mod pass;
 mod process;
 mod replay;
 mod shape;
+mod sightings;
 mod tensors;
+mod unet;
 pub mod variables;
 mod window;
 
@@ -42,10 +46,13 @@ pub use encoder::Encoder;
 pub use error::{NetworkError, NotFinite};
 pub use gru::Gru;
 pub use model::{Network, Stock};
+pub use neural::{Lesson, NeuralBelief};
 pub use observation_matrix::ObservationMatrix;
 pub use pass::Pass;
 pub use process::{Allocator, set_up_process};
 pub use replay::Replay;
 pub use shape::NetworkShape;
+pub use sightings::Sightings;
 pub use tensors::NamedTensor;
+pub use unet::UNet;
 pub use window::Window;

@@ -16,6 +16,7 @@ pub(crate) mod decoder;
 mod doubling;
 pub(crate) mod encoder;
 pub(crate) mod gru_sequence;
+pub(crate) mod image_conv;
 pub(crate) mod norm;
 mod product;
 mod taps;

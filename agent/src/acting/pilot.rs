@@ -317,9 +317,10 @@ impl Pilot {
 }
 
 fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -> Result<Belief> {
-    let prior = match policy.estimator.knows_model() {
-        true => mission.config.prior(info.burn_in),
-        false => Prior::Initial,
+    let prior = if policy.estimator.knows_model() {
+        mission.config.prior(info.burn_in)
+    } else {
+        Prior::Initial
     };
     Ok(first_belief(
         prior,

@@ -4,7 +4,6 @@ use crate::config::AgentConfig;
 use crate::estimation::AutoencoderEstimator;
 use crate::learning::learned::Learned;
 use crate::learning::learners::decisions::LearnedDecisions;
-use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::{Choice, EstimatorKind, Policy, numbered_states};
 use crate::rollout::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use anyhow::{Context, Result, ensure};
@@ -65,12 +64,11 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
             let (state, nothing) = (task.model.target_state(), Correlations::default());
             correcting(filter, is_spatial.then_some((state, nothing)))
         }
-        EstimatorKind::Learned { is_spatial, .. } => {
-            let learned = learned_model(policy, task)?;
-            let prior = learned.tables.prior(task.shape);
-            let filter = BayesFilter::learned(&learned.tables, prior);
-            let neighbours = || (learned.target, learned.correlations.clone());
-            correcting(filter, is_spatial.then(neighbours))
+        kind @ (EstimatorKind::Learned { .. } | EstimatorKind::Neural) => {
+            let learned = present(policy, task.learned.belief(kind))?;
+            same_observations(task, learned.n_observations())?;
+            let estimator = learned.estimator(kind.is_spatial(), task.shape);
+            estimator.context(CHECKPOINT)?
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
@@ -133,12 +131,6 @@ fn decisions<'a>(policy: &Policy, learned: &'a Learned) -> Result<&'a LearnedDec
     Ok(decisions)
 }
 
-fn learned_model<'a>(policy: &Policy, task: &Task<'a>) -> Result<&'a LearnedModel> {
-    let learned = present(policy, task.learned.filter(policy.estimator))?;
-    same_observations(task, learned.tables.dimensions.n_observations)?;
-    Ok(learned)
-}
-
 fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator> {
     let learned = present(policy, task.learned.network.as_ref())?;
     let shape = learned.autoencoder.shape();
@@ -152,7 +144,7 @@ fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator>
     AutoencoderEstimator::new(&learned.autoencoder).context(CHECKPOINT)
 }
 
-fn present<'a, T>(policy: &Policy, learned: Option<&'a T>) -> Result<&'a T> {
+fn present<T>(policy: &Policy, learned: Option<T>) -> Result<T> {
     learned.with_context(|| needs_checkpoint(policy))
 }
 
@@ -164,6 +156,7 @@ pub fn needs_checkpoint(policy: &Policy) -> String {
         }
         estimator if estimator.sees_own_state() => "a filter by own state (--learner own_filter)",
         EstimatorKind::Learned { .. } => "a filter",
+        EstimatorKind::Neural => "a neural belief (--learner neural)",
         EstimatorKind::Autoencoder => "an autoencoder",
         _ => "decisions",
     };

@@ -53,10 +53,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
         }
     }
     // After an outage nobody knows where the world stands.
-    let left = match is_in_step {
-        true => pilot.leave(),
-        false => Ok(()),
-    };
+    let left = if is_in_step { pilot.leave() } else { Ok(()) };
     let released = pilot.release();
     match left.and(released).map_err(anyhow::Error::from) {
         Err(error) if !is_outage(&error) => Err(error),

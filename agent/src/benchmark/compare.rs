@@ -13,6 +13,7 @@ use crate::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all}
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
 use emberwatch_protocol::Model;
@@ -86,6 +87,7 @@ struct Tally {
     planning: Duration,
     /// Where the hidden states are published.
     brier: Option<f64>,
+    score: Score,
 }
 
 /// Runs every policy on every world; `progress` is told of each policy and of each world step.
@@ -262,7 +264,7 @@ impl Match<'_> {
             world.tally.planning += times[index];
             world.fly(rollout, plans, arena.n_robots());
             if index % n_agents == 0 {
-                world.look(rollout, target);
+                world.look(rollout, target, turn.score);
                 if is_last {
                     world.snapshot = world.snapshot(rollout, turn, plans);
                 }
@@ -314,19 +316,19 @@ impl World {
     }
 
     /// Takes in the posterior of the world's first agent.
-    fn look(&mut self, rollout: &Rollout, target: usize) {
+    fn look(&mut self, rollout: &Rollout, target: usize, score: Option<Score>) {
         let agent = &rollout.agent;
         let brier = rollout
             .truth()
             .map(|truth| brier_score(agent.belief(), truth, target, agent.target()));
         self.tally.add(&rollout.observation().world, brier);
+        self.tally.score += score.unwrap_or_default();
     }
 
     fn snapshot(&self, rollout: &Rollout, turn: Turn, plans: &[Plan]) -> Option<Snapshot> {
         let (agent, observation) = (&rollout.agent, rollout.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
-        let is_own = estimator.knows_model() || estimator.is_learned();
         let moves = &plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
@@ -336,7 +338,7 @@ impl World {
             truth: rollout.truth()?.clone(),
             frame: observation.frame.clone(),
             path_cells,
-            belief: is_own.then(|| agent.belief().clone()),
+            belief: estimator.sees_frames().then(|| agent.belief().clone()),
             learned_target: estimator.is_learned().then(|| agent.target()),
         })
     }
@@ -378,6 +380,7 @@ impl Contestant {
             burning_seen_share: merit.burning_seen_share,
             front_distance: merit.front_distance,
             grid_seen_share: Some(merit.grid_seen_share),
+            log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
             is_added: false,
             rewards: tally.rewards,
         }

@@ -74,9 +74,10 @@ impl Feed {
     /// Which of several worlds are to be shown now, if anybody looks.
     pub fn turn(&self, n_worlds: usize) -> Vec<usize> {
         let due = self.turns.due(Instant::now(), n_worlds);
-        match due.is_empty() || self.is_watched() {
-            true => due,
-            false => Vec::new(),
+        if due.is_empty() || self.is_watched() {
+            due
+        } else {
+            Vec::new()
         }
     }
 

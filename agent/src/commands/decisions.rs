@@ -31,7 +31,7 @@ pub struct ServeDecisionsCommand {
     /// Take the worlds from their holders
     #[arg(long)]
     takeover: bool,
-    /// What keeps the beliefs [default: the checkpoint's filter; without one the known model's]
+    /// What keeps the beliefs [default: the checkpoint's; without one the known model's]
     #[arg(long, value_name = "NAME")]
     estimator: Option<EstimatorKind>,
     /// What `train` learned, for learned estimators; may be given for each
@@ -78,11 +78,12 @@ impl ServeDecisionsCommand {
             (None, Some(decisions)) => decisions.estimator,
             (None, None) if learned.filter.is_some() => EstimatorKind::LEARNED,
             (None, None) if learned.own_filter.is_some() => EstimatorKind::learned(true),
+            (None, None) if learned.neural.is_some() => EstimatorKind::Neural,
             (None, None) => EstimatorKind::KNOWN,
         };
         ensure!(
-            !kind.is_learned() || learned.filter(kind).is_some(),
-            "--estimator {}: expected --checkpoint FILE of such a filter",
+            !kind.is_learned() || learned.belief(kind).is_some(),
+            "--estimator {}: expected --checkpoint FILE of such a belief",
             kind.label()
         );
         Ok(kind)

@@ -124,6 +124,9 @@ fn examined(learned: &Learned) -> Vec<&'static str> {
     if learned.own_filter.is_some() {
         names.extend(["learned_own_beam", "learned_own_spatial_beam"]);
     }
+    if learned.neural.is_some() {
+        names.push("neural_beam");
+    }
     if learned.network.is_some() {
         names.push("autoencoder_beam");
     }

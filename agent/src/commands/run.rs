@@ -117,8 +117,9 @@ impl RunCommand {
 /// A rate at which observers see that the agent lives, and at which it is stopped within a second.
 fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().unwrap_or(f64::NAN);
-    match rate.is_finite() && rate >= 1.0 {
-        true => Ok(rate),
-        false => Err(format!("expected steps a second, 1 or more, got {text:?}")),
+    if rate.is_finite() && rate >= 1.0 {
+        Ok(rate)
+    } else {
+        Err(format!("expected steps a second, 1 or more, got {text:?}"))
     }
 }

@@ -39,9 +39,10 @@ pub fn parse_range<T: FromStr + PartialOrd>(text: &str) -> Result<Range<T>, Stri
         .split_once("..")
         .and_then(|(first, end)| Some(first.parse().ok()?..end.parse().ok()?));
     let range: Range<T> = parsed.ok_or("expected FIRST..END, such as 0..8")?;
-    match range.is_empty() {
-        true => Err("expected FIRST below END".into()),
-        false => Ok(range),
+    if range.is_empty() {
+        Err("expected FIRST below END".into())
+    } else {
+        Ok(range)
     }
 }
 

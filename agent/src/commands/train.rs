@@ -10,6 +10,7 @@ use emberwatch_agent::config::{AgentConfig, AgentFlags, LearnerKind, Preset};
 use emberwatch_agent::learning::checkpoint::Contents;
 use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::learning::learners::decisions::SavedDecisions;
+use emberwatch_agent::learning::learners::neural::SavedNeural;
 use emberwatch_agent::learning::train::{CHECKPOINT, TrainingSpec, train};
 use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_network::{Device, DeviceKind};
@@ -40,20 +41,20 @@ pub struct TrainCommand {
     /// What to learn [default: filter; of preset paper: autoencoder]
     #[arg(long)]
     learner: Option<LearnerKind>,
-    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of decisions: what is left of
-    /// those of the settings]
+    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of neural and decisions: what
+    /// is left of those of the settings]
     #[arg(long)]
     steps: Option<u64>,
     /// Whose belief decisions are learned on [default: learned_filter, or the checkpoint's to go on from]
     #[arg(long, value_name = "NAME")]
     estimator: Option<EstimatorKind>,
-    /// The filter for that, of an earlier training; without it, one is learned first
+    /// That belief, of an earlier training; without it, one is learned first
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Seconds to act for, with a filter that is learned first
+    /// Seconds to act for, with a belief that is learned first
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors, metrics.csv and training.png; a filter that is learned first has a folder in it
+    /// Folder for checkpoint.safetensors, metrics.csv and training.png; a belief that is learned first has a folder in it
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
@@ -62,7 +63,7 @@ pub struct TrainCommand {
     /// Act on the checkpoint's parameters without learning
     #[arg(long, requires = "resume")]
     freeze: bool,
-    /// Where an autoencoder computes: cpu, cuda or metal
+    /// Where an autoencoder or a neural belief computes: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
     /// Take the worlds from their holder
@@ -94,13 +95,13 @@ impl TrainCommand {
         }
         let end = |limit| Instant::now().checked_add(limit);
         training.deadline = self.time_limit.and_then(end);
-        if contents.is_none() && needs_filter(&training) {
-            learn_filter(&instance, &training, &stop)?;
+        if contents.is_none() && needs_belief(&training) {
+            learn_belief(&instance, &training, &stop)?;
             if stop.load(Relaxed) {
                 return Ok(());
             }
-            let filter = training.filter_folder().join(CHECKPOINT);
-            training.learned = Learned::read([&*filter], &training.device)?;
+            let belief = training.belief_folder().join(CHECKPOINT);
+            training.learned = Learned::read([&*belief], &training.device)?;
             training.resume = false;
         }
         learn(&instance, &training, contents, &stop).map(drop)
@@ -117,10 +118,7 @@ impl TrainCommand {
         });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
-        let steps = match config.learner {
-            LearnerKind::Decisions => config.decisions.steps,
-            _ => 0,
-        };
+        let steps = all_steps(&config).unwrap_or(0);
         let device = self.device.open()?;
         let learned = self.learned(&config, &device)?;
         make_folder(&self.out)?;
@@ -138,7 +136,7 @@ impl TrainCommand {
         })
     }
 
-    /// The filter that was given for decisions; refuses what would be ignored.
+    /// The belief that was given for decisions; refuses what would be ignored.
     fn learned(&self, config: &AgentConfig, device: &Device) -> Result<Learned> {
         let flags = [
             ("--estimator", self.estimator.is_some()),
@@ -154,8 +152,8 @@ impl TrainCommand {
         let estimator = config.decisions.estimator;
         if let Some(path) = &self.checkpoint {
             ensure!(
-                learned.filter(estimator).is_some(),
-                "--checkpoint {}: expected a filter on which {} acts, got another",
+                learned.belief(estimator).is_some(),
+                "--checkpoint {}: expected what {} acts on, got another",
                 path.display(),
                 estimator.label()
             );
@@ -163,16 +161,22 @@ impl TrainCommand {
         Ok(learned)
     }
 
-    /// What to go on from, if that is asked for; `None` also if it is a filter, before decisions on its belief.
-    /// Decisions go on with the estimator that they began with, for the steps that are left.
+    /// What to go on from, if that is asked for; `None` also if it is a belief, before decisions on it.
+    /// Decisions go on with the estimator that they began with.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
         if training.config.learner != LearnerKind::Decisions || !self.resume {
-            return training.check();
+            let contents = training.check()?;
+            if training.config.learner == LearnerKind::Neural
+                && let Some(contents) = &contents
+            {
+                self.go_on_for(contents.state::<SavedNeural>()?.world_steps, training)?;
+            }
+            return Ok(contents);
         }
-        if let Some(estimator) = training.estimator_of_filter()? {
+        if let Some(estimator) = training.estimator_of_belief()? {
             ensure!(
                 !self.freeze,
-                "--freeze: expected a checkpoint of decisions in {}, got one of their filter alone",
+                "--freeze: expected a checkpoint of decisions in {}, got one of their belief alone",
                 self.out.display()
             );
             self.go_on_with(estimator, training)?;
@@ -182,16 +186,22 @@ impl TrainCommand {
         if let Some(contents) = &contents {
             let saved: SavedDecisions = contents.state()?;
             self.go_on_with(saved.estimator, training)?;
-            let all = training.config.decisions.steps;
-            if self.steps.is_none() && !self.freeze && all > 0 {
-                training.steps = all.saturating_sub(saved.world_steps);
-                ensure!(
-                    training.steps > 0,
-                    "--steps: expected a number, as the {all} of the settings are done"
-                );
-            }
+            self.go_on_for(saved.world_steps, training)?;
         }
         Ok(contents)
+    }
+
+    /// Goes on for the steps that are left of those of the settings, unless a flag says otherwise.
+    fn go_on_for(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
+        let all = all_steps(&training.config).unwrap_or(0);
+        if self.steps.is_none() && !self.freeze && all > 0 {
+            training.steps = all.saturating_sub(done);
+            ensure!(
+                training.steps > 0,
+                "--steps: expected a number, as the {all} of the settings are done"
+            );
+        }
+        Ok(())
     }
 
     fn go_on_with(&self, estimator: EstimatorKind, training: &mut TrainingSpec) -> Result<()> {
@@ -204,7 +214,7 @@ impl TrainCommand {
         );
         ensure!(
             self.checkpoint.is_none(),
-            "--checkpoint: expected none beside --resume, which goes on with the filter of {}",
+            "--checkpoint: expected none beside --resume, which goes on with the belief of {}",
             self.out.display()
         );
         training.config.decisions.estimator = estimator;
@@ -234,33 +244,47 @@ impl TrainCommand {
         let reveals = (decides && decisions.estimator.knows_model()).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
         arguments.extend(rest.map(String::from));
-        if decides && self.grid.task.is_none() {
-            let episode = decisions.episode_steps.to_string();
-            arguments.extend(["--max-steps".into(), episode]);
-        }
+        let episode_steps = match learner {
+            LearnerKind::Decisions => Some(decisions.episode_steps),
+            LearnerKind::Neural => Some(training.config.neural.episode_steps),
+            _ => None,
+        };
+        // A task has its own.
+        let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
+        let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
+        arguments.extend(episode.into_iter().flatten());
         let server = OwnServer::start(self.server.clone(), &arguments)?;
         Ok((server.instance().clone(), Some(server)))
     }
 }
 
-/// Whether decisions are to be learned on the belief of a filter that is yet to be learned.
-fn needs_filter(training: &TrainingSpec) -> bool {
+/// World steps of a whole training, where the settings say how many.
+fn all_steps(config: &AgentConfig) -> Option<u64> {
+    match config.learner {
+        LearnerKind::Decisions => Some(config.decisions.steps),
+        LearnerKind::Neural => Some(config.neural.steps),
+        _ => None,
+    }
+}
+
+/// Whether decisions are to be learned on a belief that is yet to be learned.
+fn needs_belief(training: &TrainingSpec) -> bool {
     let estimator = training.config.decisions.estimator;
     training.config.learner == LearnerKind::Decisions
         && estimator.is_learned()
-        && training.learned.filter(estimator).is_none()
+        && training.learned.belief(estimator).is_none()
 }
 
-/// Learns the filter whose belief decisions are to be learned on, unless that is done.
-fn learn_filter(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
-    let Some(filter) = training.of_filter()? else {
+/// Learns the belief that decisions are to be learned on, unless that is done.
+fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
+    let Some(belief) = training.of_belief()? else {
         return Ok(());
     };
-    make_folder(&filter.out)?;
-    let n_steps = learn(instance, &filter, filter.check()?, stop)?;
+    make_folder(&belief.out)?;
+    let n_steps = learn(instance, &belief, belief.check()?, stop)?;
     ensure!(
-        n_steps >= filter.steps || stop.load(Relaxed),
-        "--time-limit: the filter is not learned yet: continue with --resume"
+        n_steps >= belief.steps || stop.load(Relaxed),
+        "--time-limit: the belief is not learned yet: continue with --resume"
     );
     Ok(())
 }

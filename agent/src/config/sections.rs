@@ -41,6 +41,19 @@ pub struct LearningConfig {
     pub explore_share: f64,
 }
 
+/// How `train --learner neural` learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct NeuralConfig {
+    pub steps: u64,
+    pub episode_steps: u64,
+    pub replay_frames: usize,
+    pub batch: usize,
+    pub updates_per_step: f64,
+    pub rate: f64,
+    pub final_rate: f64,
+    pub explore_share: f64,
+}
+
 /// How the dynamic autoencoder learns (paper sections III.B and III.C).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AutoencoderConfig {
@@ -142,6 +155,22 @@ impl LearningConfig {
     }
 }
 
+impl NeuralConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let ranges = [
+            ("steps", self.steps as f64, 1.0, 1e12),
+            ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
+            ("replay_frames", self.replay_frames as f64, 1.0, 1e6),
+            ("batch", self.batch as f64, 1.0, 1024.0),
+            ("updates_per_step", self.updates_per_step, 0.0, 16.0),
+            ("rate", self.rate, 0.0, 1.0),
+            ("final_rate", self.final_rate, 0.0, 1.0),
+            ("explore_share", self.explore_share, 0.0, 1.0),
+        ];
+        check("neural.", &ranges)
+    }
+}
+
 impl AutoencoderConfig {
     pub(super) fn check(&self) -> Result<()> {
         let (window, [beta1, beta2]) = (self.window as f64, self.betas.map(f64::from));
@@ -205,6 +234,7 @@ impl DecisionsConfig {
     pub(super) fn check(&self) -> Result<()> {
         check_dqn("decisions.", &self.learning, 2e5)?;
         let ranges = [
+            ("filter_steps", self.filter_steps as f64, 1.0, 1e12),
             ("beam_width", self.beam_width as f64, 1.0, 1e4),
             ("episode_steps", self.episode_steps as f64, 1.0, 1e9),
             ("longest_hold", self.longest_hold as f64, 1.0, 1e3),
@@ -288,6 +318,8 @@ mod tests {
             ("learning.states = 1", "2 to 64, got 1"),
             ("learning.rate = nan", "0 to 1, got NaN"),
             ("learning.beta1 = 1.0", "0 to 0.999999, got 1"),
+            ("neural.batch = 0", "1 to 1024, got 0"),
+            ("neural.rate = nan", "0 to 1, got NaN"),
             ("autoencoder.replay_frames = 999", "1000 to 100000, got 999"),
             ("autoencoder.step_size.rate = 2.0", "0 to 1, got 2"),
             ("dqn.epsilon = 2.0", "0 to 1, got 2"),

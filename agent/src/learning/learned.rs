@@ -1,10 +1,12 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
+use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learners::decisions::{self, LearnedDecisions};
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
 use crate::learning::learners::network;
+use crate::learning::learners::neural::{self, NeuralModel};
 use crate::policy::{Choice, EstimatorKind, Policy};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -14,7 +16,13 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// Kinds of checkpoints that policies act on.
-const KINDS: [&str; 4] = [fit::KIND, fit::OWN_KIND, network::KIND, decisions::KIND];
+const KINDS: [&str; 5] = [
+    fit::KIND,
+    fit::OWN_KIND,
+    neural::KIND,
+    network::KIND,
+    decisions::KIND,
+];
 
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
@@ -22,6 +30,8 @@ pub struct Learned {
     pub filter: Option<LearnedModel>,
     /// One whose kernels see the cell's own state, for policies `learned_own_*`.
     pub own_filter: Option<LearnedModel>,
+    /// A neural belief, for policies `neural_*`.
+    pub neural: Option<NeuralModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
     pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `learned_policy` and others on the belief that they were learned on.
@@ -50,9 +60,13 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            fit::KIND => self.add_filter(filter(&contents, false)?),
-            fit::OWN_KIND => self.add_filter(filter(&contents, true)?),
-            decisions::KIND => self.add_decisions(&contents)?,
+            fit::KIND => self.add_belief(filter(&contents, false)?),
+            fit::OWN_KIND => self.add_belief(filter(&contents, true)?),
+            neural::KIND => {
+                let model = NeuralModel::read(&contents, device)?;
+                self.add_belief(LearnedBelief::Neural(model))
+            }
+            decisions::KIND => self.add_decisions(&contents, device)?,
             _ => {
                 let network = network::Progress::read(&contents, device)?;
                 self.network.replace(Arc::new(network)).is_some()
@@ -62,25 +76,29 @@ impl Learned {
         Ok(())
     }
 
-    /// A filter; returns whether there was another before: decisions bring the one that they were learned on.
-    fn add_filter(&mut self, model: LearnedModel) -> bool {
-        let slot = if model.tables.dimensions.sees_own_state {
-            &mut self.own_filter
-        } else {
-            &mut self.filter
-        };
-        let is_other = slot.as_ref().is_some_and(|filter| *filter != model);
-        *slot = Some(model);
-        is_other
+    /// A belief; returns whether there was another before: decisions bring the one that they were learned on.
+    fn add_belief(&mut self, belief: LearnedBelief) -> bool {
+        fn put<T: PartialEq>(slot: &mut Option<T>, model: T) -> bool {
+            let is_other = slot.as_ref().is_some_and(|before| *before != model);
+            *slot = Some(model);
+            is_other
+        }
+        match belief {
+            LearnedBelief::Neural(model) => put(&mut self.neural, model),
+            LearnedBelief::Filter(model) if model.tables.dimensions.sees_own_state => {
+                put(&mut self.own_filter, *model)
+            }
+            LearnedBelief::Filter(model) => put(&mut self.filter, *model),
+        }
     }
 
-    /// Decisions, with what their belief's filter learned; returns whether there were some before.
-    fn add_decisions(&mut self, contents: &Contents) -> Result<bool> {
-        let (decisions, model) = LearnedDecisions::read(contents)?;
-        if let Some(model) = model {
+    /// Decisions, with the belief that was learned for them; returns whether there were some before.
+    fn add_decisions(&mut self, contents: &Contents, device: &Device) -> Result<bool> {
+        let (decisions, belief) = LearnedDecisions::read(contents, device)?;
+        if let Some(belief) = belief {
             ensure!(
-                !self.add_filter(model),
-                "expected one filter, got two: that of the decisions, and another"
+                !self.add_belief(belief),
+                "expected one belief of a kind, got two: that of the decisions, and another"
             );
         }
         Ok(self.decisions.replace(decisions).is_some())
@@ -88,15 +106,19 @@ impl Learned {
 }
 
 impl Learned {
-    pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
-        match estimator {
-            EstimatorKind::Learned { is_own: false, .. } => self.filter.as_ref(),
-            EstimatorKind::Learned { is_own: true, .. } => self.own_filter.as_ref(),
-            _ => None,
-        }
+    /// What was learned for an estimator.
+    pub fn belief(&self, estimator: EstimatorKind) -> Option<LearnedBelief> {
+        let filter = match estimator {
+            EstimatorKind::Learned { is_own: false, .. } => &self.filter,
+            EstimatorKind::Learned { is_own: true, .. } => &self.own_filter,
+            EstimatorKind::Neural => return self.neural.clone().map(LearnedBelief::Neural),
+            _ => return None,
+        };
+        let filter = filter.clone().map(Box::new);
+        filter.map(LearnedBelief::Filter)
     }
 
-    /// The policies that act on it: those of filters, of the autoencoder, and of decisions.
+    /// The policies that act on it: those of beliefs, of the autoencoder, and of decisions.
     pub fn policies(&self, model: &Model) -> Vec<Policy> {
         let mut policies = Policy::all(model);
         policies.retain(|policy| {
@@ -114,7 +136,7 @@ impl Learned {
         is_decided
             && match policy.estimator {
                 EstimatorKind::Autoencoder => self.network.is_some(),
-                kind if kind.is_learned() => self.filter(kind).is_some(),
+                kind if kind.is_learned() => self.belief(kind).is_some(),
                 _ => true,
             }
     }
@@ -123,12 +145,12 @@ impl Learned {
     pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
         match estimator {
             EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
-            _ => self.filter(estimator).map(|filter| filter.target),
+            _ => self.belief(estimator).map(|belief| belief.target()),
         }
     }
 }
 
-fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
+fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedBelief> {
     let mut saved = contents.state::<SavedFilter>()?.fit;
     let dimensions = Dimensions {
         sees_own_state,
@@ -137,5 +159,5 @@ fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
     let dimensions = dimensions.check();
     let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
     saved.load(contents, dimensions)?;
-    Ok(saved.learned())
+    Ok(LearnedBelief::Filter(Box::new(saved.learned())))
 }

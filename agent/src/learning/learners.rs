@@ -4,6 +4,7 @@ mod base;
 pub mod decisions;
 pub mod filter;
 pub mod network;
+pub mod neural;
 #[cfg(test)]
 mod tests;
 

@@ -80,9 +80,10 @@ impl Metrics {
                 ..written
             })
         };
-        match path.exists() {
-            true => go_on().with_context(|| of_file(path)),
-            false => Self::begin(path, more),
+        if path.exists() {
+            go_on().with_context(|| of_file(path))
+        } else {
+            Self::begin(path, more)
         }
     }
 

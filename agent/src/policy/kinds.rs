@@ -20,6 +20,8 @@ pub enum EstimatorKind {
         is_own: bool,
         is_spatial: bool,
     },
+    /// A network that keeps space, learned from what was seen.
+    Neural,
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
     /// The hidden state X_k, predicted one step ahead: an oracle.
@@ -90,7 +92,7 @@ impl EstimatorKind {
     pub fn all_of_options() -> impl Iterator<Item = Self> + Clone {
         let filters = [Self::KNOWN, Self::LEARNED, Self::learned(true)].into_iter();
         let filters = filters.flat_map(|filter| [filter, filter.spatial()]);
-        filters.chain([Self::Truth])
+        filters.chain([Self::Neural, Self::Truth])
     }
 
     /// Whether its corrections reach the neighbours of visited cells.
@@ -109,7 +111,10 @@ impl EstimatorKind {
 
     /// Whether its parameters, and so the meaning of its states, were learned.
     pub fn is_learned(self) -> bool {
-        matches!(self, Self::Learned { .. } | Self::Autoencoder)
+        matches!(
+            self,
+            Self::Learned { .. } | Self::Neural | Self::Autoencoder
+        )
     }
 
     /// Whether frames change its belief.
@@ -129,6 +134,7 @@ impl EstimatorKind {
                 (true, false) => "learned_own",
                 (true, true) => "learned_own_spatial",
             },
+            Self::Neural => "neural",
             Self::Autoencoder => "autoencoder",
             Self::Truth => "oracle",
             Self::NextTruth => "clairvoyant",
@@ -139,6 +145,7 @@ impl EstimatorKind {
         match self {
             Self::KNOWN => "known_model".into(),
             Self::Known { .. } | Self::Learned { .. } => format!("{}_filter", self.family()),
+            Self::Neural => "neural_belief".into(),
             Self::Truth => "truth".into(),
             Self::NextTruth => "next_truth".into(),
             Self::None | Self::Autoencoder => self.family().into(),

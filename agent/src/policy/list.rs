@@ -42,6 +42,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::None => String::new(),
         EstimatorKind::Known { is_spatial } => filter(policy, false, is_spatial),
         EstimatorKind::Learned { is_own, is_spatial } => filter(policy, is_own, is_spatial),
+        EstimatorKind::Neural => "; neural belief, needs --checkpoint".into(),
         EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint".into(),
         EstimatorKind::Truth => "; told the states, needs --publish-truth".into(),
         EstimatorKind::NextTruth => "; told the next states, only in `compare`".into(),

@@ -257,12 +257,14 @@ mod tests {
                 "learned_own_spatial_filter",
                 "learned_own_spatial_shooting learned_own_spatial_beam",
             ),
+            ("neural_belief", "neural_shooting neural_beam"),
             ("known_model", "known_policy"),
             ("spatial_filter", "spatial_policy"),
             ("learned_filter", "learned_policy"),
             ("learned_spatial_filter", "learned_spatial_policy"),
             ("learned_own_filter", "learned_own_policy"),
             ("learned_own_spatial_filter", "learned_own_spatial_policy"),
+            ("neural_belief", "neural_policy"),
             (
                 "autoencoder",
                 "autoencoder_explore autoencoder_exploit autoencoder_policy autoencoder_beam",
@@ -333,10 +335,7 @@ mod tests {
             );
         }
         let error = "filter".parse::<EstimatorKind>().expect_err("no name");
-        assert!(
-            error.ends_with("learned_own_spatial_filter, got \"filter\""),
-            "{error}"
-        );
+        assert!(error.ends_with("neural_belief, got \"filter\""), "{error}");
     }
 
     #[test]

@@ -9,8 +9,8 @@ use emberwatch_belief::estimation::scoring::{Score, score};
 use emberwatch_belief::planning::options::choose_by_rule;
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
-    BasisKind, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan, Planner,
-    Proposal, RandomWalk,
+    BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan,
+    Planner, Proposal, RandomWalk,
 };
 use emberwatch_network::Dqn;
 use emberwatch_protocol::agent_belief::Intent;
@@ -125,12 +125,25 @@ impl Agent {
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
-        if self.policy.planner != PlannerKind::RandomWalk {
-            self.aim = objective.target.label(&self.state_names);
-        }
+        let aim = match self.policy.planner {
+            PlannerKind::RandomWalk => RANDOM_MOVES.into(),
+            _ => objective.target.label(&self.state_names),
+        };
         let values = objective.values(self.basis_belief());
+        self.plan_values(&values, &aim, robots, step)
+    }
+
+    /// As [`Self::plan`], for values of cells; `aim`: what they stand for.
+    pub fn plan_values(
+        &mut self,
+        values: &CellValues,
+        aim: &str,
+        robots: &[Cell],
+        step: u64,
+    ) -> Vec<Plan> {
+        aim.clone_into(&mut self.aim);
         let (planner, random) = (&mut *self.planner, (self.seed, step));
-        plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
+        plan_team(planner, values, robots, self.n_moves, random, ROUNDS)
     }
 
     /// As [`Self::plan`], on a belief other than the agent's.
@@ -159,7 +172,7 @@ impl Agent {
     }
 
     /// The belief that paths are planned on.
-    fn basis_belief(&self) -> &Belief {
+    pub fn basis_belief(&self) -> &Belief {
         self.estimate.as_ref().unwrap_or(self.estimator.belief())
     }
 

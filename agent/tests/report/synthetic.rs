@@ -51,6 +51,7 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         burning_seen_share: None,
         front_distance: None,
         grid_seen_share: None,
+        log_likelihood: None,
         is_added: false,
         rewards: Vec::new(),
     }

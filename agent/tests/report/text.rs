@@ -1,5 +1,6 @@
 use super::synthetic::{ladder, run, teams};
 use emberwatch_agent::benchmark::report::added::{check_settings, read_csv};
+use emberwatch_agent::benchmark::report::suite::{TaskRuns, render_suite};
 use emberwatch_agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
@@ -294,7 +295,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
          mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
          steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
-         grid_seen_share\n"
+         grid_seen_share,log_likelihood\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();
@@ -318,4 +319,44 @@ fn a_csv_that_cannot_be_written_is_named() {
     let path = directory.path().join("missing").join("runs.csv");
     let error = write_csv(&path, &three_policies()).expect_err("no such directory");
     assert!(error.to_string().contains("runs.csv"), "{error}");
+}
+
+#[test]
+fn scores_of_tasks_lie_between_the_random_walk_and_the_oracle() {
+    let task = |task: &str, rewards: &[(&str, [f64; 2])]| {
+        let of_policy = |(policy, rewards): &(&str, [f64; 2])| {
+            let [first, second] = *rewards;
+            [(0, first), (1, second)].map(|(seed, reward)| run(policy, "known_model", seed, reward))
+        };
+        TaskRuns {
+            task: task.into(),
+            runs: rewards.iter().flat_map(of_policy).collect(),
+        }
+    };
+    let ends = [("random_walk", [0.0, 2.0]), ("oracle_ahead", [4.0, 6.0])];
+    let a = task(
+        "a",
+        &[ends[0], ends[1], ("beam", [3.0, 3.0]), ("own", [1.0, 1.0])],
+    );
+    let b = task("b", &[ends[0], ends[1], ("beam", [2.0, 4.0])]);
+    assert_eq!(a.scores("beam"), [0.5, 0.5]);
+    assert_eq!(b.scores("beam"), [0.25, 0.75]);
+    let table = render_suite(&[a.clone(), b]);
+    assert_eq!(
+        row(&table, "beam", 0),
+        ["beam", "0.500", "0.500", "0.500 [0.375, 0.625]"]
+    );
+    assert_eq!(row(&table, "own", 0), ["own", "0.000", "-", "-"], "{table}");
+    assert_eq!(
+        row(&table, "beam", 1),
+        ["beam", "0.1250", "0.1250"],
+        "Brier"
+    );
+    // An oracle no better than the random walk is no scale.
+    let flat = task(
+        "flat",
+        &[ends[0], ("oracle_ahead", [2.0, 0.0]), ("beam", [3.0, 3.0])],
+    );
+    assert!(flat.scores("beam").is_empty());
+    assert_eq!(row(&render_suite(&[a, flat]), "beam", 0)[3], "-");
 }

@@ -1,19 +1,22 @@
 """Tasks: their names, ids and worlds, which are those of the same settings by hand."""
 
+import subprocess
 import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 from environments import assert_same, no_warnings, rollout, serving
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
 
 import emberwatch
-from emberwatch.benchmark import evaluate
-from emberwatch.task import Task, built_in_tasks
+from emberwatch.benchmark import evaluate, suite
+from emberwatch.programs import find
+from emberwatch.tasks import Task, built_in_tasks
 
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import parallel_api_test
@@ -174,3 +177,34 @@ def test_an_evaluation_takes_seeds_and_steps_of_its_task(tmp_path: Path) -> None
         (1, 2, 4),
         (2, 2, 4),
     ]
+
+
+def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
+    own = (CONFIG / "tasks/small.toml").read_text("utf-8")
+    for old, new in {'"small"': '"tiny"', "300": "9", "end = 32": "end = 3"}.items():
+        own = own.replace(old, new)
+    file = tmp_path / "tiny.toml"
+    file.write_text(own)
+    chosen: dict[str, Any] = {"name": "mine", "folder": tmp_path / "out", "progress": None}
+    chosen["observation"] = "frame"
+
+    def down(frames: Any) -> Any:
+        return np.full(len(frames), 2)
+
+    rows = suite(down, tasks=[file], worlds=2, **chosen)
+    assert [(row.world_seed, row.steps) for row in rows["tiny"]] == [(0, 9), (1, 9)]
+    again = suite({"tiny": lambda _: 1 / 0}, tasks=[file], worlds=2, **chosen)
+    assert again == rows
+    command = [find("emberwatch-agent"), "suite", f"--tasks={file}", f"--out={tmp_path / 'out'}"]
+    command += ["--worlds=2", "--policies=coverage"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "| mine " in done.stdout, done
+    for keywords, words in (
+        ({"worlds": 0}, "worlds: expected at least 1, got 0"),
+        ({"steps": 3}, "steps: expected none, as suite sets it"),
+        ({"tasks": ["ash"]}, "task ash: No such file"),
+    ):
+        with refuses(words):
+            suite(down, **(chosen | keywords))
+    with refuses("policy: expected one for the task tiny, got small"):
+        suite({"small": down}, tasks=[file], **chosen)

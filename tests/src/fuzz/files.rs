@@ -3,6 +3,7 @@
 use super::target::Seed;
 use emberwatch_agent::config::AgentConfig;
 use emberwatch_agent::estimation::Follower;
+use emberwatch_agent::learning::belief::LearnedBelief;
 use emberwatch_agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::learning::learners::decisions::{self, Base, DecisionsLearner};
@@ -14,7 +15,7 @@ use emberwatch_agent::learning::reward::RewardEstimate;
 use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use emberwatch_network::{Dqn, DqnSettings, DqnShape};
+use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
 use emberwatch_protocol::{Dynamics, Frame, Model, Shape, Transition};
 use ndarray::{Array3, Axis};
@@ -123,7 +124,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     }
     if learned.decisions.is_some() {
         let (_, contents) = decode(&[decisions::KIND], &bytes).expect("read before");
-        let base = Base::saved(&contents, worlds().shape).expect("read before");
+        let base = Base::saved(&contents, worlds().shape, &Device::Cpu).expect("read before");
         let base = base.unwrap_or_else(base_of_filter);
         if let Ok(learner) = DecisionsLearner::new(base, Some(&contents), worlds(), &config()) {
             learner.contents().expect("no device");
@@ -172,7 +173,8 @@ fn decisions() -> Contents {
 
 fn base_of_filter() -> Base {
     let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
-    Base::learned(EstimatorKind::LEARNED, fit.learned(), worlds().shape)
+    let belief = LearnedBelief::Filter(Box::new(fit.learned()));
+    Base::learned(EstimatorKind::LEARNED, belief, worlds().shape)
 }
 
 fn dqn() -> Dqn {

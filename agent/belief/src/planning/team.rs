@@ -50,12 +50,11 @@ pub fn plan_team(
         }
         n_unchanged = 0;
         let cells = fly(values.shape(), starts[robot], &plan.moves).visited;
-        match turn < n_robots {
-            true => {
-                plans.push(plan);
-                visited.push(cells);
-            }
-            false => (plans[robot], visited[robot]) = (plan, cells),
+        if turn < n_robots {
+            plans.push(plan);
+            visited.push(cells);
+        } else {
+            (plans[robot], visited[robot]) = (plan, cells);
         }
     }
     plans

@@ -8,7 +8,7 @@ use std::sync::Mutex;
 
 /// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
 /// their order: the number of threads changes no bit of the result.
-const N_CHUNKS: usize = 8;
+pub(super) const N_CHUNKS: usize = 8;
 
 /// The numbers of a contiguous tensor on the CPU, which is locked meanwhile.
 pub(super) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {

@@ -3,6 +3,7 @@
 mod dqn;
 mod golden;
 mod golden_file;
+mod neural;
 mod properties;
 mod stock;
 mod synthetic;

@@ -1,6 +1,6 @@
 //! What holds of every network: seeds, threads, saved state, numbers that are not finite, learning.
 
-use crate::synthetic::{coin, dropout, frames};
+use crate::synthetic::{coin, dropout, frames, rayon_pool};
 use candle_core::Tensor;
 use emberwatch_network::{
     Autoencoder, AutoencoderSettings, Device, NamedTensor, NetworkError, NetworkShape, NotFinite,
@@ -54,13 +54,6 @@ fn one_and_more_threads_give_the_same_bits() {
     let one = results(1);
     assert_eq!(one, results(2));
     assert_eq!(one, results(5));
-}
-
-fn rayon_pool(n_threads: usize) -> rayon::ThreadPool {
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(n_threads)
-        .build();
-    pool.expect("threads")
 }
 
 #[test]

@@ -41,3 +41,11 @@ pub fn dropout(
 pub fn coin(layer: usize, frame: usize, channel: usize) -> bool {
     split_mix(layer as u64 * 1000 + frame as u64, channel as u64) & 1 == 1
 }
+
+/// Threads for a computation whose bits must not depend on their number.
+pub fn rayon_pool(n_threads: usize) -> rayon::ThreadPool {
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(n_threads)
+        .build();
+    pool.expect("threads")
+}

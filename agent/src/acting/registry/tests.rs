@@ -5,8 +5,9 @@ use crate::learning::learners::Worlds;
 use crate::learning::learners::decisions::SHAPE;
 use crate::learning::learners::filter::fit::FilterFit;
 use crate::learning::learners::network::Progress;
+use crate::learning::learners::neural::NeuralModel;
 use anyhow::Result;
-use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
+use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape, NeuralBelief};
 use emberwatch_protocol::randomness::split_mix;
 use emberwatch_protocol::{Cell, Frame, Grid};
 use std::sync::Arc;
@@ -108,6 +109,10 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
     let learned = Learned {
         filter: filter(false),
         own_filter: filter(true),
+        neural: Some(NeuralModel {
+            network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
+            target: 1,
+        }),
         network: Some(Arc::new(network)),
         decisions: None,
     };
@@ -120,6 +125,8 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         "oracle_ahead",
         "learned_beam",
         "learned_own_spatial_beam",
+        "neural_beam",
+        "neural_rule",
         "autoencoder_explore",
         "autoencoder_beam",
     ] {

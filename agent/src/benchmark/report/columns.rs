@@ -74,21 +74,28 @@ impl<'a> Columns<'a> {
         });
     }
 
-    /// A Markdown table; all but the columns of names are right-aligned.
     pub(super) fn table(&self, groups: &[Group<'_>]) -> Table {
-        let mut table = Table::new();
-        table
-            .load_preset(presets::ASCII_MARKDOWN)
-            .set_content_arrangement(ContentArrangement::Disabled)
-            .set_header(self.0.iter().map(|column| &column.0));
-        for (column, (heading, _)) in table.column_iter_mut().zip(&self.0) {
-            if !["policy", "estimator", "team"].contains(&&**heading) {
-                column.set_cell_alignment(CellAlignment::Right);
-            }
-        }
-        for group in groups {
-            table.add_row(self.0.iter().map(|(_, cell)| cell(group)));
-        }
-        table
+        let headings: Vec<&str> = self.0.iter().map(|column| &*column.0).collect();
+        let cells = |group: &Group<'_>| self.0.iter().map(|(_, cell)| cell(group)).collect();
+        markdown(&headings, groups.iter().map(cells))
     }
+}
+
+/// A Markdown table; all but the columns of names are right-aligned.
+pub(super) fn markdown<H: AsRef<str>>(
+    headings: &[H],
+    rows: impl Iterator<Item = Vec<String>>,
+) -> Table {
+    let mut table = Table::new();
+    table
+        .load_preset(presets::ASCII_MARKDOWN)
+        .set_content_arrangement(ContentArrangement::Disabled)
+        .set_header(headings.iter().map(AsRef::as_ref));
+    for (column, heading) in table.column_iter_mut().zip(headings) {
+        if !["policy", "estimator", "team"].contains(&heading.as_ref()) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table.add_rows(rows);
+    table
 }

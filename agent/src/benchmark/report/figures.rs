@@ -67,15 +67,28 @@ impl Snapshot {
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
-    match is_svg {
-        true => replace_file(path, svg.as_bytes(), Readers::Any),
-        false => replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any),
+    if is_svg {
+        replace_file(path, svg.as_bytes(), Readers::Any)
+    } else {
+        replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any)
     }
 }
 
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
 /// [`FIRE_CELLS_PER_STEP`].
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
+    let title = "Reward of each policy on the same worlds";
+    draw_bars(path, runs, title, ladder_note(runs), axis_label)
+}
+
+/// Draws a bar a policy, the best at the top, with a mark for each of its runs.
+pub(super) fn draw_bars(
+    path: &Path,
+    runs: &[PolicyRun],
+    title: &str,
+    note: String,
+    axis_label: &str,
+) -> Result<()> {
     ensure!(
         !runs.is_empty(),
         "ladder: expected at least one policy run, got none"
@@ -93,8 +106,8 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
         .collect();
     let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
     let ladder = Ladder {
-        title: "Reward of each policy on the same worlds".into(),
-        note: ladder_note(runs),
+        title: title.into(),
+        note,
         axis: axis_label.into(),
         legend: FAMILIES.into_iter().filter(is_used).collect(),
         bars,

@@ -11,7 +11,7 @@ use std::path::Path;
 pub const ALONE: &str = "alone";
 
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
@@ -51,6 +51,8 @@ pub struct PolicyRun {
     pub front_distance: Option<f64>,
     /// Share of the grid that was ever seen.
     pub grid_seen_share: Option<f64>,
+    /// Mean `ln P(y)` of a visited cell under the prediction before the frame, where the estimator predicts frames.
+    pub log_likelihood: Option<f64>,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,

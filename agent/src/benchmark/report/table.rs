@@ -40,9 +40,10 @@ fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
         _ => "± is one standard error over worlds",
     };
     let baseline = if groups.iter().any(|group| group.policy == baseline) {
-        let same = match groups.iter().any(Group::is_team) {
-            true => " alone with as many robots",
-            false => "",
+        let same = if groups.iter().any(Group::is_team) {
+            " alone with as many robots"
+        } else {
+            ""
         };
         format!("differences are paired by world, to {baseline}{same}")
     } else {
@@ -110,9 +111,10 @@ fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
     let Some((below, _)) = less.last() else {
         return "No split by fire: one world has no halves.".into();
     };
-    let median = match less.len() == more.len() {
-        true => (below + more[0].0) / 2.0,
-        false => more[0].0,
+    let median = if less.len() == more.len() {
+        (below + more[0].0) / 2.0
+    } else {
+        more[0].0
     };
     let decimals = decimals(groups.iter().flat_map(rewards));
     let mut columns = Columns::of_names(groups);

@@ -9,7 +9,7 @@ pub use self::base::Base;
 pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
 
 use self::run::Run;
-use self::saved::{Held, SavedModel, SavedRun, filter_tensors};
+use self::saved::{Held, SavedBelief, SavedRun, belief_tensors};
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::{Contents, check};
 use crate::learning::learners::base::{Learner, Worlds, without_truth};
@@ -75,16 +75,18 @@ impl DecisionsLearner {
     }
 
     /// An agent before it takes in what its world shows.
-    fn rollout_at(&self, observation: Observation) -> Rollout {
+    fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, &self.policy);
-        self.worlds
-            .rollout(config, policy, base.estimator(), names, observation)
+        let estimator = base.estimator()?;
+        Ok(self
+            .worlds
+            .rollout(config, policy, estimator, names, observation))
     }
 
     /// A run that begins with what its world shows.
     fn begun(&self, observation: Observation) -> Result<Run> {
-        let mut rollout = self.rollout_at(observation);
+        let mut rollout = self.rollout_at(observation)?;
         rollout.correct()?;
         rollout.agent.predict();
         Ok(Run::begun(rollout, &self.dqn))
@@ -133,27 +135,22 @@ impl DecisionsLearner {
         (1.0 - done).max(config.final_rate)
     }
 
-    fn saved(&self) -> Contents {
+    fn saved(&self) -> Result<Contents> {
         let runs = self.runs.iter().map(Run::saved);
-        let model = self.base.model.as_ref();
+        let belief = self.base.belief();
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
             estimator: self.base.kind,
-            model: model.map(|model| SavedModel {
-                dimensions: model.tables.dimensions,
-                target: model.target,
-                correlations: model.correlations.clone(),
-            }),
+            belief: belief.map(SavedBelief::of),
             world_steps: self.world_steps,
             earned: self.earned,
             dqn: self.dqn.saved(),
             worlds: self.worlds.numbers.clone().zip(runs).collect(),
         };
-        let of_filter = model.into_iter().flat_map(filter_tensors);
-        Contents::new(
-            self.dqn.named_tensors().into_iter().chain(of_filter),
-            &state,
-        )
+        let of_belief = belief.map(belief_tensors).transpose()?;
+        let of_belief = of_belief.unwrap_or_default();
+        let tensors = self.dqn.named_tensors().into_iter().chain(of_belief);
+        Ok(Contents::new(tensors, &state))
     }
 
     /// Goes on from a checkpoint on the same base.
@@ -187,7 +184,7 @@ impl Learner for DecisionsLearner {
             let run = match left.filter(|left| left.is_of(&observation)) {
                 Some(left) => {
                     n_gone_on += 1;
-                    Run::restore(left, self.rollout_at(observation), &self.dqn)?
+                    Run::restore(left, self.rollout_at(observation)?, &self.dqn)?
                 }
                 None => self.begun(observation)?,
             };
@@ -278,7 +275,7 @@ impl Learner for DecisionsLearner {
     }
 
     fn contents(&self) -> Result<Contents> {
-        Ok(self.saved())
+        self.saved()
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -1,11 +1,13 @@
 //! Which belief learners plan on.
 
 use crate::config::AgentConfig;
+use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::Contents;
 use crate::learning::learners::decisions::{Base, DecisionsLearner};
 use crate::learning::learners::filter::FilterLearner;
 use crate::learning::learners::filter::fit::FilterFit;
 use crate::learning::learners::network::{NetworkLearner, Progress};
+use crate::learning::learners::neural::{NeuralLearner, NeuralModel};
 use crate::learning::learners::{Learner, Worlds};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use emberwatch_belief::estimation::BayesFilter;
@@ -14,6 +16,7 @@ use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
     BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
 };
+use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use emberwatch_protocol::randomness::split_mix;
@@ -139,21 +142,24 @@ fn learners_plan_on_the_belief_that_settings_say() {
             sees_own_state: false,
         };
         let learner = FilterLearner::new(dimensions, worlds(), config);
-        check(learner, basis, |belief, target, step| {
+        let beam = |belief: &Belief, target: usize, step: u64| {
             let policy = learned_beam();
             let objective = Objective {
                 target: Target::State(target),
                 ..config.objective(&policy)
             };
             vec![path(config, &policy, objective, belief, step)]
-        });
-        let progress = Progress::first(&worlds(), config, &emberwatch_network::Device::Cpu);
+        };
+        check(learner, basis, beam);
+        let progress = Progress::first(&worlds(), config, &Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check(learner, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);
             let path = |choice| path(config, choice, config.objective(choice), belief, step);
             choices.iter().map(path).collect()
         });
+        let learner = NeuralLearner::new(None, worlds(), config, &Device::Cpu);
+        check(learner.expect("a network"), basis, beam);
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
         let base = Base::known(EstimatorKind::KNOWN, filter, &model);
@@ -178,8 +184,8 @@ fn learners_plan_on_the_belief_that_settings_say() {
     }
 }
 
-/// What a checkpoint of decisions holds after so many steps in a row.
-fn learn(learner: &mut DecisionsLearner, steps: std::ops::Range<u64>) -> Contents {
+/// What a checkpoint holds after so many steps in a row.
+fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     for step in steps {
         fly(learner, step);
         learner.learn().expect("finite");
@@ -194,24 +200,30 @@ fn decisions_resume_bit_for_bit() {
         config.decisions.learning.batch,
         config.decisions.updates_per_step,
     ) = (4, 1.0);
-    for kind in [
-        EstimatorKind::learned(true),
-        EstimatorKind::LEARNED.spatial(),
-    ] {
+    let filter = |sees_own_state| {
         let dimensions = Dimensions {
             n_states: 3,
             n_observations: 3,
             kernel: (3, 3),
-            sees_own_state: kind.sees_own_state(),
+            sees_own_state,
         };
-        let learned = FilterFit::new(dimensions, worlds().shape, &config).learned();
-        let base = Base::learned(kind, learned, worlds().shape);
+        let fit = FilterFit::new(dimensions, worlds().shape, &config);
+        LearnedBelief::Filter(Box::new(fit.learned()))
+    };
+    let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+    let neural = NeuralModel { network, target: 1 };
+    for (kind, belief) in [
+        (EstimatorKind::learned(true), filter(true)),
+        (EstimatorKind::LEARNED.spatial(), filter(false)),
+        (EstimatorKind::Neural, LearnedBelief::Neural(neural)),
+    ] {
+        let base = Base::learned(kind, belief, worlds().shape);
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");
         let left = learn(&mut learner, 1..20);
-        let base = Base::saved(&left, worlds().shape)
+        let base = Base::saved(&left, worlds().shape, &Device::Cpu)
             .expect("whole")
-            .expect("a filter");
+            .expect("a belief");
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
         let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
@@ -222,4 +234,64 @@ fn decisions_resume_bit_for_bit() {
             "{kind:?}"
         );
     }
+}
+
+/// A neural belief that learns at every step.
+fn neural(contents: Option<&Contents>, worlds: Worlds) -> anyhow::Result<NeuralLearner> {
+    let mut config = config(BasisKind::Estimate);
+    config.neural.steps = 40;
+    (config.neural.batch, config.neural.updates_per_step) = (4, 1.0);
+    NeuralLearner::new(contents, worlds, &config, &Device::Cpu)
+}
+
+#[test]
+fn a_neural_belief_resumes_bit_for_bit() {
+    let mut learner = neural(None, worlds()).expect("new");
+    learner.attach(vec![observation(0)]).expect("possible");
+    let left = learn(&mut learner, 1..20);
+    let mut resumed = neural(Some(&left), worlds()).expect("its own");
+    let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
+    assert_eq!(n_gone_on, 1);
+    let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 20..40));
+    assert!(contents[0] == contents[1] && learner.n_updates() > 30);
+    let mut elsewhere = neural(Some(&left), worlds()).expect("its own");
+    let n_gone_on = elsewhere.attach(vec![observation(7)]).expect("possible");
+    assert_eq!((n_gone_on, elsewhere.n_updates()), (0, 19));
+}
+
+#[test]
+fn what_does_not_fit_a_neural_belief_is_named() {
+    let mut learner = neural(None, worlds()).expect("new");
+    learner.attach(vec![observation(0)]).expect("possible");
+    let left = learn(&mut learner, 1..5);
+    let refused = |contents: &Contents, worlds: Worlds, words: &str| {
+        let learner = neural(Some(contents), worlds).map(drop);
+        let error = learner.expect_err(words).to_string();
+        assert!(error.starts_with(words), "{error}");
+    };
+    let worlds_of_two = Worlds {
+        n_observations: 2,
+        ..worlds()
+    };
+    refused(&left, worlds_of_two, "n_observations: expected 2, got 3");
+    let mut without = left.clone();
+    without.tensors.remove("head.bias");
+    refused(
+        &without,
+        worlds(),
+        "head.bias: expected shape [3], got none",
+    );
+    let mut squares = left.clone();
+    let tensor = squares.tensors.get_mut("adam.second.head.bias");
+    tensor.expect("a moment").numbers[0] = -1.0;
+    refused(
+        &squares,
+        worlds(),
+        "adam.second.head.bias: expected numbers from 0 on, got -1",
+    );
+    let cut = Contents {
+        state: left.state[..left.state.len() - 1].to_vec(),
+        ..left
+    };
+    refused(&cut, worlds(), "state: expected");
 }

@@ -6,6 +6,7 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::learners::decisions::{Base, DecisionsLearner};
 use crate::learning::learners::filter::FilterLearner;
 use crate::learning::learners::network::{self, NetworkLearner};
+use crate::learning::learners::neural::NeuralLearner;
 use crate::learning::learners::{Learner, Worlds};
 use crate::learning::train::spec::TrainingSpec;
 use anyhow::{Context, Result, bail, ensure};
@@ -39,6 +40,10 @@ pub fn learner(
                 None => FilterLearner::new(dimensions, worlds, config),
             })
         }
+        LearnerKind::Neural => {
+            let learner = NeuralLearner::new(contents, worlds, config, &spec.device);
+            Box::new(learner.with_context(of_file)?)
+        }
         LearnerKind::Autoencoder => {
             let mut progress = network::Progress::first(&worlds, config, &spec.device)?;
             if let Some(contents) = contents {
@@ -55,7 +60,7 @@ pub fn learner(
             Box::new(NetworkLearner::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
-            let saved = contents.map(|contents| Base::saved(contents, worlds.shape));
+            let saved = contents.map(|contents| Base::saved(contents, worlds.shape, &spec.device));
             let base = match saved.transpose().with_context(of_file)?.flatten() {
                 Some(base) => base,
                 None => base(spec, info, worlds.shape)?,
@@ -71,13 +76,13 @@ pub fn learner(
     })
 }
 
-/// What keeps the beliefs that decisions are learned on: a filter that was learned, or that of the server's model.
+/// What keeps the beliefs that decisions are learned on: what was learned, or the filter of the server's model.
 fn base(spec: &TrainingSpec, info: &ServerInfo, shape: Shape) -> Result<Base> {
     let (kind, config) = (spec.config.decisions.estimator, &spec.config);
     if kind.is_learned() {
-        let filter = spec.learned.filter(kind);
-        let filter = filter.context("decisions: expected a checkpoint of a filter, got none")?;
-        return Ok(Base::learned(kind, filter.clone(), shape));
+        let belief = spec.learned.belief(kind);
+        let belief = belief.context("decisions: expected a checkpoint of a belief, got none")?;
+        return Ok(Base::learned(kind, belief, shape));
     }
     let model = info.model.as_deref().with_context(|| {
         format!(

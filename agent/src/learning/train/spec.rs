@@ -5,6 +5,7 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learned::Learned;
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit;
+use crate::learning::learners::neural::{self, SavedNeural};
 use crate::learning::learners::{Learner, decisions, network};
 use crate::policy::EstimatorKind;
 use anyhow::{Context, Result, anyhow, bail, ensure};
@@ -50,6 +51,7 @@ impl TrainingSpec {
         let kind = match self.config.learner {
             LearnerKind::Filter => fit::KIND,
             LearnerKind::OwnFilter => fit::OWN_KIND,
+            LearnerKind::Neural => neural::KIND,
             LearnerKind::Autoencoder if n_worlds != 1 => {
                 bail!(
                     "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"
@@ -65,42 +67,47 @@ impl TrainingSpec {
         Ok(Some(contents))
     }
 
-    /// The training of the filter whose belief decisions are learned on, in a folder within this one's; `None` if there
-    /// is nothing more to learn of it.
-    pub fn of_filter(&self) -> Result<Option<Self>> {
-        let decisions = &self.config.decisions;
-        let mut filter = self.clone();
-        filter.out = self.filter_folder();
-        filter.config.learner = if decisions.estimator.sees_own_state() {
-            LearnerKind::OwnFilter
-        } else {
-            LearnerKind::Filter
+    /// The training of the belief that decisions are learned on, in a folder within this one's; `None` if there is nothing
+    /// more to learn of it.
+    pub fn of_belief(&self) -> Result<Option<Self>> {
+        let estimator = self.config.decisions.estimator;
+        let mut belief = self.clone();
+        belief.out = self.belief_folder();
+        belief.config.learner = match estimator {
+            EstimatorKind::Neural => LearnerKind::Neural,
+            _ if estimator.sees_own_state() => LearnerKind::OwnFilter,
+            _ => LearnerKind::Filter,
         };
-        filter.resume = self.resume && filter.out.join(CHECKPOINT).exists();
-        let learned = match filter.check()? {
-            Some(contents) => contents.state::<SavedFilter>()?.fit.world_steps,
-            None => 0,
+        belief.resume = self.resume && belief.out.join(CHECKPOINT).exists();
+        let contents = belief.check()?;
+        let learned = contents.map(|contents| match belief.config.learner {
+            LearnerKind::Neural => Ok(contents.state::<SavedNeural>()?.world_steps),
+            _ => Ok::<_, anyhow::Error>(contents.state::<SavedFilter>()?.fit.world_steps),
+        });
+        let all = match belief.config.learner {
+            LearnerKind::Neural => self.config.neural.steps,
+            _ => self.config.decisions.filter_steps,
         };
-        filter.steps = decisions.filter_steps.saturating_sub(learned);
-        Ok((filter.steps > 0).then_some(filter))
+        belief.steps = all.saturating_sub(learned.transpose()?.unwrap_or(0));
+        Ok((belief.steps > 0).then_some(belief))
     }
 
-    /// Whose belief decisions are to be learned on, if their training was left while its filter was learned.
-    pub fn estimator_of_filter(&self) -> Result<Option<EstimatorKind>> {
-        let place = self.filter_folder().join(CHECKPOINT);
+    /// Whose belief decisions are to be learned on, if their training was left while that was learned.
+    pub fn estimator_of_belief(&self) -> Result<Option<EstimatorKind>> {
+        let place = self.belief_folder().join(CHECKPOINT);
         if self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
         }
-        let (_, contents) = checkpoint::read(&place, &[fit::KIND, fit::OWN_KIND])?;
+        let (_, contents) = checkpoint::read(&place, &[fit::KIND, fit::OWN_KIND, neural::KIND])?;
         let settings = contents.settings();
         let settings = settings.with_context(|| format!("checkpoint {}", place.display()))?;
         let estimator = settings.decisions.estimator;
         Ok(estimator.is_learned().then_some(estimator))
     }
 
-    /// Where [`Self::of_filter`] leaves its checkpoint.
-    pub fn filter_folder(&self) -> PathBuf {
-        self.out.join("filter")
+    /// Where [`Self::of_belief`] leaves its checkpoint.
+    pub fn belief_folder(&self) -> PathBuf {
+        self.out.join("belief")
     }
 
     /// The numbers of the robots on a server.

@@ -26,7 +26,7 @@ from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVect
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
-from emberwatch.task import Task, built_in_tasks
+from emberwatch.tasks import Task, built_in_tasks
 from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
 
 if TYPE_CHECKING:

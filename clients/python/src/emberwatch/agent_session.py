@@ -42,6 +42,7 @@ _CHOICES: Final = {
         "learned_spatial_filter",
         "learned_own_filter",
         "learned_own_spatial_filter",
+        "neural_belief",
     ),
     "prior": ("simulated", "initial", "uniform"),
     "agent": ("own", "running"),

@@ -12,7 +12,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, TextIO, cast
@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.arguments import as_seed
+from emberwatch.arguments import as_integer, as_seed, told
 from emberwatch.client import Client
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS, MeritTally
@@ -31,7 +31,7 @@ from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
-from emberwatch.task import Task
+from emberwatch.tasks import Task, built_in_tasks
 from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
@@ -191,6 +191,51 @@ def evaluate(
             file.add(rows)
     report.end()
     return [done[seed] for seed in chosen]
+
+
+def suite(
+    policy: Any,
+    *,
+    name: str,
+    folder: str | os.PathLike[str] = "suite",
+    tasks: Iterable[str | os.PathLike[str]] | None = None,
+    worlds: int | None = None,
+    **keywords: Any,
+) -> dict[str, list[Row]]:
+    """Scores a policy on the test worlds of tasks, for `emberwatch-agent suite --out FOLDER`.
+
+    Args:
+        policy: As of `evaluate`, for all tasks; or a mapping from the name of each task to one.
+        name: What tables call it.
+        folder: Where rows are kept, a CSV file a task. What is there already is not run again.
+        tasks: Names of tasks or task files; None: all that have names, or those of the mapping.
+        worlds: Worlds of each task, the first of its test seeds; None: all of them.
+        keywords: As of `evaluate`, but for `task`, `seeds`, `steps` and `csv`.
+
+    Returns:
+        A row for each world, by the name of its task.
+    """
+    for keyword in ("task", "seeds", "steps", "csv"):
+        if keyword in keywords:
+            raise InvalidArgumentError(f"{keyword}: expected none, as suite sets it")
+    if worlds is not None and (as_integer(worlds) or 0) < 1:
+        raise invalid("worlds", "at least 1", told(worlds))
+    by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
+    chosen = list(tasks or by_task or built_in_tasks())
+    rows: dict[str, list[Row]] = {}
+    for source in chosen:
+        task = Task.named(source)
+        if by_task is not None and task.name not in by_task:
+            raise invalid("policy", f"one for the task {task.name}", ", ".join(by_task))
+        rows[task.name] = evaluate(
+            policy if by_task is None else by_task[task.name],
+            name=name,
+            task=source,
+            seeds=task.test_seeds[:worlds],
+            csv=Path(folder) / f"{task.name}.csv",
+            **keywords,
+        )
+    return rows
 
 
 def _make(env: str, keywords: dict[str, Any], n_robots: int, n_worlds: int) -> Any:

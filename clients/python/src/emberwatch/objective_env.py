@@ -24,6 +24,7 @@ _Estimator = Literal[
     "learned_spatial_filter",
     "learned_own_filter",
     "learned_own_spatial_filter",
+    "neural_belief",
 ]
 
 
@@ -66,8 +67,9 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
       `"learned_filter"` one with learned parameters, which finds several times as many fires where
       they are rare; `"learned_own_filter"` one that learned a kernel for each state of the cell
       itself. Each of them has a spatial one, whose corrections reach neighbouring cells:
-      `"spatial_filter"`, `"learned_spatial_filter"`, `"learned_own_spatial_filter"`. By default the
-      checkpoint's filter, without one the known model's.
+      `"spatial_filter"`, `"learned_spatial_filter"`, `"learned_own_spatial_filter"`.
+      `"neural_belief"` is a network from what was seen in each cell. By default the checkpoint's,
+      without one the known model's filter.
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
       second), `"initial"` or `"uniform"`.

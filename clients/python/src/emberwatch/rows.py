@@ -53,11 +53,15 @@ class Row:
     front_distance: float | None = None
     #: Share of the grid that was ever seen.
     grid_seen_share: float | None = None
+    #: Mean of ln P of a visited cell's observation; None: only the agent program scores beliefs.
+    log_likelihood: float | None = None
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: The same of older files: without figures of merit, and without teams.
-_HEADERS: Final = [_HEADER[: _HEADER.index(end)] for end in ("steps_to_detection", "robots")]
+#: The same of older files: without likelihoods, figures of merit, or teams.
+_HEADERS: Final = [
+    _HEADER[: _HEADER.index(end)] for end in ("log_likelihood", "steps_to_detection", "robots")
+]
 
 
 class RowFile:

@@ -1,23 +1,27 @@
 //! What keeps the beliefs that decisions are made on.
 
 use super::saved::SavedDecisions;
+use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::Contents;
-use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use emberwatch_network::{Device, NetworkError};
 use emberwatch_protocol::{Model, Shape};
 
 /// What keeps the beliefs that decisions are made on, before a world's first frame.
 pub struct Base {
     pub kind: EstimatorKind,
-    filter: BayesFilter,
     /// The state that pays most.
     pub(super) target: usize,
-    correlations: Correlations,
     pub(super) state_names: Vec<String>,
-    /// What the filter learned, unless the model is known.
-    pub(super) model: Option<LearnedModel>,
+    start: Start,
+}
+
+/// Where a belief begins.
+enum Start {
+    Known(Box<BayesFilter>),
+    Learned(LearnedBelief, Shape),
 }
 
 impl Base {
@@ -25,41 +29,52 @@ impl Base {
     pub fn known(kind: EstimatorKind, filter: BayesFilter, model: &Model) -> Self {
         Self {
             kind,
-            filter,
             target: model.target_state(),
-            correlations: Correlations::default(),
             state_names: model.state_names(),
-            model: None,
+            start: Start::Known(Box::new(filter)),
         }
     }
 
-    pub fn learned(kind: EstimatorKind, model: LearnedModel, shape: Shape) -> Self {
+    pub fn learned(kind: EstimatorKind, belief: LearnedBelief, shape: Shape) -> Self {
         Self {
             kind,
-            filter: BayesFilter::learned(&model.tables, model.tables.prior(shape)),
-            target: model.target,
-            correlations: model.correlations.clone(),
-            state_names: numbered_states(model.tables.dimensions.n_states),
-            model: Some(model),
+            target: belief.target(),
+            state_names: numbered_states(belief.n_states()),
+            start: Start::Learned(belief, shape),
         }
     }
 
     /// Number of values that a cell may show to it.
     pub fn n_observations(&self) -> usize {
-        let likelihood = self.filter.likelihood();
-        likelihood.map_or(0, |likelihood| likelihood.ncols())
+        match &self.start {
+            Start::Known(filter) => filter.likelihood().map_or(0, |it| it.ncols()),
+            Start::Learned(belief, _) => belief.n_observations(),
+        }
     }
 
-    pub(super) fn estimator(&self) -> Box<dyn Estimator> {
-        let neighbours = || (self.target, self.correlations.clone());
-        let neighbours = self.kind.is_spatial().then(neighbours);
-        correcting(self.filter.clone(), neighbours)
+    pub(super) fn estimator(&self) -> Result<Box<dyn Estimator>, NetworkError> {
+        let is_spatial = self.kind.is_spatial();
+        match &self.start {
+            Start::Known(filter) => {
+                let neighbours = || (self.target, Correlations::default());
+                Ok(correcting(*filter.clone(), is_spatial.then(neighbours)))
+            }
+            Start::Learned(belief, shape) => belief.estimator(is_spatial, *shape),
+        }
     }
 
-    /// What a checkpoint's decisions are on, if that was learned.
-    pub fn saved(contents: &Contents, shape: Shape) -> Result<Option<Self>> {
+    /// What was learned, unless the model is known.
+    pub(super) fn belief(&self) -> Option<&LearnedBelief> {
+        match &self.start {
+            Start::Known(_) => None,
+            Start::Learned(belief, _) => Some(belief),
+        }
+    }
+
+    /// What a checkpoint's decisions are on, if that was learned; a network computes on `device`.
+    pub fn saved(contents: &Contents, shape: Shape, device: &Device) -> Result<Option<Self>> {
         let saved: SavedDecisions = contents.state()?;
-        let model = saved.model(contents)?;
-        Ok(model.map(|model| Self::learned(saved.estimator, model, shape)))
+        let belief = saved.belief(contents, device)?;
+        Ok(belief.map(|belief| Self::learned(saved.estimator, belief, shape)))
     }
 }

@@ -1,10 +1,12 @@
-//! Decisions in a checkpoint: the DQN, what the belief's filter learned, and where the robots are.
+//! Decisions in a checkpoint: the DQN, the belief that they were learned on, and where the robots are.
 
+use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
 use crate::learning::learners::base::{Place, place};
 use crate::learning::learners::filter::fit::LearnedModel;
+use crate::learning::learners::neural::{NeuralModel, new_network};
 use crate::policy::EstimatorKind;
 use anyhow::Result;
 use emberwatch_belief::estimation::Correlations;
@@ -12,7 +14,7 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_belief::planning::{BasisKind, Memory, OPTIONS};
-use emberwatch_network::{Dqn, DqnShape, NamedTensor, SavedDqn, Track};
+use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor, SavedDqn, Track};
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::client::Observation;
 use serde::{Deserialize, Serialize};
@@ -28,8 +30,8 @@ const MOST_EARNED: f64 = 2e6;
 /// Longest time for which an option is held, steps.
 const LONGEST_HOLD: u64 = 1000;
 
-/// Before the names of the filter's tensors.
-const FILTER: &str = "filter.";
+/// Before the names of the belief's tensors.
+const BELIEF: &str = "belief.";
 
 /// A random option that is flown for some steps in a row.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -55,19 +57,25 @@ pub struct LearnedDecisions {
 pub struct SavedDecisions {
     pub options: Vec<String>,
     pub estimator: EstimatorKind,
-    pub(super) model: Option<SavedModel>,
+    pub(super) belief: Option<SavedBelief>,
     pub world_steps: u64,
     pub(super) earned: f64,
     pub dqn: SavedDqn,
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
-/// What a filter learned, without its tensors.
+/// A belief that was learned, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct SavedModel {
-    pub(super) dimensions: Dimensions,
-    pub(super) target: usize,
-    pub(super) correlations: Correlations,
+pub(super) enum SavedBelief {
+    Filter {
+        dimensions: Dimensions,
+        target: usize,
+        correlations: Box<Correlations>,
+    },
+    Neural {
+        n_observations: usize,
+        target: usize,
+    },
 }
 
 /// Where a world was left.
@@ -85,8 +93,8 @@ pub(super) struct SavedRun {
 }
 
 impl LearnedDecisions {
-    /// From a checkpoint, with what the belief's filter learned, if it did.
-    pub fn read(contents: &Contents) -> Result<(Self, Option<LearnedModel>)> {
+    /// From a checkpoint, with the belief that was learned for them, if it was; a network computes on `device`.
+    pub fn read(contents: &Contents, device: &Device) -> Result<(Self, Option<LearnedBelief>)> {
         let config = contents.settings()?;
         let saved: SavedDecisions = contents.state()?;
         let mut dqn = Dqn::new(config.decisions.settings(), SHAPE, config.seed);
@@ -97,37 +105,75 @@ impl LearnedDecisions {
             basis: config.objective.belief,
             beam_width: config.decisions.beam_width,
         };
-        Ok((decisions, saved.model(contents)?))
+        Ok((decisions, saved.belief(contents, device)?))
+    }
+}
+
+impl SavedBelief {
+    pub(super) fn of(belief: &LearnedBelief) -> Self {
+        match belief {
+            LearnedBelief::Filter(model) => Self::Filter {
+                dimensions: model.tables.dimensions,
+                target: model.target,
+                correlations: Box::new(model.correlations.clone()),
+            },
+            LearnedBelief::Neural(model) => Self::Neural {
+                n_observations: model.network.n_observations(),
+                target: model.target,
+            },
+        }
     }
 }
 
 impl SavedDecisions {
-    /// What the belief's filter learned, if it did.
-    pub fn model(&self, contents: &Contents) -> Result<Option<LearnedModel>> {
-        let Some(saved) = &self.model else {
-            return Ok(None);
-        };
+    /// The belief that was learned, if it was; a network computes on `device`.
+    pub fn belief(&self, contents: &Contents, device: &Device) -> Result<Option<LearnedBelief>> {
+        let is_neural = matches!(self.belief, Some(SavedBelief::Neural { .. }));
+        let fits = is_neural == (self.estimator == EstimatorKind::Neural);
+        check(fits, "belief", self.estimator.label(), "another")?;
+        let find = |name: &str, shape: &[usize]| contents.tensor(&format!("{BELIEF}{name}"), shape);
+        let belief = self.belief.as_ref().map(|saved| match saved {
+            SavedBelief::Filter {
+                dimensions,
+                target,
+                correlations,
+            } => {
+                let parameters = self.parameters(*dimensions, find)?;
+                check_target(*target, parameters.dimensions.n_states)?;
+                let model = LearnedModel::new(parameters, *target, *correlations.clone());
+                Ok(LearnedBelief::Filter(Box::new(model)))
+            }
+            &SavedBelief::Neural {
+                n_observations,
+                target,
+            } => {
+                check_target(target, n_observations)?;
+                let mut network = new_network(n_observations, device)?;
+                network.set_parameters(find)?;
+                Ok(LearnedBelief::Neural(NeuralModel { network, target }))
+            }
+        });
+        belief.transpose()
+    }
+
+    /// Those of the filter.
+    fn parameters(
+        &self,
+        dimensions: Dimensions,
+        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
+    ) -> Result<Parameters> {
         let dimensions = Dimensions {
             sees_own_state: self.estimator.sees_own_state(),
-            ..saved.dimensions
+            ..dimensions
         };
         let dimensions = dimensions.check();
         let dimensions =
             dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-        let (n_states, target) = (dimensions.n_states, saved.target);
-        check(
-            target < n_states,
-            "target",
-            format!("less than {n_states}"),
-            target,
-        )?;
         let mut parameters = Parameters::zeros(dimensions);
         for (at, shape) in dimensions.shapes().iter().enumerate() {
-            let name = format!("{FILTER}{}", Parameters::NAMES[at]);
-            parameters.tensors[at] = contents.tensor(&name, shape)?;
+            parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
         }
-        let correlations = saved.correlations.clone();
-        Ok(Some(LearnedModel::new(parameters, target, correlations)))
+        Ok(parameters)
     }
 
     pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
@@ -181,16 +227,26 @@ impl SavedRun {
     }
 }
 
-pub(super) fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = NamedTensor> {
-    let parameters = &model.parameters;
-    let shapes = parameters.dimensions.shapes().into_iter();
-    let named = Parameters::NAMES
-        .iter()
-        .zip(shapes)
-        .zip(&parameters.tensors);
-    let named =
-        named.map(|((name, shape), numbers)| (format!("{FILTER}{name}"), shape, numbers.clone()));
-    named.collect::<Vec<_>>().into_iter()
+fn check_target(target: usize, n_states: usize) -> Result<()> {
+    let expected = format!("less than {n_states}");
+    check(target < n_states, "target", expected, target)
+}
+
+/// The tensors of a belief that was learned.
+pub(super) fn belief_tensors(belief: &LearnedBelief) -> Result<Vec<NamedTensor>> {
+    let named = |(name, shape, numbers)| (format!("{BELIEF}{name}"), shape, numbers);
+    let tensors = match belief {
+        LearnedBelief::Filter(model) => {
+            let parameters = &model.parameters;
+            let shapes = parameters.dimensions.shapes().into_iter();
+            let names = Parameters::NAMES.iter().map(|name| (*name).to_owned());
+            let tensors = names.zip(shapes).zip(parameters.tensors.clone());
+            let tensors = tensors.map(|((name, shape), numbers)| (name, shape, numbers));
+            tensors.collect()
+        }
+        LearnedBelief::Neural(model) => model.network.parameters()?,
+    };
+    Ok(tensors.into_iter().map(named).collect())
 }
 
 #[cfg(test)]
@@ -207,14 +263,14 @@ mod tests {
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
             estimator: EstimatorKind::KNOWN,
-            model: None,
+            belief: None,
             world_steps: 7,
             earned: 0.5,
             dqn: dqn.saved(),
             worlds: BTreeMap::new(),
         };
         let mut contents = Contents::new(dqn.named_tensors(), &state);
-        let read = |contents: &Contents| LearnedDecisions::read(contents).map(drop);
+        let read = |contents: &Contents| LearnedDecisions::read(contents, &Device::Cpu).map(drop);
         let error = read(&contents).expect_err("no settings").to_string();
         assert!(error.starts_with("settings: expected"), "{error}");
         contents.settings = toml::to_string(&config).expect("TOML");

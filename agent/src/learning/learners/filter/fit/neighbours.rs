@@ -24,9 +24,10 @@ pub struct Neighbours {
 impl Neighbours {
     /// What was learned of a state so far.
     pub fn correlations_of(&self, state: usize) -> Correlations {
-        match self.state == Some(state) {
-            true => self.correlations.clone(),
-            false => Correlations::default(),
+        if self.state == Some(state) {
+            self.correlations.clone()
+        } else {
+            Correlations::default()
         }
     }
 

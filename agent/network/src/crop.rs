@@ -1,0 +1,86 @@
+//! Parts of grids, as the network that keeps space takes them.
+
+use crate::unet::ALIGNMENT;
+use emberwatch_protocol::grid::Shape;
+
+/// Cells that a crop has beyond those to predict, on both sides together: what lies further away says little of them.
+const MARGINS: usize = 24;
+
+/// A part of a grid, with sides that the network's strides divide; it may reach beyond the grid's lower and right edge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Crop {
+    /// The row and column of its first cell.
+    pub first: [usize; 2],
+    /// Rows and columns.
+    pub sides: [usize; 2],
+}
+
+/// The first and the last row of some cells, then their columns.
+pub(crate) type Extent = [[usize; 2]; 2];
+
+impl Crop {
+    /// The whole of a grid.
+    pub fn whole(shape: Shape) -> Self {
+        let (height, width) = shape.dim();
+        Self {
+            first: [0, 0],
+            sides: [height, width].map(|side| side.next_multiple_of(ALIGNMENT)),
+        }
+    }
+
+    /// The sides of crops that hold cells of any of some extents.
+    pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
+        let whole = Self::whole(shape);
+        [0, 1].map(|axis| {
+            let spans = extents.iter().map(|it| it[axis][1] + 1 - it[axis][0]);
+            let side = spans.max().unwrap_or(0) + MARGINS;
+            side.next_multiple_of(ALIGNMENT).min(whole.sides[axis])
+        })
+    }
+
+    /// The one of such sides with an extent in its middle, as far as the grid goes.
+    pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
+        let whole = Self::whole(shape);
+        let first = [0, 1].map(|axis| {
+            let middle = (extent[axis][0] + extent[axis][1]).div_ceil(2);
+            let most = whole.sides[axis] - sides[axis];
+            let first = middle.saturating_sub(sides[axis] / 2).min(most);
+            // The strides fall as on the whole grid.
+            first / ALIGNMENT * ALIGNMENT
+        });
+        Self { first, sides }
+    }
+}
+
+/// The extent of some cells by their row-major index.
+///
+/// # Panics
+/// If there is none.
+pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize>) -> Extent {
+    let mut extent = [[usize::MAX, 0]; 2];
+    for cell in cells.map(|cell| shape.cell(cell)) {
+        for ([first, last], at) in extent.iter_mut().zip([cell.row, cell.col]) {
+            (*first, *last) = (at.min(*first), at.max(*last));
+        }
+    }
+    assert!(extent[0][0] < usize::MAX, "cells: expected at least one");
+    extent
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crops_hold_their_cells_with_margins_up_to_the_edges() {
+        let shape = Shape::new(70, 30).expect("test shape");
+        let extents = [extent(shape, [33, 95].into_iter()), [[50, 69], [0, 9]]];
+        assert_eq!(extents[0], [[1, 3], [3, 5]]);
+        let sides = Crop::sides(shape, &extents);
+        assert_eq!(sides, [44, 32], "20 rows and margins; the whole width");
+        let first = |extent| Crop::around(shape, sides, extent).first;
+        assert_eq!(first(&extents[0]), [0, 0]);
+        assert_eq!(first(&extents[1]), [28, 0]);
+        assert_eq!(first(&[[30, 49], [0, 9]]), [16, 0]);
+    }
+}

@@ -1,0 +1,297 @@
+//! What was last seen in each cell of a world and when: all that the neural belief is computed from.
+
+use crate::crop::Crop;
+use emberwatch_protocol::frame::{Frame, UNOBSERVED};
+use emberwatch_protocol::grid::Shape;
+use serde::{Deserialize, Serialize};
+
+/// Bytes of a [`Sighting`] in [`Sightings::to_bytes`].
+const SIGHTING_BYTES: usize = 5;
+
+/// Ages from which on a sighting counts as this old, steps.
+const OLDEST: usize = 4000;
+
+/// Steps in which a sighting fades to `1/e`: what is seen changes quickly in some worlds and slowly in others.
+const FADING_STEPS: [f32; 3] = [10.0, 60.0, 400.0];
+
+/// The value that a cell showed, if it was seen, and in which step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sighting {
+    /// [`UNOBSERVED`] before the first.
+    pub value: u8,
+    /// On the count of [`Sightings`].
+    pub step: u32,
+}
+
+/// The last and the last but one sighting of each cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Sightings {
+    shape: Shape,
+    step: u32,
+    /// Row-major.
+    cells: Vec<[Sighting; 2]>,
+}
+
+/// Numbers that depend on ages, from 0 to [`OLDEST`].
+#[derive(Debug, Clone)]
+pub struct Features {
+    n_observations: usize,
+    ages: Vec<Age>,
+}
+
+/// What an age is to the network.
+#[derive(Debug, Clone, Copy)]
+struct Age {
+    freshness: [f32; 3],
+    logarithm: f32,
+}
+
+impl Sighting {
+    const NONE: Self = Self {
+        value: UNOBSERVED,
+        step: 0,
+    };
+}
+
+impl Sightings {
+    /// Before the first frame.
+    pub fn new(shape: Shape) -> Self {
+        Self {
+            shape,
+            step: 0,
+            cells: vec![[Sighting::NONE; 2]; shape.n_cells()],
+        }
+    }
+
+    /// The grid.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Takes in a frame of the present step.
+    pub fn see(&mut self, frame: &Frame) {
+        for (cell, value) in frame.observed() {
+            self.see_cell(cell, value);
+        }
+    }
+
+    /// Takes in what a cell shows in the present step.
+    pub fn see_cell(&mut self, cell: usize, value: u8) {
+        let step = self.step;
+        let [last, before] = &mut self.cells[cell];
+        *before = *last;
+        *last = Sighting { value, step };
+    }
+
+    /// Goes on to the next step.
+    pub fn pass(&mut self) {
+        self.step = self.step.saturating_add(1);
+    }
+
+    /// The value that a cell showed last, and how many steps ago; `None` before.
+    pub fn last(&self, cell: usize) -> Option<(u8, u32)> {
+        let [last, _] = self.cells[cell];
+        (last.value != UNOBSERVED).then(|| (last.value, self.step - last.step))
+    }
+
+    /// Whether they are of a grid and of so many observations.
+    pub fn are_of(&self, shape: Shape, n_observations: usize) -> bool {
+        let fits = |seen: &Sighting| {
+            let is_value = usize::from(seen.value) < n_observations || seen.value == UNOBSERVED;
+            is_value && seen.step <= self.step
+        };
+        self.shape == shape
+            && self.cells.len() == shape.n_cells()
+            && self.cells.iter().flatten().all(fits)
+    }
+
+    /// Little-endian: the step as `u32`; of each cell the last sighting and the one before, as value and step.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = self.step.to_le_bytes().to_vec();
+        for seen in self.cells.iter().flatten() {
+            bytes.push(seen.value);
+            bytes.extend(seen.step.to_le_bytes());
+        }
+        bytes
+    }
+
+    /// Of such bytes; `None` if they are not those of a grid with so many observations.
+    pub fn from_bytes(bytes: &[u8], shape: Shape, n_observations: usize) -> Option<Self> {
+        let (step, seen) = bytes.split_first_chunk()?;
+        let (seen, []) = seen.as_chunks::<SIGHTING_BYTES>() else {
+            return None;
+        };
+        let seen: Vec<Sighting> = seen
+            .iter()
+            .map(|&[value, a, b, c, d]| Sighting {
+                value,
+                step: u32::from_le_bytes([a, b, c, d]),
+            })
+            .collect();
+        let (cells, []) = seen.as_chunks::<2>() else {
+            return None;
+        };
+        let sightings = Self {
+            shape,
+            step: u32::from_le_bytes(*step),
+            cells: cells.to_vec(),
+        };
+        sightings.are_of(shape, n_observations).then_some(sightings)
+    }
+}
+
+impl Features {
+    /// For worlds with so many observations.
+    pub fn new(n_observations: usize) -> Self {
+        let age = |age: usize| Age {
+            freshness: FADING_STEPS.map(|steps| (-(age as f32) / steps).exp()),
+            logarithm: (age as f32).ln_1p() / 8.0,
+        };
+        Self {
+            n_observations,
+            ages: (0..=OLDEST).map(age).collect(),
+        }
+    }
+
+    /// Numbers of a cell: of each observation its freshness when it was seen last, by three measures, and when it was
+    /// seen before that; whether the cell was never seen, the logarithm of its age, whether it lies inside the grid, and
+    /// how long ago it was seen before the last time.
+    pub fn n_channels(n_observations: usize) -> usize {
+        4 * n_observations + 4
+    }
+
+    /// Adds the features of a crop's cells, row-major.
+    pub fn add(&self, sightings: &Sightings, crop: &Crop, to: &mut Vec<f32>) {
+        let ([height, width], n) = (crop.sides, Self::n_channels(self.n_observations));
+        let (rows, cols) = sightings.shape.dim();
+        let start = to.len();
+        to.resize(start + height * width * n, 0.0);
+        let mut cells = to[start..].chunks_exact_mut(n);
+        for row in (0..height).map(|row| crop.first[0] + row) {
+            for col in (0..width).map(|col| crop.first[1] + col) {
+                let Some(to) = cells.next().filter(|_| row < rows && col < cols) else {
+                    continue;
+                };
+                self.write(sightings, row * cols + col, to);
+            }
+        }
+    }
+
+    fn write(&self, sightings: &Sightings, cell: usize, to: &mut [f32]) {
+        let n = self.n_observations;
+        let [last, before] = sightings.cells[cell].map(|seen| {
+            let age = ((sightings.step - seen.step) as usize).min(OLDEST);
+            let is_seen = seen.value != UNOBSERVED;
+            is_seen.then(|| (usize::from(seen.value), self.ages[age]))
+        });
+        let (of_values, of_cell) = to.split_at_mut(4 * n);
+        if let Some((value, age)) = last {
+            for (at, freshness) in age.freshness.into_iter().enumerate() {
+                of_values[at * n + value] = freshness;
+            }
+        }
+        if let Some((value, age)) = before {
+            of_values[3 * n + value] = age.freshness[1];
+            of_cell[3] = age.freshness[2];
+        }
+        let age = last.map_or(self.ages[OLDEST], |(_, age)| age);
+        of_cell[0] = f32::from(last.is_none());
+        of_cell[1] = age.logarithm;
+        of_cell[2] = 1.0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape() -> Shape {
+        Shape::new(1, 3).expect("test shape")
+    }
+
+    /// Cell 0 shows 1, then after five steps 0; cell 1 shows 2 then; cell 2 nothing.
+    fn sightings() -> Sightings {
+        let mut sightings = Sightings::new(shape());
+        let frame = |values| Frame::from_bytes(shape(), 3, values).expect("test frame");
+        sightings.see(&frame(&[1, 255, 255]));
+        (0..5).for_each(|_| sightings.pass());
+        sightings.see(&frame(&[0, 2, 255]));
+        (0..10).for_each(|_| sightings.pass());
+        sightings
+    }
+
+    #[test]
+    fn features_tell_what_was_seen_when_and_what_lies_inside() {
+        let crop = Crop::whole(shape());
+        assert_eq!((crop.sides, Features::n_channels(3)), ([4, 4], 16));
+        let mut features = vec![7.0];
+        Features::new(3).add(&sightings(), &crop, &mut features);
+        assert_eq!(features.len(), 1 + 16 * 16);
+        let cell = |cell: usize| &features[1 + 16 * cell..][..16];
+        let fresh = |age: f32, steps: f32| (-age / steps).exp();
+        let [a, b, c] = FADING_STEPS.map(|steps| fresh(10.0, steps));
+        let log = |age: f32| age.ln_1p() / 8.0;
+        let (d, e) = (fresh(15.0, 60.0), fresh(15.0, 400.0));
+        let first = [
+            a,
+            0.,
+            0.,
+            b,
+            0.,
+            0.,
+            c,
+            0.,
+            0.,
+            0.,
+            d,
+            0.,
+            0.,
+            log(10.0),
+            1.,
+            e,
+        ];
+        assert_eq!(cell(0), first);
+        let second = [
+            0.,
+            0.,
+            a,
+            0.,
+            0.,
+            b,
+            0.,
+            0.,
+            c,
+            0.,
+            0.,
+            0.,
+            0.,
+            log(10.0),
+            1.,
+            0.,
+        ];
+        assert_eq!(cell(1), second);
+        let mut never = [0.0; 16];
+        (never[12], never[13], never[14]) = (1.0, log(4000.0), 1.0);
+        assert_eq!(cell(2), never);
+        assert!(features[1 + 3 * 16..].iter().all(|&number| number == 0.0));
+    }
+
+    #[test]
+    fn sightings_go_through_bytes_and_others_are_refused() {
+        let sightings = sightings();
+        let bytes = sightings.to_bytes();
+        let read = |bytes: &[u8]| Sightings::from_bytes(bytes, shape(), 3);
+        assert_eq!(read(&bytes), Some(sightings.clone()));
+        assert_eq!(sightings.last(0), Some((0, 10)));
+        assert_eq!(sightings.last(2), None);
+        assert_eq!(Sightings::from_bytes(&bytes, shape(), 2), None, "a value");
+        let larger = Shape::new(1, 4).expect("test shape");
+        assert_eq!(Sightings::from_bytes(&bytes, larger, 3), None);
+        for cut in 0..bytes.len() {
+            assert_eq!(read(&bytes[..cut]), None);
+        }
+        let mut late = bytes;
+        late[5] = 16; // A step after the present one.
+        assert_eq!(read(&late), None);
+    }
+}

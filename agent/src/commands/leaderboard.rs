@@ -1,0 +1,115 @@
+//! `leaderboard`: an entry from the results of `suite`, and the page of all entries.
+
+use super::shared::write;
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use emberwatch_agent::benchmark::report::added::read_csv;
+use emberwatch_agent::benchmark::report::leaderboard::{
+    About, Entry, draw_leaderboard, read_entries, render_page,
+};
+use emberwatch_agent::benchmark::report::suite::TaskRuns;
+use emberwatch_agent::file::{Readers, replace_file};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Where the page begins that is made: what stands before is kept.
+const MADE: &str = "<!-- made by `emberwatch-agent leaderboard` -->";
+
+/// Add an entry to a leaderboard, and make its page and figure.
+#[derive(Args)]
+pub struct LeaderboardCommand {
+    /// The folder of entries, a CSV file each
+    #[arg(long, value_name = "FOLDER", default_value = "docs/leaderboard")]
+    entries: PathBuf,
+    /// The page, of which all below its mark is replaced; a figure of its name, .svg, is put beside it
+    #[arg(long, value_name = "FILE", default_value = "docs/leaderboard.md")]
+    page: PathBuf,
+    /// Add a policy: the folder that `suite --out`, or `emberwatch.benchmark.suite` in Python, wrote
+    #[arg(long, value_name = "FOLDER", requires_all = ["policy", "by", "code", "commit"])]
+    add: Option<PathBuf>,
+    /// The policy to add
+    #[arg(long, requires = "add")]
+    policy: Option<String>,
+    /// Who made it
+    #[arg(long, requires = "add")]
+    by: Option<String>,
+    /// Where its code is
+    #[arg(long, requires = "add")]
+    code: Option<String>,
+    /// The commit of that code
+    #[arg(long, requires = "add")]
+    commit: Option<String>,
+    /// Processor seconds of training, of all tasks together
+    #[arg(long, value_name = "SECONDS", requires = "add", default_value_t = 0.0)]
+    training_seconds: f64,
+}
+
+impl LeaderboardCommand {
+    /// Adds the entry, if there is one, and makes the page.
+    pub fn run(&self) -> Result<()> {
+        if let Some(folder) = &self.add {
+            self.add(folder)?;
+        }
+        let entries = read_entries(&self.entries)?;
+        let table = render_page(&entries);
+        let page =
+            std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
+        let (kept, _) = page.split_once(MADE).with_context(|| {
+            format!(
+                "{}: expected a line {MADE}, below which the page is made",
+                self.page.display()
+            )
+        })?;
+        let page = format!("{kept}{MADE}\n\n{table}");
+        replace_file(&self.page, page.as_bytes(), Readers::Any)?;
+        draw_leaderboard(&self.page.with_extension("svg"), &entries)?;
+        write(&table)
+    }
+
+    fn add(&self, folder: &Path) -> Result<()> {
+        let text = |flag: &Option<String>| flag.clone().unwrap_or_default();
+        let about = About {
+            policy: text(&self.policy),
+            by: text(&self.by),
+            code: text(&self.code),
+            commit: text(&self.commit),
+            training_seconds: self.training_seconds,
+        };
+        ensure!(
+            about.training_seconds >= 0.0,
+            "--training-seconds: expected 0 or more, got {}",
+            about.training_seconds
+        );
+        let files =
+            std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
+        let files = files
+            .map(|file| Ok(file?.path()))
+            .collect::<Result<BTreeSet<_>>>()?;
+        let files = files
+            .iter()
+            .filter(|path| path.extension().is_some_and(|it| it == "csv"));
+        let tasks = files
+            .map(|path| task(path, &about.policy))
+            .collect::<Result<Vec<_>>>()?;
+        let tasks: Vec<TaskRuns> = tasks
+            .into_iter()
+            .filter(|task| !task.runs.is_empty())
+            .collect();
+        ensure!(
+            !tasks.is_empty(),
+            "--add {}: expected results of {:?}, got none",
+            folder.display(),
+            about.policy
+        );
+        let path = self.entries.join(&about.policy).with_extension("csv");
+        Entry { about, tasks }.write(&path)
+    }
+}
+
+/// A policy's runs in a task's file.
+fn task(path: &Path, policy: &str) -> Result<TaskRuns> {
+    let name = path.file_stem().unwrap_or_default().display().to_string();
+    let mut runs = read_csv(path).with_context(|| path.display().to_string())?;
+    runs.retain(|run| run.policy == policy);
+    Ok(TaskRuns { task: name, runs })
+}
