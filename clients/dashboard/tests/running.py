@@ -137,8 +137,9 @@ class Programs:
 
 
 def flags(settings: dict[str, object]) -> list[str]:
-    """Settings as command-line flags."""
-    pairs = [(f"--{name.replace('_', '-')}", value) for name, value in settings.items()]
+    """Settings as command-line flags; None is left out."""
+    given = {name: value for name, value in settings.items() if value is not None}
+    pairs = [(f"--{name.replace('_', '-')}", value) for name, value in given.items()]
     return [name if value is True else f"{name}={value}" for name, value in pairs]
 
 

@@ -190,4 +190,6 @@ def test_the_task_is_named(programs, open_page):
     by_task = dict.fromkeys(("height", "width", "moves", "burn_in"))
     server = programs.server(task="small", **by_task)
     look = open_page(programs.dashboard(server.instance))
-    look.eventually(lambda: look.text("task") == "task small", "the task's name")
+    look.eventually(
+        lambda: look.page.locator("#task").text_content() == "task small", "the task's name"
+    )

@@ -24,12 +24,23 @@ STRICT = {"LC_ALL": "C.UTF-8", "PYTHONIOENCODING": "utf-8:strict"}
 LATIN = os.fsdecode(b"fire \xe9")
 EXPECTED = "expected UTF-8, and a locale that has its letters, such as LC_ALL=C.UTF-8, got "
 
+TASK = """
+name = "mine"
+model = "m.toml"
+height = 4
+width = 4
+moves = 2
+max_steps = 9
+test_seeds = { start = 0, end = 1 }
+"""
+
 USE = """
 import sys, gymnasium, emberwatch
 from emberwatch.model import Model
 folder, instance = sys.argv[1:]
 Model.named(f"{folder}/m.toml")
-for keywords in ({"states": f"{folder}/fire.npz"}, {"model": f"{folder}/m.toml", "height": 7}):
+of_model = {"model": f"{folder}/m.toml", "height": 7}
+for keywords in ({"states": f"{folder}/fire.npz"}, of_model, {"task": f"{folder}/t.toml"}):
     gymnasium.make("emberwatch/Wildfire-v0", **keywords).close()
 with emberwatch.connect(instance) as client, client.acquire(takeover=True) as lease:
     client.snapshot(f"{folder}/a.snapshot")
@@ -53,6 +64,7 @@ def filled(folder: Path) -> Path:
     np.savez(folder / "fire.npz", states=np.eye(4, dtype=np.uint8)[None].repeat(3, axis=0))
     shutil.copy(RECORDED, folder / "fire.toml")
     shutil.copy(LIVELY, folder / "m.toml")
+    (folder / "t.toml").write_text(TASK)
     return folder
 
 

@@ -18,6 +18,11 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
     return text
 
 
+def local(text: str) -> str:
+    """A path in UTF-8, as programs tell it, as Python takes it in this locale."""
+    return os.fsdecode(text.encode())
+
+
 def shown(text: str) -> str:
     """The text with escapes for what standard output cannot write, such as paths of other bytes."""
     encoding = sys.stdout.encoding or "utf-8"

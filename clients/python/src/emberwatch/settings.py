@@ -12,7 +12,7 @@ import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
-from emberwatch.paths import utf8
+from emberwatch.paths import local, utf8
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
@@ -200,9 +200,9 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     robots = _robots(settings, n_rows, n_robots)
     checked = check_settings(settings.server_flags(len(robots) // n_robots))
     if checked["states"]:
-        described = _description(checked["states"])
+        described = _description(local(checked["states"]))
     else:
-        described = Model.checked(checked["model"])
+        described = Model.checked(local(checked["model"]))
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
