@@ -25,7 +25,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 20, "{line}");
+        assert_eq!(fields.len(), 21, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields
