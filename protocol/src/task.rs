@@ -154,6 +154,13 @@ impl Task {
         let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
             Err(format!("{setting}: expected {expected}, got {got}"))
         };
+        if !is_file_name(&self.name) {
+            return needs(
+                "name",
+                "1 to 64 letters, digits, - and _",
+                &format!("{:?}", self.name),
+            );
+        }
         if self.model.is_empty() != self.is_recorded() {
             let got = format!("{:?} and {:?}", self.model, self.states);
             return needs("model and states", "one of them", &got);
@@ -177,6 +184,12 @@ impl Task {
         }
         Ok(())
     }
+}
+
+/// Whether a name can be that of a file anywhere: 1 to 64 letters, digits, hyphens, underscores and dots within.
+pub fn is_file_name(name: &str) -> bool {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    (1..=64).contains(&name.len()) && name.bytes().all(is_plain) && !name.starts_with('.')
 }
 
 fn one() -> u32 {
@@ -214,6 +227,10 @@ mod tests {
         let height = "moves = 64\nheight = 3";
         check("jacksboro", "moves = 64", height, "height: expected none");
         check("small", "max_steps = 300", "max_steps = 0", "at least 1");
+        for name in ["", "../small", "a b", ".a", "/a"] {
+            let name = format!("name = {name:?}");
+            check("small", "name = \"small\"", &name, "name: expected 1 to 64");
+        }
         check("small", "end = 32", "end = 0", "test_seeds: expected 1 to");
     }
 

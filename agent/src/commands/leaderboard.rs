@@ -5,10 +5,11 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::report::added::read_csv;
 use emberwatch_agent::benchmark::report::leaderboard::{
-    About, Entry, draw_leaderboard, read_entries, render_page,
+    About, Entry, check_entries, draw_leaderboard, read_entries, render_page,
 };
 use emberwatch_agent::benchmark::report::suite::TaskRuns;
 use emberwatch_agent::file::{Readers, replace_file};
+use emberwatch_protocol::task::is_file_name;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -51,6 +52,7 @@ impl LeaderboardCommand {
             self.add(folder)?;
         }
         let entries = read_entries(&self.entries)?;
+        check_entries(&entries)?;
         let table = render_page(&entries);
         let page =
             std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
@@ -76,10 +78,22 @@ impl LeaderboardCommand {
             training_seconds: self.training_seconds,
         };
         ensure!(
-            about.training_seconds >= 0.0,
+            (0.0..1e12).contains(&about.training_seconds),
             "--training-seconds: expected 0 or more, got {}",
             about.training_seconds
         );
+        for (flag, text) in [
+            ("--policy", &about.policy),
+            ("--by", &about.by),
+            ("--code", &about.code),
+        ] {
+            let is_plain =
+                !text.contains(['|', '\n']) && (flag != "--policy" || is_file_name(text));
+            ensure!(
+                is_plain,
+                "{flag}: expected plain words on one line, and no path, got {text:?}"
+            );
+        }
         let files =
             std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
         let files = files
@@ -101,8 +115,13 @@ impl LeaderboardCommand {
             folder.display(),
             about.policy
         );
-        let path = self.entries.join(&about.policy).with_extension("csv");
-        Entry { about, tasks }.write(&path)
+        let path = self.entries.join(format!("{}.csv", about.policy));
+        let entry = Entry { about, tasks };
+        let mut entries = read_entries(&self.entries)?;
+        entries.retain(|other| other.about.policy != entry.about.policy);
+        entries.push(entry.clone());
+        check_entries(&entries)?;
+        entry.write(&path)
     }
 }
 

@@ -58,6 +58,13 @@ impl SuiteCommand {
         names
             .clone()
             .try_for_each(|name| Policy::check_name(name))?;
+        ensure!(
+            !self
+                .policies
+                .iter()
+                .any(|name| name.starts_with("clairvoyant")),
+            "--policies: expected none that is told the next states, as these act only in `compare`"
+        );
         let config = self.settings.effective()?;
         let tasks = if self.tasks.is_empty() {
             Task::built_in_names()
@@ -84,7 +91,7 @@ impl SuiteCommand {
 
     /// All runs of a task; those that are missing are made and added to its file, policy by policy.
     fn runs(&self, task: &Task, config: &AgentConfig) -> Result<TaskRuns> {
-        let path = self.out.join(&task.name).with_extension("csv");
+        let path = self.out.join(format!("{}.csv", task.name));
         let mut runs = if path.exists() {
             read_csv(&path).with_context(|| path.display().to_string())?
         } else {
@@ -95,13 +102,21 @@ impl SuiteCommand {
         let names = [FLOOR, CEILING]
             .into_iter()
             .chain(self.policies.iter().map(|name| &**name));
-        let missing: Vec<&str> = names
-            .filter(|name| {
-                can_run(name, task, &learned) && !is_done(&runs, name, &seeds, task.max_steps)
-            })
-            .collect();
+        let missing = names.filter(|name| !is_done(&runs, name, &seeds, task.max_steps));
+        let (missing, left): (Vec<&str>, Vec<&str>) =
+            missing.partition(|name| can_run(name, task, &learned));
+        if !left.is_empty() {
+            let (task, policies) = (&task.name, left.join(", "));
+            tracing::warn!("task {task}: without {policies}, which need a model or --checkpoints");
+        }
         if !missing.is_empty() {
             let (mut arena, _server) = self.open(task, &seeds)?;
+            let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
+            ensure!(
+                task.max_steps <= longest,
+                "max_steps: expected at most {longest}, as the shortest episode has, got {}",
+                task.max_steps
+            );
             for name in missing {
                 let comparison = Comparison {
                     policies: vec![Policy::named(name, arena.model())?],

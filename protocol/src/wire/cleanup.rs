@@ -100,8 +100,8 @@ impl ChannelFiles {
     fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
             let ids = self.ids(path);
-            // It may be of a port that grows now in another PID namespace, whose process cannot be checked.
-            let is_of_living = ids.iter().any(|id| used.ids.contains(id));
+            // Living ports may be making it now in another PID namespace, whose processes cannot be checked.
+            let is_of_living = !ids.is_empty() && ids.iter().all(|id| used.ids.contains(id));
             Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
     }
@@ -220,6 +220,30 @@ mod tests {
         };
         await_finished(&files, finish).expect("it is finished");
         std::fs::remove_file(&segment).expect("clean up");
+    }
+
+    #[test]
+    fn what_a_dead_process_did_not_finish_is_removed_though_the_other_side_lives() {
+        let files = ChannelFiles {
+            shared: std::env::temp_dir(),
+            ..files_of_test("half-dead")
+        };
+        let minutes = |n: u64| id(std::process::id(), Duration::from_secs(60 * n));
+        let (living, other, dead) = (minutes(1), minutes(2), id(NOBODY, Duration::ZERO));
+        let used = Used {
+            ids: [living, other].into(),
+            ..Used::default()
+        };
+        let connection = |from: u128, to: u128| {
+            let name = format!("{}{from}_{to}.connection", files.prefix);
+            files.shared.join(name)
+        };
+        let (left, grows) = (connection(living, dead), connection(living, other));
+        make(left.clone(), 0o200);
+        make(grows.clone(), 0o200);
+        assert_eq!(files.remove_unfinished(&used).expect("all is read"), 1);
+        assert!(!left.exists() && grows.exists());
+        std::fs::remove_file(&grows).expect("clean up");
     }
 
     #[test]

@@ -153,9 +153,6 @@ impl Row {
 }
 
 /// All entries of a folder, by the names of their files.
-///
-/// # Errors
-/// If an entry has other worlds or steps of a task than the random walk's.
 pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
     let files = std::fs::read_dir(folder)
         .with_context(|| format!("expected a folder of entries at {}", folder.display()))?;
@@ -166,20 +163,34 @@ pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
         .iter()
         .filter(|path| path.extension().is_some_and(|it| it == "csv"));
     let read = |path: &Path| Entry::read(path).with_context(|| format!("entry {}", path.display()));
-    let entries = files.map(|path| read(path)).collect::<Result<Vec<_>>>()?;
-    let floor = entries.iter().find(|entry| entry.about.policy == FLOOR);
-    let floor =
-        floor.with_context(|| format!("expected an entry of {FLOOR} in {}", folder.display()))?;
-    for entry in &entries {
-        for TaskRuns { task, .. } in &entry.tasks {
+    files.map(|path| read(path)).collect()
+}
+
+/// Refuses entries of other worlds or steps of a task than the random walk's, two of one policy, and a world twice.
+pub fn check_entries(entries: &[Entry]) -> Result<()> {
+    let mut names = entries.iter().map(|entry| &*entry.about.policy);
+    let floor = names.position(|name| name == FLOOR);
+    let floor = &entries[floor.with_context(|| format!("expected an entry of {FLOOR}"))?];
+    let mut known = BTreeSet::new();
+    for entry in entries {
+        let policy = &entry.about.policy;
+        ensure!(
+            known.insert(policy),
+            "entry {policy}: expected one file of it, got more"
+        );
+        for TaskRuns { task, runs } in &entry.tasks {
+            let worlds = entry.worlds(task);
             ensure!(
-                entry.worlds(task) == floor.worlds(task),
-                "entry {}: expected the worlds and steps of task {task} that {FLOOR} has",
-                entry.about.policy
+                worlds == floor.worlds(task),
+                "entry {policy}: expected the worlds and steps of task {task} that {FLOOR} has"
+            );
+            ensure!(
+                worlds.len() == runs.len(),
+                "entry {policy}: expected each world of task {task} once"
             );
         }
     }
-    Ok(entries)
+    Ok(())
 }
 
 /// The page: a row an entry, the best first, then each task's scores.

@@ -55,8 +55,9 @@ class ChannelFiles:
         ports, services = self._used(living)
         for path in self.unfinished():
             ids = self._ids(path)
-            # Memory of a port in another PID namespace, whose process cannot be seen, may grow now.
-            if not ids & ports and not any(map(_is_in_the_making, ids)):
+            # Living ports may be making it now in another PID namespace, which cannot be seen.
+            is_of_living = bool(ids) and ids <= ports
+            if not is_of_living and not any(map(_is_in_the_making, ids)):
                 _remove(path)
         for node in dead:
             identity = int(node.id.value)
