@@ -108,7 +108,7 @@ def test_a_checkpoint_brings_its_filter(tmp_path: Path) -> None:
     decide(spatial)
     known = make(checkpoint=checkpoint, estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
-    with fails("program", match="expected --checkpoint FILE of such a filter"):
+    with fails("program", match="expected --checkpoint FILE of such a belief"):
         make(estimator="learned_own_filter").reset()
     with fails("program", match="no file"):
         make(checkpoint=tmp_path / "no file").reset()
