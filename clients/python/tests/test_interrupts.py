@@ -31,9 +31,10 @@ import emberwatch
 from emberwatch import ports
 from emberwatch.wrappers import BeliefObservation
 
-#: An interrupt within the end of a generator is reported and dropped by Python itself.
+#: An interrupt within the end of a generator, or a callback of the garbage collector that a test's
+#: library brings, is reported and dropped by Python itself.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:Exception ignored in. <generator:pytest.PytestUnraisableExceptionWarning"
+    "ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning"
 )
 
 PATH = ("frame", "robot", "age", "belief")
