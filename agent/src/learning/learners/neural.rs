@@ -27,6 +27,7 @@ use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use emberwatch_protocol::{Move, path};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
@@ -144,10 +145,10 @@ impl NeuralLearner {
         let shape = self.worlds.shape;
         if saved.shape == shape {
             saved.check_worlds()?;
-            self.replay.resume(saved.replay);
+            self.replay.resume(saved.replay.into_owned());
             (self.left, self.earned) = (saved.worlds, saved.earned);
         }
-        (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
+        (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
         Ok(())
     }
 }
@@ -310,17 +311,16 @@ impl Learner for NeuralLearner {
         let runs = self.runs.iter();
         let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
-        // As `SavedNeural`, without a copy of the replay.
-        let state = (
-            self.worlds.shape,
-            self.worlds.n_observations,
-            self.n_updates(),
-            self.world_steps,
-            self.earned,
-            &self.reward,
-            &self.replay,
+        let state = SavedNeural {
+            shape: self.worlds.shape,
+            n_observations: self.worlds.n_observations,
+            n_updates: self.n_updates(),
+            world_steps: self.world_steps,
+            earned: self.earned,
+            reward: Cow::Borrowed(&self.reward),
+            replay: Cow::Borrowed(&self.replay),
             worlds,
-        );
+        };
         Ok(Contents::new(self.network.named_tensors()?, &state))
     }
 

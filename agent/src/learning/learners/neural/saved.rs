@@ -14,6 +14,7 @@ use emberwatch_protocol::Shape;
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::model::MAX_VALUES;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// More updates than a step of all worlds earns.
@@ -29,7 +30,7 @@ pub struct NeuralModel {
 
 /// All of a checkpoint of a neural belief but the tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct SavedNeural {
+pub struct SavedNeural<'a> {
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
@@ -37,8 +38,8 @@ pub struct SavedNeural {
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
     pub(super) earned: f64,
-    pub(super) reward: RewardEstimate,
-    pub(super) replay: Replay,
+    pub(super) reward: Cow<'a, RewardEstimate>,
+    pub(super) replay: Cow<'a, Replay>,
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
@@ -80,7 +81,7 @@ pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelie
     Ok(NeuralBelief::new(n_observations, 0, device)?)
 }
 
-impl SavedNeural {
+impl SavedNeural<'_> {
     /// Loads the network; refuses what does not fit.
     pub(super) fn load_into(&self, network: &mut NeuralBelief, contents: &Contents) -> Result<()> {
         check_counts(&[
