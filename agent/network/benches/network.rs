@@ -123,6 +123,7 @@ fn neural_belief(c: &mut Criterion) {
             lessons.push(Lesson {
                 before: before.clone(),
                 frame: frame.clone(),
+                base: Vec::new(),
             });
         }
         for (cell, value) in frame {
@@ -136,7 +137,7 @@ fn neural_belief(c: &mut Criterion) {
         b.iter(|| network.update(2e-3, &lessons).expect("finite"));
     });
     group.bench_function("prediction", |b| {
-        b.iter(|| network.predict(&before).expect("a prediction"));
+        b.iter(|| network.predict(&before, None).expect("a prediction"));
     });
     group.finish();
 }

@@ -41,7 +41,8 @@ pub fn learner(
             })
         }
         LearnerKind::Neural => {
-            let learner = NeuralLearner::new(contents, worlds, config, &spec.device);
+            let filter = spec.learned.filter.as_ref();
+            let learner = NeuralLearner::new(contents, filter, worlds, config, &spec.device);
             Box::new(learner.with_context(of_file)?)
         }
         LearnerKind::Autoencoder => {
