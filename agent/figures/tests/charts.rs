@@ -127,7 +127,7 @@ fn names_are_escaped_and_shortened() {
 fn extreme_values_are_drawn_or_left_out() {
     for value in EXTREME {
         let mut other = bar("error", 2.0);
-        (other.error, other.worlds) = (Some(value), vec![(1, value), (2, 1.0)]);
+        (other.ends, other.worlds) = (Some([0.0, 2.0 * value]), vec![(1, value), (2, 1.0)]);
         check(&ladder(vec![bar("value", value), other, bar("usual", 3.0)]).svg());
         for scale in [Scale::Linear, Scale::Logarithmic] {
             let mut curve = Curve::new("extreme", vec![(0.0, value), (value, 1.0), (5.0, 2.0)]);
