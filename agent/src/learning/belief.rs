@@ -150,7 +150,9 @@ impl SavedBelief {
                 check_target(*target, *n_observations)?;
                 let mut network = new_network(*n_observations, device)?;
                 network.set_parameters(&find)?;
-                let filter = filter.as_ref().map(|it| it.read_corrected(*n_observations, &find));
+                let filter = filter
+                    .as_ref()
+                    .map(|it| it.read_corrected(*n_observations, &find));
                 LearnedBelief::Neural(NeuralModel {
                     network,
                     target: *target,
