@@ -260,9 +260,8 @@ class Client:
             waited = time.monotonic() - start
             check(not is_gone and waited < TIMEOUT, "an answer", f"none after {waited} s")
             if waited > 100e-6:
+                # Drains it, too.
                 self._listener.timed_wait(iox2.Duration.from_millis(50))
-                while self._listener.try_wait() is not None:
-                    pass
                 watched = [] if self._process is None else [self._process]
                 is_gone = bool(select.select(watched, [], [], 0)[0])
 

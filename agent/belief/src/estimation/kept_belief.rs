@@ -1,0 +1,149 @@
+//! Simulated first beliefs of earlier runs, kept in the user's cache folder: a file each, of the key, the probabilities
+//! and a checksum. Where anything is wrong with a file or the folder, the belief is simulated again.
+
+use crate::estimation::belief::Belief;
+use crate::estimation::prior::Prior;
+use emberwatch_protocol::grid::{Probabilities, Shape};
+use emberwatch_protocol::model::Model;
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// Most files that are kept.
+const MAX_FILES: usize = 32;
+
+/// Most bytes of a file: a belief about 512 x 512 cells in four states.
+const MAX_BYTES: usize = 4 << 20;
+
+const CHECKSUM_BYTES: usize = 4;
+
+/// Where a prior is kept.
+#[derive(Debug)]
+pub struct KeptBelief {
+    path: PathBuf,
+    /// All that the belief depends on, as text.
+    key: String,
+    /// S, H and W.
+    dim: (usize, usize, usize),
+}
+
+impl KeptBelief {
+    /// `None` if there is no cache folder, or the belief is too large for it.
+    pub fn new(prior: Prior, model: &Model, shape: Shape, seed: u64) -> Option<Self> {
+        let version = env!("CARGO_PKG_VERSION");
+        let file = toml::to_string(model.file()).expect("invariant: model files serialise");
+        let key = format!("emberwatch {version}: {prior:?}, {shape}, seed {seed}\n{file}\n");
+        let dim = (model.n_states(), shape.height(), shape.width());
+        let name = format!("{:08x}.belief", crc32fast::hash(key.as_bytes()));
+        let path = cache_folder()?.join("emberwatch/beliefs").join(name);
+        let kept = Self { path, key, dim };
+        (kept.n_bytes() <= MAX_BYTES).then_some(kept)
+    }
+
+    /// The belief, if it was kept.
+    pub fn read(&self) -> Option<Belief> {
+        let found = self.path.metadata().ok()?;
+        // Nothing is read of a file of another length, or of what is no file.
+        if !found.is_file() || found.len() != self.n_bytes() as u64 {
+            return None;
+        }
+        let bytes = std::fs::read(&self.path).ok()?;
+        let (content, checksum) = bytes.split_last_chunk::<CHECKSUM_BYTES>()?;
+        if crc32fast::hash(content) != u32::from_le_bytes(*checksum) {
+            return None;
+        }
+        let values = content.strip_prefix(self.key.as_bytes())?;
+        let values = values.as_chunks().0.iter().copied().map(f32::from_le_bytes);
+        let values = Probabilities::from_shape_vec(self.dim, values.collect()).ok()?;
+        Belief::from_probabilities(values).ok()
+    }
+
+    /// Keeps the belief for later runs; the oldest go where there are too many.
+    ///
+    /// # Errors
+    /// If the system does not let it write there.
+    pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
+        let mut bytes = self.key.clone().into_bytes();
+        let values = belief.probabilities().iter();
+        bytes.extend(values.flat_map(|value| value.to_le_bytes()));
+        bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+        let folder = self.path.parent().unwrap_or(Path::new("/"));
+        std::fs::create_dir_all(folder)?;
+        replace(&self.path, &bytes)?;
+        remove_oldest(folder, MAX_FILES);
+        Ok(())
+    }
+
+    fn n_bytes(&self) -> usize {
+        let (n_states, height, width) = self.dim;
+        self.key.len() + n_states * height * width * size_of::<f32>() + CHECKSUM_BYTES
+    }
+}
+
+/// `XDG_CACHE_HOME`, or `.cache` in the home folder; relative paths do not count.
+fn cache_folder() -> Option<PathBuf> {
+    let folder = |name| std::env::var_os(name).map(PathBuf::from);
+    let is_absolute = |path: &PathBuf| path.is_absolute();
+    let of_home = || folder("HOME").map(|home| home.join(".cache"));
+    folder("XDG_CACHE_HOME")
+        .filter(is_absolute)
+        .or_else(|| of_home().filter(is_absolute))
+}
+
+/// Writes a file of the user alone beside the path and renames it; a checksum in it finds what a crash leaves.
+fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let beside = path.with_extension(std::process::id().to_string());
+    // What an earlier process of this number left may have other readers.
+    let _ = std::fs::remove_file(&beside);
+    let opened = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(&beside);
+    let written = opened
+        .and_then(|mut file| file.write_all(bytes))
+        .and_then(|()| std::fs::rename(&beside, path));
+    if written.is_err() {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&beside);
+    }
+    written
+}
+
+fn remove_oldest(folder: &Path, most: usize) {
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return;
+    };
+    let age = |entry: std::io::Result<std::fs::DirEntry>| {
+        let path = entry.ok()?.path();
+        let changed = path.metadata().and_then(|found| found.modified());
+        Some((changed.unwrap_or(SystemTime::UNIX_EPOCH), path))
+    };
+    let mut files: Vec<_> = entries.filter_map(age).collect();
+    files.sort();
+    let n_too_many = files.len().saturating_sub(most);
+    for (_, path) in &files[..n_too_many] {
+        // Another agent may have removed it.
+        let _ = std::fs::remove_file(path);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_files_go() {
+        let folder = tempfile::TempDir::new().expect("a folder");
+        for (name, seconds) in [("a", 20), ("b", 10), ("c", 30)] {
+            let file = std::fs::File::create(folder.path().join(name)).expect("a file");
+            let changed = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(seconds);
+            file.set_modified(changed).expect("a time");
+        }
+        remove_oldest(folder.path(), 2);
+        let is_there = |name| folder.path().join(name).exists();
+        assert_eq!(["a", "b", "c"].map(is_there), [true, false, true]);
+    }
+}
