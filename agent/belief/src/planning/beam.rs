@@ -10,7 +10,7 @@ use crate::planning::reach::Reach;
 use emberwatch_protocol::path::Move;
 use emberwatch_protocol::randomness::split_mix;
 
-/// Key of the hash values that stand for cells: the word `beam` in ASCII.
+/// Key of the hash values that stand for cells, unless told otherwise: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
 /// The default width. With the known-model filter a width of 100 earned 37.2 +- 2.2 per step on 40
@@ -23,6 +23,7 @@ pub const DEFAULT_WIDTH: usize = 50;
 #[derive(Debug)]
 pub struct BeamSearch {
     width: usize,
+    hash_key: u64,
     /// Worth of a move's cell beside that of the move before it.
     discount: f32,
     /// Worth of the next move's cell: a power of the discount.
@@ -80,6 +81,7 @@ impl BeamSearch {
         assert!(width > 0, "beam search: expected a width of at least one");
         Self {
             width,
+            hash_key: HASH_KEY,
             discount: 1.0,
             weight: 1.0,
             reach: Reach::default(),
@@ -93,6 +95,12 @@ impl BeamSearch {
             seen: SeenStates::new(4 * width),
             history: Vec::new(),
         }
+    }
+
+    /// Breaks ties in another way for each key.
+    pub fn set_key(&mut self, key: u64) {
+        self.hash_key = key;
+        self.cell_hashes.clear();
     }
 
     /// Makes each move's cell worth `discount` times as much as that of the move before it; 1 at first.
@@ -123,7 +131,7 @@ impl BeamSearch {
         let known = self.cell_hashes.len() as u64;
         let missing = known..(n_cells as u64).max(known);
         self.cell_hashes
-            .extend(missing.map(|index| split_mix(HASH_KEY, index)));
+            .extend(missing.map(|index| split_mix(self.hash_key, index)));
     }
 
     /// Makes the start the only state of the beam.
