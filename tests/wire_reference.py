@@ -42,21 +42,24 @@ BYTES: Any = iox2.Slice[ctypes.c_uint8]
 LAYOUTS = {
     "StepRequest": (
         "=IIQQIIIIQQ",
-        "version operation lease sequence first_robot n_robots n_moves flags low high",
+        "version operation lease sequence first_robot n_robots n_moves flags listener_low "
+        "listener_high",
     ),
     "StepReply": (
         "=IIQIIIIIIQQ",
-        "version status sequence first_robot n_robots n_worlds flags height width nanos detail",
+        "version status sequence first_robot n_robots n_worlds flags height width "
+        "simulation_nanos detail",
     ),
     "WorldResult": (
         "=QQQdQQIIIHH",
-        "step seed episode reward hovered late n_targets n_visited n_hits terminated truncated",
+        "step seed episode reward hovered late n_target_cells n_visited n_hits terminated "
+        "truncated",
     ),
     "RobotResult": (
         "=ddIIIIIIII",
         "reward marginal n_visited n_hits start_row start_col row col coverage n_moves",
     ),
-    "ControlRequest": ("=IIQQQ", "version reserved sequence low high"),
+    "ControlRequest": ("=IIQQQ", "version reserved sequence listener_low listener_high"),
     "ControlReply": ("=IIQ", "version status sequence"),
 }
 

@@ -12,7 +12,7 @@ PACKAGE = Path(emberwatch.__file__).parent
 def modules() -> dict[str, Path]:
     """The package's modules by name."""
     names = {}
-    for path in PACKAGE.rglob("*.py"):
+    for path in (*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.pyi")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
         names[".".join(parts).removesuffix(".__init__")] = path
     return names

@@ -1,4 +1,4 @@
-"""Beam search in NumPy."""
+"""Beam search: the best paths, and the refusal of what makes no sense."""
 
 from itertools import product
 from typing import Any
@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.moves import DIRECTIONS
 from emberwatch.planning import beam_search
-from emberwatch.view import DIRECTIONS
 
 RNG = np.random.default_rng(3)
 
@@ -37,6 +37,17 @@ def test_visited_cells_are_worth_nothing() -> None:
     values[0, 1, 2], values[0, 0, 1], visited[0, 1, 2] = 9.0, 1.0, 255
     paths = beam_search(values, np.array([(1, 1)]), 1, rng=RNG, visited=visited)
     assert paths.tolist() == [[0]]
+
+
+def test_the_generator_breaks_ties() -> None:
+    values, robots = np.ones((40, 9, 9)), np.full((40, 2), 4)
+    first, again, other = (
+        beam_search(values, robots, 3, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    # Up, down, left and right are alike.
+    counts = np.bincount(np.concatenate((first, other))[:, 0], minlength=4)
+    assert counts.min() >= 5, counts
 
 
 def test_small_integers_are_cells_too() -> None:

@@ -21,13 +21,13 @@ from emberwatch.errors import (
     bad_answer,
     invalid,
 )
+from emberwatch.moves import fly
 from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
 from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings
-from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
 #: Exit code of an agent whose lease was lost.

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.moves import DIRECTIONS
 from emberwatch.settings import WorldSpec
-from emberwatch.view import DIRECTIONS
 
 
 class Flights:

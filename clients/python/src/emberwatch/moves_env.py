@@ -14,11 +14,11 @@ from emberwatch import wire
 from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.flights import Flights
+from emberwatch.moves import fly
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
-from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
 _FIRST: Final = np.zeros(1, np.intp)

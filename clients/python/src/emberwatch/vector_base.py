@@ -26,11 +26,12 @@ from emberwatch.base import (
     wants_to_resume,
 )
 from emberwatch.errors import invalid
+from emberwatch.moves import fly
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.owner import SessionOwner
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
-from emberwatch.view import View, fly
+from emberwatch.view import View
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
