@@ -3,7 +3,7 @@
 They need no model: only which state is the target, and for two of them the hidden states.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -64,5 +64,11 @@ class MeritTally:
 
     def merit(self, world: int) -> Merit:
         """The figures of one world's steps so far."""
-        names = (field.name for field in fields(Merit))
-        return Merit(**dict(zip(names, self._tally.merit(world), strict=True)))
+        detected, n_burning, seen, distance, grid_seen = self._tally.merit(world)
+        return Merit(
+            steps_to_detection=detected,
+            burning_cells_at_detection=n_burning,
+            burning_seen_share=seen,
+            front_distance=distance,
+            grid_seen_share=grid_seen,
+        )
