@@ -1,11 +1,11 @@
 //! Why a channel could not be opened or used.
 
-use iceoryx2::prelude::ipc;
+use iceoryx2::service::ipc_threadsafe;
 use std::time::Duration;
 use thiserror::Error;
 
-/// iceoryx2's inter-process flavour.
-pub type Ipc = ipc::Service;
+/// iceoryx2's inter-process flavour whose ports may move between threads.
+pub type Ipc = ipc_threadsafe::Service;
 
 /// Why a channel could not be opened or used.
 #[derive(Debug, Error)]
@@ -90,6 +90,9 @@ pub enum ChannelError {
         /// How many the process may have.
         limit: String,
     },
+    /// The check of [`super::interrupt::interrupt_when`] ended a wait.
+    #[error("interrupted")]
+    Interrupted,
     /// iceoryx2 refused.
     #[error("{what}: iceoryx2 says {problem}")]
     Ipc {

@@ -1,6 +1,7 @@
 //! The variable parts of steps and frames: from bytes to results, frames and paths, and back.
 
 use super::channels::MAX_ROBOTS;
+use super::control::ServerInfo;
 use super::message::{FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult};
 use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
@@ -35,6 +36,30 @@ pub struct RobotSample<'a> {
     pub frame: &'a [u8],
     /// The path that it flew, one byte a move; empty if it did not fly.
     pub path: &'a [u8],
+}
+
+impl StepParts<'_> {
+    /// Checks the results: no robot stayed that a world does not have, and paths are whole.
+    pub(crate) fn check(&self, info: &ServerInfo) -> Result<(), String> {
+        let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
+        let all = u64::MAX >> (MAX_ROBOTS - n_robots);
+        let stayed = |world: &WorldResult| world.hovered | world.late;
+        if let Some(world) = self.worlds.iter().find(|it| stayed(it) > all) {
+            let got = stayed(world);
+            return Err(format!(
+                "robots that stayed: expected bits below {n_robots}, got {got:#x}"
+            ));
+        }
+        let is_whole = |n_moves: usize| n_moves == 0 || n_moves == info.n_moves;
+        let mut paths = self.robots.iter().map(|robot| robot.n_moves as usize);
+        match paths.find(|&n_moves| !is_whole(n_moves)) {
+            Some(got) => Err(format!(
+                "n_moves: expected 0 or {}, got {got}",
+                info.n_moves
+            )),
+            None => Ok(()),
+        }
+    }
 }
 
 /// Splits the payload of a step answer.
