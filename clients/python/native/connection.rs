@@ -5,9 +5,7 @@ use crate::owned::Owned;
 use emberwatch_protocol::Decider;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::{Connection, ConnectionError};
-use emberwatch_protocol::frame::UNOBSERVED;
 use emberwatch_protocol::message::{StepReply, StepRequest};
-use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use std::time::Duration;
@@ -82,7 +80,7 @@ impl Server {
             flags,
             ..StepRequest::default()
         };
-        let step = |wire: &mut Connection| step_checked(wire, request, body, duration(seconds));
+        let step = |wire: &mut Connection| wire.step_payload(request, body, duration(seconds));
         let answer = self.wire.with(py, step)?;
         answered(py, answer, seconds)
     }
@@ -122,32 +120,6 @@ impl Agent {
     fn close(&self, py: Python<'_>) {
         self.wire.close(py);
     }
-}
-
-/// A step whose frames hold observations and nothing else.
-pub fn step_checked(
-    wire: &mut Connection,
-    request: StepRequest,
-    body: &[u8],
-    timeout: Duration,
-) -> Result<(StepReply, Vec<u8>), ConnectionError> {
-    let (reply, payload) = wire.step_payload(request, body, timeout)?;
-    let head = reply.n_worlds as usize * WORLD_BYTES + reply.n_robots as usize * ROBOT_BYTES;
-    // 255 becomes 0, observation o becomes o + 1: one maximum checks all.
-    let values = payload[head..].iter();
-    let highest = values.fold(0, |most: u8, value| most.max(value.wrapping_add(1)));
-    let n_observations = wire.info().n_observations;
-    if usize::from(highest) > n_observations {
-        let got = highest - 1;
-        let problem = format!(
-            "frame: expected observations below {n_observations} or {UNOBSERVED}, got {got}"
-        );
-        return Err(ConnectionError::Garbled {
-            what: "step",
-            problem,
-        });
-    }
-    Ok((reply, payload))
 }
 
 /// What Python gets of an answer.

@@ -1,6 +1,6 @@
 //! A lease: the right to fly consecutive robots, and the step k for which each world's next path is.
 
-use crate::connection::{Answer, Server, answered, duration, step_checked};
+use crate::connection::{Answer, Server, answered, duration};
 use crate::moves;
 use emberwatch_protocol::connection::{Connection, ConnectionError, worlds_of};
 use emberwatch_protocol::message::{Operation, StepReply, StepRequest, WorldResult};
@@ -130,7 +130,7 @@ impl Lease {
             let steps: Vec<u64> = worlds.clone().map(of).collect();
             write_step_body(&steps, moves, &mut body);
         }
-        let (reply, payload) = step_checked(wire, request, &body, duration(seconds))?;
+        let (reply, payload) = wire.step_payload(request, &body, duration(seconds))?;
         for (world, result) in worlds.clone().zip(payload.chunks_exact(WORLD_BYTES)) {
             let result: WorldResult = bytemuck::pod_read_unaligned(result);
             self.note(world, result.step);

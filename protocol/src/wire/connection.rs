@@ -170,8 +170,8 @@ impl Connection {
         })
     }
 
-    /// As [`Self::step`]; the answer's header, and its payload as it came: results of the worlds, results of the robots,
-    /// and frames, whose values are not checked.
+    /// As [`Self::step`]; the answer's header, and its payload as it came, checked: results of the worlds, results of the
+    /// robots, and frames.
     ///
     /// # Errors
     /// As [`Self::step`].

@@ -3,6 +3,7 @@
 use super::channels::MAX_ROBOTS;
 use super::control::ServerInfo;
 use super::message::{FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult};
+use crate::model::frame::UNOBSERVED;
 use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
 use bytemuck::AnyBitPattern;
@@ -39,26 +40,31 @@ pub struct RobotSample<'a> {
 }
 
 impl StepParts<'_> {
-    /// Checks the results: no robot stayed that a world does not have, and paths are whole.
+    /// Checks the values: no robot stayed that a world does not have, paths are whole, and frames hold observations.
     pub(crate) fn check(&self, info: &ServerInfo) -> Result<(), String> {
         let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
-        let all = u64::MAX >> (MAX_ROBOTS - n_robots);
-        let stayed = |world: &WorldResult| world.hovered | world.late;
-        if let Some(world) = self.worlds.iter().find(|it| stayed(it) > all) {
-            let got = stayed(world);
+        let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
+        let stayed = stayed.max().unwrap_or_default();
+        if stayed > u64::MAX >> (MAX_ROBOTS - n_robots) {
             return Err(format!(
-                "robots that stayed: expected bits below {n_robots}, got {got:#x}"
+                "robots that stayed: expected bits below {n_robots}, got {stayed:#x}"
             ));
         }
-        let is_whole = |n_moves: usize| n_moves == 0 || n_moves == info.n_moves;
         let mut paths = self.robots.iter().map(|robot| robot.n_moves as usize);
-        match paths.find(|&n_moves| !is_whole(n_moves)) {
-            Some(got) => Err(format!(
-                "n_moves: expected 0 or {}, got {got}",
-                info.n_moves
-            )),
-            None => Ok(()),
+        if let Some(got) = paths.find(|&n_moves| n_moves != 0 && n_moves != info.n_moves) {
+            let expected = info.n_moves;
+            return Err(format!("n_moves: expected 0 or {expected}, got {got}"));
         }
+        // 255 becomes 0, observation o becomes o + 1: one maximum, of many values at once, checks all.
+        let values = self.frames.iter().map(|value| value.wrapping_add(1));
+        let highest = values.fold(0, u8::max);
+        if usize::from(highest) > info.n_observations {
+            let (n, got) = (info.n_observations, highest - 1);
+            return Err(format!(
+                "frame: expected observations below {n} or {UNOBSERVED}, got {got}"
+            ));
+        }
+        Ok(())
     }
 }
 
