@@ -1,6 +1,6 @@
-//! The package's errors.
+//! Errors of arguments that make no sense.
 
-use pyo3::call::PyCallArgs;
+use crate::errors::error;
 use pyo3::prelude::*;
 use std::fmt::Display;
 
@@ -11,18 +11,11 @@ pub fn invalid(
     expected: impl Display,
     got: impl Display,
 ) -> PyErr {
-    let problem = format!("{subject}: expected {expected}, got {got}");
-    raised(py, "InvalidArgumentError", (problem,))
+    let words = (subject.to_string(), expected.to_string(), got.to_string());
+    error(py, "invalid", words)
 }
 
 /// An `EmberwatchError` with a code.
 pub fn failed(py: Python<'_>, problem: &str, code: &str) -> PyErr {
-    raised(py, "EmberwatchError", (problem, code))
-}
-
-fn raised<'py>(py: Python<'py>, class: &str, arguments: impl PyCallArgs<'py>) -> PyErr {
-    let made = py
-        .import("emberwatch.errors")
-        .and_then(|errors| errors.getattr(class)?.call1(arguments));
-    made.map_or_else(|error| error, PyErr::from_value)
+    error(py, "EmberwatchError", (problem, code))
 }

@@ -171,13 +171,12 @@ class WildfireEnv(WorldEnv):
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
                 as after Ctrl-C: reset or resume. Nothing is sent.
         """
-        moves = as_moves(action, 1, self._spec.n_moves)
         self._session.begin_step()
-        self._answer = answer = self._session.step(moves)
+        self._answer = answer = self._session.step(action)
         self._update(self._observations, answer)
         result = answer.result()
         if self.render_mode is not None:
-            self._trace(result.robot, moves.reshape(-1))
+            self._trace(result.robot, as_moves(action, 1, self._spec.n_moves).reshape(-1))
         observation, info = self._seen(answer, result)
         reward, world = paid(result, self._pays), result.world
         self._session.finish()

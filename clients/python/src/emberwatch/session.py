@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.client import Client, connect
@@ -27,7 +27,7 @@ from emberwatch.errors import (
 )
 from emberwatch.lease import Lease
 from emberwatch.observer import Newest, Truth, TruthReader
-from emberwatch.ports import RESET_TIMEOUT
+from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.wire import StepAnswer, WorldResult
@@ -157,8 +157,8 @@ class Session:
                 raise
         return self._begin(indices, seeds)
 
-    def step(self, moves: NDArray[np.uint8], rows: range | None = None) -> StepAnswer:
-        """Flies checked paths with all robots, or with those of some consecutive worlds.
+    def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
+        """Flies paths with all robots, or with those of some consecutive worlds.
 
         Slow teammates are waited for, without end while the server lives. A path that came too
         late for them is given up, and the answer is how the world stands.
@@ -170,7 +170,7 @@ class Session:
         timeout = self.settings.timeout + lease.client.info.deadline_millis / 1000
         while True:
             try:
-                answer = lease.step_moves(moves, robots, timeout=timeout)
+                answer = lease.step(paths, robots=robots, timeout=timeout)
                 self._has_moved = True
                 return answer
             except (LeaseLostError, ServerGoneError) as error:
@@ -181,7 +181,7 @@ class Session:
                 if error.code != "timeout" and not is_late:
                     self._refused(error)
                     raise
-            before = int(lease.steps_of(robots)[0])
+            before = lease.steps_of(robots)[0]
             answer = self._look(lease, robots)
             n_moved = int(answer.worlds["step"][0]) - before
             if n_moved > 0:

@@ -13,7 +13,7 @@ import numpy as np
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import local, utf8
-from emberwatch.ports import STEP_TIMEOUT
+from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
 from emberwatch.wire import Shape
@@ -176,7 +176,7 @@ class WorldSpec:
 
     @property
     def shape(self) -> Shape:
-        return Shape(self.n_robots, self.n_moves, self.n_observations)
+        return Shape(self.n_robots, self.height, self.width)
 
 
 def draw_seed(generator: np.random.Generator) -> int:

@@ -1,0 +1,35 @@
+//! Moves that a caller hands in: arrays of integers, which become bytes.
+
+use emberwatch_protocol::path::check_moves;
+use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+
+/// Checks paths of `n_moves` moves for `n_robots` robots. Others than plain arrays of usual integers, and wrong ones,
+/// go to `emberwatch/arguments.py`, which says what is wrong.
+pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyResult<Vec<u8>> {
+    let expected = (n_robots, n_moves);
+    let fast = read::<i64>(given, expected, |value| {
+        u8::try_from(value).unwrap_or(u8::MAX)
+    });
+    let fast = fast.or_else(|| read::<u8>(given, expected, |value| value));
+    if let Some(moves) = fast.filter(|moves| check_moves(moves).is_ok()) {
+        return Ok(moves);
+    }
+    let module = given.py().import("emberwatch.arguments")?;
+    let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
+    Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
+}
+
+fn read<T: Element + Copy>(
+    given: &Bound<'_, PyAny>,
+    (n_robots, n_moves): (usize, usize),
+    byte: impl Fn(T) -> u8,
+) -> Option<Vec<u8>> {
+    let array: PyReadonlyArrayDyn<'_, T> = given.extract().ok()?;
+    let shape = array.shape();
+    let fits = shape == [n_robots, n_moves] || n_robots == 1 && shape == [n_moves];
+    fits.then(|| match array.as_slice() {
+        Ok(moves) => moves.iter().map(|&value| byte(value)).collect(),
+        Err(_) => array.as_array().iter().map(|&value| byte(value)).collect(),
+    })
+}
