@@ -66,8 +66,14 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
             let expected = "1 to 64 characters out of A-Z a-z 0-9 - _";
             error(py, "invalid", ("instance", expected, format!("'{name}'")))
         }
-        ChannelError::NoServer { .. } | ChannelError::NoAgent { .. } => {
+        ChannelError::NoServer { instance } => {
+            let remedy = format!("start one with `emberwatch-server --instance {instance}`");
+            let text = format!("no server on instance '{instance}': {remedy}");
             error(py, "NoServerError", (text,))
+        }
+        ChannelError::NoAgent { .. } => error(py, "NoServerError", (text,)),
+        ChannelError::OtherVersion { version } => {
+            error(py, "EmberwatchError", (text, "version_mismatch", version))
         }
         ChannelError::OtherPidNamespace { .. } => {
             error(py, "EmberwatchError", (text, "pid_namespace"))

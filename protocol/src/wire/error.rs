@@ -1,5 +1,6 @@
 //! Why a channel could not be opened or used.
 
+use super::message::VERSION;
 use iceoryx2::service::ipc_threadsafe;
 use std::time::Duration;
 use thiserror::Error;
@@ -41,6 +42,15 @@ pub enum ChannelError {
     NoServer {
         /// Name of the instance.
         instance: String,
+    },
+    /// A server runs on the instance, but it speaks another version of the protocol.
+    #[error(
+        "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of one \
+         release"
+    )]
+    OtherVersion {
+        /// What the server speaks.
+        version: u32,
     },
     /// No agent takes decisions for the world.
     #[error(

@@ -199,6 +199,42 @@ mod tests {
     }
 
     #[test]
+    fn values_that_cannot_be_are_refused() {
+        let info = serde_json::from_str(
+            r#"{"protocol": 2, "build": "", "pid": 1, "height": 1, "width": 3, "n_moves": 4, "n_worlds": 1, "n_robots": 2,
+            "n_observations": 3, "observations": [], "model": null, "burn_in": 0, "max_steps": 0, "max_clients": 16,
+            "coverage": "path", "publish_truth": false, "lease_millis": 1, "deadline_millis": 0, "recorded_world": null,
+            "task": null}"#,
+        )
+        .expect("what a server says of itself");
+        let problem = |stayed: u64, n_moves: u32, value: u8| {
+            let world = WorldResult {
+                hovered: stayed,
+                ..WorldResult::default()
+            };
+            let robot = RobotResult {
+                n_moves,
+                ..RobotResult::default()
+            };
+            let parts = StepParts {
+                worlds: vec![world],
+                robots: vec![RobotResult::default(), robot],
+                frames: &[255, 0, value],
+            };
+            parts.check(&info).err().unwrap_or_default()
+        };
+        for good in [problem(0, 4, 2), problem(3, 0, 255)] {
+            assert_eq!(good, "");
+        }
+        assert!(problem(4, 0, 0).contains("expected bits below 2, got 0x4"));
+        assert!(problem(0, 3, 0).contains("n_moves: expected 0 or 4, got 3"));
+        for value in [3, 254] {
+            let words = format!("expected observations below 3 or 255, got {value}");
+            assert!(problem(0, 0, value).contains(&words), "{words}");
+        }
+    }
+
+    #[test]
     fn a_sample_gives_each_robot_its_frame_and_path() {
         let header = FrameHeader {
             n_robots: 2,

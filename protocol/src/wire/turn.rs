@@ -229,4 +229,42 @@ mod tests {
         );
         std::fs::remove_file(&path).expect("clean up");
     }
+
+    #[test]
+    fn a_turn_ends_though_a_copy_of_its_file_stays_open() {
+        let turn = Turn::take().expect("a turn");
+        let copy = turn.lock.as_ref().map(|lock| lock.try_clone());
+        let copy = copy.expect("it is alone").expect("a copy, as a child has");
+        drop(turn);
+        let path = own_channel_directory().expect("it is there").join(LOCK);
+        let next = wait(&path, Duration::from_secs(5), || Ok(())).expect("it is free");
+        assert!(next.is_some());
+        drop(copy);
+    }
+
+    #[test]
+    fn a_wait_for_a_turn_is_interrupted() {
+        let path = std::env::temp_dir().join(format!("emberwatch-wait-{}", std::process::id()));
+        let held = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
+        let refusal = wait(&path, LONGEST_WAIT, || Err(ChannelError::Interrupted));
+        assert!(matches!(refusal, Err(ChannelError::Interrupted)));
+        drop(held);
+        std::fs::remove_file(&path).expect("clean up");
+    }
+
+    #[test]
+    fn a_fork_waits_for_the_turns_of_other_threads_and_they_for_it() {
+        before_fork();
+        let (sender, receiver) = std::sync::mpsc::channel();
+        std::thread::scope(|scope| {
+            scope.spawn(move || {
+                let _turn = Turn::take().expect("a turn");
+                sender.send(()).expect("the test waits");
+            });
+            let waited = receiver.recv_timeout(Duration::from_millis(50));
+            after_fork();
+            assert!(waited.is_err(), "it has a turn during the fork");
+            receiver.recv().expect("its turn comes after the fork");
+        });
+    }
 }
