@@ -3,6 +3,7 @@
 mod belief;
 mod connection;
 mod errors;
+mod flights;
 mod lease;
 mod merit;
 mod model;
@@ -43,6 +44,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
     module.add_class::<connection::Server>()?;
     module.add_class::<connection::Agent>()?;
+    module.add_class::<flights::Flights>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Frames>()?;
     module.add_class::<reader::Truths>()?;

@@ -59,6 +59,52 @@ class Agent:
     def close(self) -> None:
         """Closes it. May be called again."""
 
+class Flights:
+    """The present path of each robot, as far as it is flown. Rows are robots.
+
+    With `reward`, each cell pays when it is first visited, what its hidden state pays. A copy or
+    pickle is as new.
+    """
+
+    def __init__(
+        self, n_rows: int, height: int, width: int, n_moves: int, reward: list[float] | None
+    ) -> None: ...
+    @property
+    def robots(self) -> NDArray[np.int64]:
+        """Row and column of each robot; a new array, as the others."""
+
+    @property
+    def n_made(self) -> NDArray[np.int64]:
+        """Number of moves made."""
+
+    @property
+    def visited(self) -> NDArray[np.uint8]:
+        """255 in the cells visited, else 0."""
+
+    @property
+    def paid(self) -> NDArray[np.float64]:
+        """What the moves have been paid."""
+
+    def begin(
+        self,
+        begun: NDArray[np.bool_],
+        robots: NDArray[np.int64],
+        states: NDArray[np.uint8] | None,
+    ) -> None:
+        """Begins some paths; `robots` and hidden `states` are those of all rows."""
+
+    def completes(self) -> NDArray[np.bool_]:
+        """Of which rows the next move is the last of its path."""
+
+    def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The paths that these actions would complete, `(n_rows, T)`."""
+
+    def made(self, row: int) -> NDArray[np.uint8]:
+        """The moves made by one robot."""
+
+    def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """One move of some robots; returns what it pays each row."""
+
 class Lease:
     """The right to fly consecutive robots, and the step k of each of their worlds."""
 
