@@ -1,4 +1,4 @@
-//! Beliefs in double precision: Bayes' rule, `Phi`, entropy, and the first belief. Their shape is `[S, n, H, W]`: the
+//! Beliefs in double precision: Bayes' rule, `Phi`, and the first belief. Their shape is `[S, n, H, W]`: the
 //! states of n worlds.
 
 use crate::model::{model_of, shape_of};
@@ -7,10 +7,10 @@ use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
-use numpy::ndarray::{Array3, ArrayD, Axis, Zip};
+use numpy::ndarray::{Array3, Array4, Axis};
 use numpy::{
-    IntoPyArray, PyArray3, PyArray4, PyArrayDyn, PyReadonlyArray2, PyReadonlyArray3,
-    PyReadonlyArray4, PyReadonlyArrayDyn, PyReadwriteArray4, ToPyArray,
+    IntoPyArray, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    PyReadwriteArray4, ToPyArray,
 };
 use pyo3::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -68,11 +68,12 @@ impl Transition {
                 format!("{:?}", beliefs.dim()),
             ));
         }
-        let mut out = beliefs.to_owned();
-        for mut world in out.axis_iter_mut(Axis(1)) {
+        let mut out = Array4::zeros(beliefs.dim());
+        let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
+        for (world, mut next) in worlds {
             self.belief.assign(&world);
             operator.apply(&self.belief, &mut self.predictor);
-            world.assign(&self.predictor);
+            next.assign(&self.predictor);
         }
         Ok(out.into_pyarray(py))
     }
@@ -147,25 +148,6 @@ pub fn correct<'py>(
         let problem = format!("{subject}: {expected}, got {}", impossible.observed);
         failed(py, &problem, "impossible_frame")
     })
-}
-
-/// Shannon entropy in nats (eq. 14) of distributions along the first axis.
-#[pyfunction]
-pub fn entropy<'py>(
-    py: Python<'py>,
-    belief: PyReadonlyArrayDyn<'py, f64>,
-) -> Bound<'py, PyArrayDyn<f64>> {
-    let belief = belief.as_array();
-    let mut entropy = ArrayD::zeros(&belief.shape()[1..]);
-    for plane in belief.outer_iter() {
-        Zip::from(&mut entropy).and(plane).for_each(|sum, &p| {
-            if p > 0.0 {
-                *sum -= p * p.ln();
-            }
-        });
-    }
-    entropy.mapv_inplace(|sum: f64| sum.max(0.0));
-    entropy.into_pyarray(py)
 }
 
 /// How often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.

@@ -53,7 +53,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<belief::Transition>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
-    module.add_function(wrap_pyfunction!(belief::entropy, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;

@@ -184,9 +184,6 @@ class Transition:
 def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
     """Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
 
-def entropy(belief: _Doubles) -> _Doubles:
-    """In nats, along the first axis."""
-
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
     """How often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
 

@@ -137,7 +137,8 @@ def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 
 def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
-    return _native.entropy(np.asarray(belief, np.float64))
+    logarithm = np.log(belief, out=np.zeros_like(belief), where=belief > 0.0)
+    return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
 
 
 def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:
