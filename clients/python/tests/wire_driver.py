@@ -8,9 +8,10 @@ its standard output the answer, `{"header": "<hex>", "payload": "<hex>"}`.
 import json
 import sys
 
-from emberwatch import wire
 from emberwatch.channels import Node, in_turn
 from emberwatch.ports import Peer, RequestPort
+
+from emberwatch import wire
 
 HEADERS = {
     "step": (wire.StepRequest, wire.StepReply),
