@@ -1,7 +1,8 @@
 //! Moves that a caller hands in: arrays of integers, which become bytes.
 
 use emberwatch_protocol::path::check_moves;
-use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
+use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
 /// Checks paths of `n_moves` moves for `n_robots` robots. Others than plain arrays of usual integers, and wrong ones,
@@ -25,7 +26,12 @@ fn read<T: Element + Copy>(
     (n_robots, n_moves): (usize, usize),
     byte: impl Fn(T) -> u8,
 ) -> Option<Vec<u8>> {
-    let array: PyReadonlyArrayDyn<'_, T> = given.extract().ok()?;
+    // Not of a subclass, which may mask values.
+    let is_plain = given
+        .get_type()
+        .is(&PyUntypedArray::type_object(given.py()));
+    let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
+    let array = array?.ok()?;
     let shape = array.shape();
     let fits = shape == [n_robots, n_moves] || n_robots == 1 && shape == [n_moves];
     fits.then(|| match array.as_slice() {

@@ -10,6 +10,8 @@ def header(name: str, *, result: bytes = bytes(64), **fields: int) -> bytes:
     layout, given = LAYOUTS[name], {"version": 2} | fields
     assert given.keys() <= {field.name for field in layout.fields}
     return b"".join(
-        result if field.name == "result" else given.get(field.name, 0).to_bytes(field.size, "little")
+        result
+        if field.name == "result"
+        else given.get(field.name, 0).to_bytes(field.size, "little")
         for field in layout.fields
     )

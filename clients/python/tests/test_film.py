@@ -8,9 +8,9 @@ from typing import Any
 import document
 import numpy as np
 import pytest
+from headers import header
 from numpy.typing import NDArray
 from PIL import Image
-from headers import header
 from test_recording import FILE_HEADER, deflated, packed
 
 from emberwatch import wire

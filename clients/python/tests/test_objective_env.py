@@ -312,7 +312,7 @@ def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
 
 def test_another_world_has_no_agent(env: Any) -> None:
     env.reset(seed=1000)
-    with pytest.raises(errors.NoServerError, match="no agent serves decisions for world 7"):
+    with pytest.raises(errors.NoServerError, match="no agent serves decisions of world 7"):
         emberwatch.Decisions(env.instance, 7)
 
 

@@ -16,7 +16,6 @@ from processes import PATIENCE, connects, eventually, server
 
 from emberwatch import errors
 from emberwatch.client import connect
-from emberwatch.observer import observe
 from emberwatch.programs import unused_instance
 
 US = os.getpid()

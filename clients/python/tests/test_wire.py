@@ -145,7 +145,8 @@ def test_the_values_are_the_documented_ones() -> None:
 def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
     message, values = document.worked_example("StepReply")
     reply = LAYOUTS["StepReply"]
-    told = list(zip([it.name for it in reply.fields], struct.unpack_from(reply.format, message)))
+    numbers = struct.unpack_from(reply.format, message)
+    told = [(it.name, number) for it, number in zip(reply.fields, numbers, strict=True)]
     payload = np.frombuffer(message, np.uint8, offset=reply.size)
     answer = wire.StepAnswer(SHAPE, 0, 2, 0, dict(told)["simulation_nanos"], payload)
     (world, first), (same, second) = answer.result(0), answer.result(1)
@@ -241,6 +242,7 @@ def test_the_documented_replies_become_records() -> None:
     (told,), (world,) = replies("status")[0]["worlds"], status.worlds
     assert (status.pid, status.n_steps, world.n_paths) == (14661, 2, told["n_paths"])
     assert world.holder_pids == tuple(told["holder_pids"]) and len(world.robots) == 2
+
 
 def test_a_refusal_is_in_the_words_of_python() -> None:
     (error,) = replies("error")

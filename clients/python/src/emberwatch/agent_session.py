@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.client import Client, connect_with_retry
+from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     EmberwatchError,
@@ -23,7 +24,6 @@ from emberwatch.errors import (
 )
 from emberwatch.moves import fly
 from emberwatch.observer import Frame, Newest, Observer
-from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
 from emberwatch.session import Session, not_reset

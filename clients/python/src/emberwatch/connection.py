@@ -89,9 +89,7 @@ class ServerConnection(Connection):
         """Sends one request on `step` as it is; `Lease.step` and `observe` are easier."""
         n_moves = self.info.n_moves if operation == wire.STEP else 0
         place = first_robot, n_robots
-        nanos, payload = self._native.step(
-            operation, lease, *place, n_moves, flags, body, timeout
-        )
+        nanos, payload = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)
         return StepAnswer(self.shape, *place, flags, nanos, payload)
 
     def lease(self, number: int, robots: range) -> _native.Lease:

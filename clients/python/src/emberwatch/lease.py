@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from emberwatch import wire
 from emberwatch.arguments import as_seeds
+from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.errors import invalid
 from emberwatch.paths import utf8
-from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
 

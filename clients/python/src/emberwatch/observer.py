@@ -105,7 +105,9 @@ class Outlook:
 class Reader(Closable, Generic[_Sample]):
     """A subscriber of one channel. It never slows whom it reads."""
 
-    def __init__(self, instance: str, native: _native.Frames | _native.Truths | _native.Outlooks) -> None:
+    def __init__(
+        self, instance: str, native: _native.Frames | _native.Truths | _native.Outlooks
+    ) -> None:
         self.instance: Final = instance
         self._native = native
 
@@ -163,8 +165,9 @@ class OutlookReader(Reader[Outlook]):
 
     def _made(self, fields: dict[str, Any]) -> Outlook:
         first, n_robots = fields["robots"]
-        states, robots = tuple(fields["states"]), range(first, first + n_robots)
-        return Outlook(**fields | {"states": states, "robots": robots})
+        fields["states"] = tuple(fields["states"])
+        fields["robots"] = range(first, first + n_robots)
+        return Outlook(**fields)
 
 
 class Newest(Generic[_Step]):
@@ -236,8 +239,9 @@ def observe(
 
 def frame_of(fields: dict[str, Any]) -> Frame:
     """A step out of a sample's fields."""
-    robots = tuple(
+    fields["result"] = WorldResult(*fields["result"])
+    fields["robots"] = tuple(
         RobotFrame(result=RobotResult(*result), frame=frame, path=path)
         for result, frame, path in fields["robots"]
     )
-    return Frame(**fields | {"result": WorldResult(*fields["result"]), "robots": robots})
+    return Frame(**fields)

@@ -35,6 +35,7 @@ TRUTH_BUFFER: Final = 128
 AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
 
+
 class WorldResult(NamedTuple):
     """How one world stands after a step or a reset (PROTOCOL.md, `WorldResult`)."""
 
@@ -198,6 +199,6 @@ class StepAnswer:
         world = self._shape.n_worlds(self.first_robot, index + 1) - 1
         offset = self._head + index * ROBOT.size
         return StepResult(
-            WorldResult(*WORLD.unpack_from(self._payload, world * WORLD.size)),
-            RobotResult(*ROBOT.unpack_from(self._payload, offset)),
+            WorldResult(*WORLD.unpack_from(self._payload.data, world * WORLD.size)),
+            RobotResult(*ROBOT.unpack_from(self._payload.data, offset)),
         )
