@@ -1,16 +1,16 @@
 //! Beliefs in double precision: Bayes' rule, `Phi`, and the first belief. Their shape is `[S, n, H, W]`: the
 //! states of n worlds.
 
+use crate::detached::detached;
 use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
-use numpy::ndarray::{Array3, Array4, Axis};
+use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{
-    IntoPyArray, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
-    PyReadwriteArray4, ToPyArray,
+    IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
 };
 use pyo3::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,8 +34,8 @@ pub struct Transition {
 #[pymethods]
 impl Transition {
     #[new]
-    fn new(model: String, height: usize, width: usize) -> PyResult<Self> {
-        let (parameters, shape) = (model_of(&model)?, shape_of(height, width)?);
+    fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
+        let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
         let none = Array3::zeros((parameters.n_states(), height, width));
         Ok(Self {
             operator: transition::Transition::new(&parameters, shape),
@@ -50,12 +50,15 @@ impl Transition {
     fn apply<'py>(
         &mut self,
         py: Python<'py>,
-        beliefs: PyReadonlyArray4<'py, f64>,
+        beliefs: &Bound<'py, PyArray4<f64>>,
     ) -> PyResult<Bound<'py, PyArray4<f64>>> {
         let operator = self
             .operator
             .as_mut()
             .map_err(|error| vanishing(py, error))?;
+        let beliefs = beliefs.try_readonly();
+        let expected = "an array that no other thread corrects";
+        let beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, "one in use"))?;
         let beliefs = beliefs.as_array();
         let (n_states, height, width) = self.belief.dim();
         let (_, n_worlds, _, _) = beliefs.dim();
@@ -69,12 +72,15 @@ impl Transition {
             ));
         }
         let mut out = Array4::zeros(beliefs.dim());
-        let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
-        for (world, mut next) in worlds {
-            self.belief.assign(&world);
-            operator.apply(&self.belief, &mut self.predictor);
-            next.assign(&self.predictor);
-        }
+        let (belief, predictor) = (&mut self.belief, &mut self.predictor);
+        detached(py, beliefs.len(), || {
+            let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
+            for (world, mut next) in worlds {
+                belief.assign(&world);
+                operator.apply(belief, predictor);
+                next.assign(predictor);
+            }
+        });
         Ok(out.into_pyarray(py))
     }
 
@@ -104,36 +110,27 @@ fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
 #[pyfunction]
 pub fn correct<'py>(
     py: Python<'py>,
-    mut beliefs: PyReadwriteArray4<'py, f64>,
+    beliefs: &Bound<'py, PyArray4<f64>>,
     likelihood: PyReadonlyArray2<'py, f64>,
     frames: PyReadonlyArray3<'py, u8>,
 ) -> PyResult<()> {
+    let beliefs = beliefs.try_readwrite();
+    let expected = "an array to write to, which no other thread uses";
+    let got = "one that is read-only or in use";
+    let mut beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, got))?;
     let likelihood = likelihood.as_array().to_owned();
     let frames = frames.as_array();
     let (n_worlds, height, width) = frames.dim();
     let expected = (likelihood.nrows(), n_worlds, height, width);
     let got = beliefs.as_array().dim();
-    if got != expected {
-        return Err(invalid(
-            py,
-            "belief",
-            format!("shape {expected:?}"),
-            format!("{got:?}"),
-        ));
+    if got != expected || got.0 == 0 {
+        let (expected, got) = (format!("shape {expected:?}"), format!("{got:?}"));
+        return Err(invalid(py, "belief", expected, got));
     }
-    let shown = |&(_, &value): &(usize, &u8)| value != UNOBSERVED;
-    let values: Vec<(usize, u8)> = frames
-        .iter()
-        .enumerate()
-        .filter(shown)
-        .map(|(index, &value)| (index, value))
-        .collect();
+    let values = detached(py, frames.len(), || shown(frames));
     let cell = |index: usize| {
-        format!(
-            "frame: cell ({}, {})",
-            index / width % height,
-            index % width
-        )
+        let (row, col) = (index / width % height, index % width);
+        format!("frame: cell ({row}, {col})")
     };
     let n_observations = likelihood.ncols();
     if let Some((index, value)) = values.iter().find(|it| usize::from(it.1) >= n_observations) {
@@ -141,13 +138,21 @@ pub fn correct<'py>(
         return Err(invalid(py, cell(*index), expected, value));
     }
     let probabilities = beliefs.as_slice_mut()?;
-    let corrected = correct_cells(probabilities, &likelihood, || values.iter().copied());
+    let corrected = detached(py, frames.len(), || {
+        correct_cells(probabilities, &likelihood, || values.iter().copied())
+    });
     corrected.map_err(|impossible| {
         let (subject, belief) = (cell(impossible.index), impossible.belief);
         let expected = format!("expected an observation that the belief {belief:?} allows");
         let problem = format!("{subject}: {expected}, got {}", impossible.observed);
         failed(py, &problem, "impossible_frame")
     })
+}
+
+/// Index and value of the observed cells.
+fn shown(frames: ArrayView3<'_, u8>) -> Vec<(usize, u8)> {
+    let values = frames.iter().copied().enumerate();
+    values.filter(|&(_, value)| value != UNOBSERVED).collect()
 }
 
 /// How often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.
@@ -159,7 +164,7 @@ pub fn simulated_prior<'py>(
     width: usize,
     burn_in: u64,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
-    let (model, shape) = (model_of(model)?, shape_of(height, width)?);
+    let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
     let n_worlds = Prior::N_WORLDS;
     let prior = Prior::Simulated { n_worlds, burn_in };
     let kept = KeptBelief::new(prior, &model, shape, 0);

@@ -85,8 +85,8 @@ impl Server {
         answered(py, answer, seconds)
     }
 
-    fn close(&self, py: Python<'_>) {
-        self.wire.close(py);
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.wire.close(py)
     }
 }
 
@@ -117,8 +117,8 @@ impl Agent {
         decoded(answer).map_err(|error| raise(py, error, what, seconds))
     }
 
-    fn close(&self, py: Python<'_>) {
-        self.wire.close(py);
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.wire.close(py)
     }
 }
 

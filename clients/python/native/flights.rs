@@ -1,7 +1,11 @@
 //! Paths flown move by move by many robots, in rows: where they are, what they have visited.
 
-use emberwatch_protocol::path::Move;
+use crate::detached::detached;
+use crate::model::shape_of;
+use crate::refusal::invalid;
+use emberwatch_protocol::path::{MAX_MOVES, Move};
 use emberwatch_protocol::{Cell, Shape};
+use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArray3,
@@ -31,14 +35,18 @@ pub struct Flights {
 impl Flights {
     #[new]
     fn new(
+        py: Python<'_>,
         n_rows: usize,
         height: usize,
         width: usize,
         n_moves: usize,
         reward: Option<Vec<f64>>,
     ) -> PyResult<Self> {
-        let shape = Shape::new(height, width);
-        let shape = shape.map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let shape = shape_of(py, height, width)?;
+        if !(1..=MAX_MOVES).contains(&n_moves) {
+            let expected = format!("an integer within 1 to {MAX_MOVES}");
+            return Err(invalid(py, "n_moves", expected, n_moves));
+        }
         Ok(Self {
             shape,
             n_moves,
@@ -79,7 +87,8 @@ impl Flights {
     #[getter]
     fn visited<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let (height, width) = self.shape.dim();
-        PyArray1::from_slice(py, &self.visited).reshape([self.cells.len(), height, width])
+        let visited = detached(py, self.visited.len(), || self.visited.clone());
+        PyArray1::from_vec(py, visited).reshape([self.cells.len(), height, width])
     }
 
     /// What the moves have been paid.
@@ -91,12 +100,19 @@ impl Flights {
     /// Begins some paths; `robots` and hidden `states` are those of all rows.
     fn begin(
         &mut self,
+        py: Python<'_>,
         begun: PyReadonlyArray1<'_, bool>,
         robots: PyReadonlyArray2<'_, i64>,
         states: Option<PyReadonlyArray3<'_, u8>>,
     ) -> PyResult<()> {
-        let (begun, robots, n_cells) = (begun.as_array(), robots.as_array(), self.shape.n_cells());
+        let (begun, robots) = (begun.as_array(), robots.as_array());
         let (height, width) = self.shape.dim();
+        let states = states.as_ref().map(|states| states.as_array());
+        let dim = (self.cells.len(), height, width);
+        if let Some(got) = states.map(|it| it.dim()).filter(|&got| got != dim) {
+            let (expected, got) = (format!("shape {dim:?}"), format!("{got:?}"));
+            return Err(invalid(py, "states", expected, got));
+        }
         if begun.len() != self.cells.len() || robots.dim() != (self.cells.len(), 2) {
             return Err(PyValueError::new_err("begin: expected one of each row"));
         }
@@ -109,14 +125,8 @@ impl Flights {
             self.cells[row] = cell;
             self.n_made[row] = 0;
             self.paid[row] = 0.0;
-            self.visited[row * n_cells..][..n_cells].fill(0);
-            if let Some(states) = &states {
-                let states = states.as_array();
-                let own = states.outer_iter().nth(row).into_iter().flatten();
-                let kept = self.states[row * n_cells..][..n_cells].iter_mut();
-                kept.zip(own).for_each(|(kept, &state)| *kept = state);
-            }
         }
+        detached(py, self.visited.len(), || self.enter(begun, states));
         Ok(())
     }
 
@@ -131,19 +141,26 @@ impl Flights {
         py: Python<'py>,
         actions: PyReadonlyArray1<'_, u8>,
     ) -> PyResult<Bound<'py, PyArray2<u8>>> {
+        let actions = actions.as_array();
+        if actions.len() != self.cells.len() {
+            return Err(PyValueError::new_err("paths: expected one of each row"));
+        }
         let mut paths = self.moves.clone();
         let last = paths
             .iter_mut()
             .skip(self.n_moves - 1)
             .step_by(self.n_moves);
-        last.zip(actions.as_array())
-            .for_each(|(last, &action)| *last = action);
+        last.zip(actions).for_each(|(last, &action)| *last = action);
         PyArray1::from_vec(py, paths).reshape([self.cells.len(), self.n_moves])
     }
 
     /// The moves made by one robot.
-    fn made<'py>(&self, py: Python<'py>, row: usize) -> Bound<'py, PyArray1<u8>> {
-        PyArray1::from_slice(py, &self.moves[row * self.n_moves..][..self.n_made[row]])
+    fn made<'py>(&self, py: Python<'py>, row: usize) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let n_rows = self.cells.len();
+        let expected = || invalid(py, "row", format!("one below {n_rows}"), row);
+        let n_made = *self.n_made.get(row).ok_or_else(expected)?;
+        let made = &self.moves[row * self.n_moves..][..n_made];
+        Ok(PyArray1::from_slice(py, made))
     }
 
     /// One move of the rows `moved`, below 4; returns what it pays each row.
@@ -170,6 +187,20 @@ impl Flights {
 }
 
 impl Flights {
+    /// Forgets what was visited, and keeps the hidden states, of the rows `begun`.
+    fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
+        let n_cells = self.shape.n_cells();
+        for row in (0..begun.len()).filter(|&row| begun[row]) {
+            let cells = row * n_cells..(row + 1) * n_cells;
+            self.visited[cells.clone()].fill(0);
+            if let Some(states) = states {
+                let own = states.index_axis_move(Axis(0), row);
+                let kept = self.states[cells].iter_mut();
+                kept.zip(own).for_each(|(kept, &state)| *kept = state);
+            }
+        }
+    }
+
     fn fly(&mut self, row: usize, action: u8) -> f64 {
         self.moves[row * self.n_moves + self.n_made[row]] = action;
         self.n_made[row] += 1;

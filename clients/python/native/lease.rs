@@ -2,6 +2,7 @@
 
 use crate::connection::{Answer, Server, answered, duration};
 use crate::moves;
+use crate::refusal::invalid;
 use emberwatch_protocol::connection::{Connection, ConnectionError, worlds_of};
 use emberwatch_protocol::message::{Operation, StepReply, StepRequest, WorldResult};
 use emberwatch_protocol::payload::{WORLD_BYTES, write_step_body};
@@ -41,7 +42,14 @@ impl Lease {
         flags: u32,
         seconds: f64,
     ) -> PyResult<Answer<'py>> {
-        let n_moves = self.server.get().n_moves;
+        let server = self.server.get();
+        let worlds = worlds_of(first_robot, n_robots, server.team);
+        if worlds.start < self.worlds.start || worlds.end > self.worlds.end {
+            let expected = format!("robots of worlds {:?}", self.worlds);
+            let got = format!("{n_robots} from {first_robot} on");
+            return Err(invalid(py, "step", expected, got));
+        }
+        let n_moves = server.n_moves;
         let moves = moves::paths(paths, n_robots as usize, n_moves)?;
         let request = self.request(Operation::Step, first_robot, n_robots, flags);
         let request = StepRequest {

@@ -2,6 +2,7 @@
 
 mod belief;
 mod connection;
+mod detached;
 mod errors;
 mod flights;
 mod lease;

@@ -24,13 +24,14 @@ pub struct MeritTally {
 impl MeritTally {
     #[new]
     fn new(
+        py: Python<'_>,
         n_worlds: usize,
         height: usize,
         width: usize,
         target: u8,
         recent_steps: u32,
     ) -> PyResult<Self> {
-        let shape = shape_of(height, width)?;
+        let shape = shape_of(py, height, width)?;
         let tally = merit::MeritTally::new(shape, target, recent_steps);
         Ok(Self {
             shape,

@@ -1,6 +1,7 @@
 //! Model files: what Python's `Model` and `Description` hold.
 
-use emberwatch_protocol::grid::Shape;
+use crate::refusal::invalid;
+use emberwatch_protocol::grid::{MAX_SIDE, Shape};
 use emberwatch_protocol::model::{Description, Model, parse_color};
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
@@ -33,8 +34,11 @@ pub fn model_of(text: &str) -> PyResult<Model> {
     Model::from_toml(text).map_err(refused)
 }
 
-pub fn shape_of(height: usize, width: usize) -> PyResult<Shape> {
-    Shape::new(height, width).map_err(refused)
+/// The shape of a grid.
+pub fn shape_of(py: Python<'_>, height: usize, width: usize) -> PyResult<Shape> {
+    let expected = format!("height and width within 1 to {MAX_SIDE}");
+    let got = format!("{height} x {width}");
+    Shape::new(height, width).map_err(|_| invalid(py, "grid", expected, got))
 }
 
 fn refused(error: impl ToString) -> PyErr {

@@ -1,6 +1,6 @@
 //! What belongs to the process that made it, and to one thread at a time.
 
-use crate::errors::{error, interrupted};
+use crate::errors::{error, interrupted, raise_of_channel};
 use emberwatch_protocol::channels::ChannelError;
 use pyo3::prelude::*;
 use std::mem::ManuallyDrop;
@@ -61,18 +61,19 @@ impl<T: Send> Owned<T> {
                 let text = format!("the connection to instance '{}' is closed", self.instance);
                 Err(error(py, "EmberwatchError", (text, "closed")))
             }
-            None => Err(crate::errors::raise_of_channel(
-                py,
-                ChannelError::Interrupted,
-            )),
+            None => Err(raise_of_channel(py, ChannelError::Interrupted)),
         }
     }
 
     /// Drops it. In another process it stays as it is; it may be closed again.
-    pub fn close(&self, py: Python<'_>) {
-        if self.pid == pid() {
-            py.detach(|| self.end());
+    ///
+    /// # Errors
+    /// If the wait for other threads was interrupted: then it is still open.
+    pub fn close(&self, py: Python<'_>) -> PyResult<()> {
+        if self.pid != pid() || py.detach(|| self.end(interrupted)) {
+            return Ok(());
         }
+        Err(raise_of_channel(py, ChannelError::Interrupted))
     }
 
     /// Refuses any other process than that which made it.
@@ -107,9 +108,7 @@ impl<T: Send> Owned<T> {
                     });
                 }
                 Slot::Taken => {
-                    let waited = self.freed.wait_timeout(slot, INTERVAL);
-                    let (again, _) = waited.unwrap_or_else(PoisonError::into_inner);
-                    drop(again);
+                    self.wait(slot);
                     if interrupted() {
                         return None;
                     }
@@ -119,24 +118,34 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Takes it for good; waits for a thread that uses it.
-    fn end(&self) {
+    /// Takes it for good, and waits for a thread that uses it; `false` once `stops` ends the wait.
+    fn end(&self, stops: fn() -> bool) -> bool {
         let mut slot = self.lock();
         loop {
             match std::mem::replace(&mut *slot, Slot::Closed) {
                 Slot::Free(value) => {
                     drop(slot);
                     self.freed.notify_all();
-                    return drop(value);
+                    drop(value);
+                    return true;
                 }
-                Slot::Closed => return,
+                Slot::Closed => return true,
                 Slot::Taken => {
                     *slot = Slot::Taken;
-                    let waited = self.freed.wait(slot);
-                    slot = waited.unwrap_or_else(PoisonError::into_inner);
+                    self.wait(slot);
+                    if stops() {
+                        return false;
+                    }
+                    slot = self.lock();
                 }
             }
         }
+    }
+
+    /// Waits until it is free, or for an interval: threads that give up may leave others unnotified.
+    fn wait(&self, slot: MutexGuard<'_, Slot<T>>) {
+        let waited = self.freed.wait_timeout(slot, INTERVAL);
+        drop(waited.unwrap_or_else(PoisonError::into_inner));
     }
 
     fn lock(&self) -> MutexGuard<'_, Slot<T>> {
@@ -148,7 +157,7 @@ impl<T: Send> Drop for Taken<'_, T> {
     fn drop(&mut self) {
         if let Some(value) = self.value.take() {
             *self.owner.lock() = Slot::Free(value);
-            self.owner.freed.notify_one();
+            self.owner.freed.notify_all();
         }
     }
 }
@@ -157,8 +166,9 @@ impl<T: Send> Drop for Owned<T> {
     fn drop(&mut self) {
         if self.pid == pid() {
             // Not attached: what ends here may wait for another thread that needs the interpreter.
-            if Python::try_attach(|py| py.detach(|| self.end())).is_none() {
-                self.end();
+            let end = || self.end(|| false);
+            if Python::try_attach(|py| py.detach(end)).is_none() {
+                end();
             }
         }
     }

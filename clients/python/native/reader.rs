@@ -105,8 +105,8 @@ macro_rules! reader {
                 Ok(Some(fields.into_pyobject(py)?.into_any()))
             }
 
-            fn close(&self, py: Python<'_>) {
-                self.0.close(py);
+            fn close(&self, py: Python<'_>) -> PyResult<()> {
+                self.0.close(py)
             }
         }
     };

@@ -1,6 +1,7 @@
 //! Reads recordings, record by record.
 
 use crate::errors::error;
+use crate::refusal::invalid;
 use crate::samples::{frame, truth};
 use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError};
 use pyo3::prelude::*;
@@ -24,8 +25,11 @@ impl Recording {
     #[new]
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let name = path.display().to_string();
-        let file = BufReader::new(File::open(path)?);
-        let reader = py.detach(|| Reader::new(file));
+        // Opening a FIFO waits for its writer, and no signal ends that.
+        if !py.detach(|| std::fs::metadata(&path))?.is_file() {
+            return Err(invalid(py, "recording", "a regular file", name));
+        }
+        let reader = py.detach(|| Reader::new(BufReader::new(File::open(path)?)));
         let reader = reader.map_err(|problem| raise(py, &name, problem))?;
         Ok(Self {
             name,

@@ -59,8 +59,8 @@ def test_small_integers_are_cells_too() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"n_moves": 0}, "n_moves: expected an integer from 1 on, got 0"),
-        ({"width": 2.5}, "width: expected an integer from 1 on, got 2.5"),
+        ({"n_moves": 0}, "n_moves: expected an integer within 1 to 4096, got 0"),
+        ({"width": 2.5}, "width: expected an integer within 1 to 65536, got 2.5"),
         ({"values": np.zeros((2, 2))}, r"values: expected .*, got shape \(2, 2\)"),
         ({"values": np.full((1, 2, 2), np.nan)}, "values: expected finite numbers"),
         ({"robots": np.zeros((1, 2))}, "robots: expected integers .*, got float64"),

@@ -70,7 +70,7 @@ pub fn correct(
 /// [`correct`] for cells of any grids: `probabilities` state by state, and of the observed cells index and value.
 ///
 /// # Errors
-/// The first cell where `b(y)' u = 0`; the probabilities are then as they were.
+/// The first cell where `b(y)' u` is 0 or no number; the probabilities are then as they were.
 ///
 /// # Panics
 /// If a cell or a value is out of range.
@@ -92,7 +92,7 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
             pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)
         };
         let evidence: f64 = joint().sum();
-        if evidence <= 0.0 {
+        if evidence <= 0.0 || !evidence.is_finite() {
             return Err(Impossible {
                 index,
                 observed,

@@ -108,10 +108,32 @@ impl BeamSearch {
         self.discount = discount;
     }
 
-    /// The best path that a beam of the given width finds in the reach.
-    fn search(&mut self, width: usize, n_moves: usize) -> Plan {
+    /// [`Planner::plan`], or `None` once `stops`, which is asked before each move: a wide beam may take minutes.
+    pub fn plan_unless(
+        &mut self,
+        problem: &PlanningProblem<'_>,
+        mut stops: impl FnMut() -> bool,
+    ) -> Option<Plan> {
+        self.look_at(problem);
+        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
+        let greedy = self.search(1, problem.n_moves, &mut stops)?;
+        let plan = self.search(self.width, problem.n_moves, &mut stops)?;
+        let is_greedy = greedy.score > plan.score;
+        Some(if is_greedy { greedy } else { plan })
+    }
+
+    /// The best path that a beam of the given width finds in the reach; `None` once `stops`.
+    fn search(
+        &mut self,
+        width: usize,
+        n_moves: usize,
+        stops: &mut impl FnMut() -> bool,
+    ) -> Option<Plan> {
         self.begin(width);
         for _ in 0..n_moves {
+            if stops() {
+                return None;
+            }
             self.expand();
             self.select(width);
             self.weight *= self.discount;
@@ -119,10 +141,10 @@ impl BeamSearch {
         let rank = |state: &State| (ordered_bits(state.score), !state.hash);
         let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
         let best = best.expect("invariant: every state has successors, so no beam is empty");
-        Plan {
+        Some(Plan {
             moves: self.moves_to(best, width, n_moves),
             score: self.beam[best].score,
-        }
+        })
     }
 
     fn look_at(&mut self, problem: &PlanningProblem<'_>) {
@@ -255,15 +277,8 @@ impl BeamSearch {
 
 impl Planner for BeamSearch {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
-        self.look_at(problem);
-        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
-        let greedy = self.search(1, problem.n_moves);
-        let plan = self.search(self.width, problem.n_moves);
-        if greedy.score > plan.score {
-            greedy
-        } else {
-            plan
-        }
+        let plan = self.plan_unless(problem, || false);
+        plan.expect("invariant: nothing stops it")
     }
 }
 

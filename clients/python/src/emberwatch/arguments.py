@@ -33,6 +33,14 @@ def as_integer(value: object) -> int | None:
         return None
 
 
+def as_count(value: object, subject: str, least: int, most: int) -> int:
+    """Checks an integer that is not below `least` nor above `most`."""
+    number = as_integer(value)
+    if number is not None and least <= number <= most:
+        return number
+    raise invalid(subject, f"an integer within {least} to {most}", told(value))
+
+
 def as_seeds(
     seeds: Iterable[int | None] | None, worlds: Iterable[int]
 ) -> list[dict[str, int | None]]:

@@ -116,10 +116,11 @@ class Transition:
         self._shape = (model.n_states, *worlds, height, width)
         self._operator = _native.Transition(model.toml, height, width)
 
-    def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, belief: NDArray[np.floating]) -> NDArray[np.float64]:
         """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
         if belief.shape != self._shape:
             raise invalid("belief", f"shape {self._shape}", belief.shape)
+        belief = np.asarray(belief, np.float64)
         n_states, *_, height, width = self._shape
         beliefs = belief.reshape(n_states, -1, height, width)
         return self._operator.apply(beliefs).reshape(self._shape)

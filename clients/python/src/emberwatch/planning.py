@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import _native
+from emberwatch.arguments import as_count
 from emberwatch.errors import invalid
 
 
@@ -23,17 +24,19 @@ def beam_search(
     Args:
         values: What a visit to each cell is worth, `(n, H, W)`; counts in single precision.
         robots: Row and column of each robot, `(n, 2)`; its cell counts only if it is flown over.
-        n_moves: Moves of a path, at least 1.
+        n_moves: Moves of a path, 1 to 4,096.
         rng: Breaks ties: one number of it for each world.
         visited: Cells that are worth nothing any more, where not 0, `(n, H, W)`.
-        width: Paths kept after each move, 1 to 65,536; of those that end in one cell and have
-            visited the same cells, one.
+        width: Paths kept after each move, 1 to 65,536, fewer where they need over 4 GiB; of those
+            that end in one cell and have visited the same cells, one.
 
     Returns:
         The moves, `(n, n_moves)`: 0 up, 1 down, 2 left, 3 right.
     """
     given, cells = np.asarray(values), np.asarray(robots)
-    _check(given, cells, visited, n_moves=n_moves, width=width)
+    n_moves = as_count(n_moves, "n_moves", 1, 4096)
+    width = as_count(width, "width", 1, 65536)
+    _check(given, cells, visited)
     with np.errstate(over="ignore"):
         worth = given.astype(np.float32)
     if not np.isfinite(worth).all():
@@ -41,18 +44,14 @@ def beam_search(
     if visited is not None:
         worth[np.asarray(visited) != 0] = 0.0
     keys = rng.integers(2**64, size=len(worth), dtype=np.uint64)
-    return _native.beam_search(worth, cells.astype(np.int64), keys, int(n_moves), int(width))
+    return _native.beam_search(worth, cells.astype(np.int64), keys, n_moves, width)
 
 
 def _check(
     values: NDArray[np.floating],
     robots: NDArray[np.integer],
     visited: NDArray[np.generic] | None,
-    **numbers: int,
 ) -> None:
-    for name, number in numbers.items():
-        if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise invalid(name, "an integer from 1 on", repr(number))
     if values.ndim != 3 or values.size == 0 or not np.isfinite(values).all():
         raise invalid("values", "finite numbers (n, H, W), some of each", f"shape {values.shape}")
     if robots.shape != (len(values), 2) or robots.dtype.kind not in "iu":
