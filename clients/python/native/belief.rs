@@ -118,8 +118,7 @@ pub fn correct<'py>(
     let expected = "an array to write to, which no other thread uses";
     let got = "one that is read-only or in use";
     let mut beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, got))?;
-    let likelihood = likelihood.as_array().to_owned();
-    let frames = frames.as_array();
+    let (likelihood, frames) = (likelihood.as_array(), frames.as_array());
     let (n_worlds, height, width) = frames.dim();
     let expected = (likelihood.nrows(), n_worlds, height, width);
     let got = beliefs.as_array().dim();
@@ -127,6 +126,7 @@ pub fn correct<'py>(
         let (expected, got) = (format!("shape {expected:?}"), format!("{got:?}"));
         return Err(invalid(py, "belief", expected, got));
     }
+    let likelihood = likelihood.to_owned();
     let values = detached(py, frames.len(), || shown(frames));
     let cell = |index: usize| {
         let (row, col) = (index / width % height, index % width);
