@@ -37,6 +37,10 @@ env.reset(seed=1)
 env.step([3] * 6)
 session = env._session
 print(session._client.info.pid, session.instance, flush=True)
+
+def fly():
+    while True:
+        env.step([3] * 6)
 """
 
 #: How it may end by itself, and the exit code.
@@ -48,6 +52,9 @@ ENDS = {
     "os._exit(4)": 4,
     "os.abort()": -signal.SIGABRT,
     "import threading; threading.Thread(target=lambda: time.sleep(0.1)).start()": 0,
+    "env.itself = env": 0,
+    "import atexit; atexit.register(lambda: env.step([3] * 6))": 0,
+    "import threading; threading.Thread(target=fly, daemon=True).start(); time.sleep(0.1)": 0,
 }
 
 ABRUPT = ("os._exit(4)", "os.abort()")
