@@ -1,7 +1,8 @@
 """PyTorch on the same CPU: the peer of `agent/network/benches/network.rs`, measured in the same run.
 
 The dynamic autoencoder from the layer table of REPRODUCTION.md and a DQN, with torch's own layers:
-hidden 16, windows of 1,000 frames of 64 x 64 cells. Two threads; single inputs with one as well.
+hidden 16, windows of 1,000 frames of 64 x 64 cells; and the network of the neural belief, whose
+updates are of 16 grids. Two threads; single inputs and the neural belief with one as well.
 Everything is measured twice: with glibc's allocator as it is, and with one that keeps its memory
 and uses huge pages.
 
@@ -33,6 +34,41 @@ TUNED = {
     "MALLOC_TOP_PAD_": str(1 << 28),
     "THP_MEM_ALLOC_ENABLE": "1",
 }
+
+
+def conv(before, after, stride=1, dilation=1):
+    return nn.Sequential(nn.Conv2d(before, after, 3, stride, dilation, dilation), nn.ReLU())
+
+
+class UNet(nn.Module):
+    """Features of cells to the logits of what will be seen there."""
+
+    def __init__(self):
+        super().__init__()
+        self.full = conv(4 * N_STATES + 4, 16)
+        self.to_half, self.down_half = conv(16, 24, stride=2), conv(24, 24)
+        self.to_quarter, self.down_quarter = conv(24, 32, stride=2), conv(32, 32)
+        self.wide = conv(32, 32, dilation=2)
+        self.from_quarter, self.at_half = nn.Conv2d(32, 24, 1), conv(24, 24)
+        self.from_half, self.at_full = nn.Conv2d(24, 16, 1), conv(16, 16)
+        self.head = nn.Conv2d(16, N_STATES, 1)
+
+    def forward(self, features):
+        full = self.full(features)
+        half = self.residual(self.down_half, self.to_half(full))
+        quarter = self.residual(self.down_quarter, self.to_quarter(half))
+        quarter = self.from_quarter(self.residual(self.wide, quarter))
+        half = self.residual(self.at_half, functional.relu(half + self.doubled(quarter)))
+        full = functional.relu(full + self.doubled(self.from_half(half)))
+        return self.head(self.residual(self.at_full, full))
+
+    @staticmethod
+    def residual(layer, images):
+        return images + layer(images)
+
+    @staticmethod
+    def doubled(images):
+        return functional.interpolate(images, scale_factor=2)
 
 
 class Autoencoder(nn.Module):
@@ -111,6 +147,34 @@ def inference_step():
     return step
 
 
+def neural_update():
+    network, n_grids = UNet(), 16
+    optimiser = torch.optim.Adam(network.parameters(), 2e-3)
+    features = torch.rand(n_grids, 4 * N_STATES + 4, SIDE, SIDE)
+    grid = torch.arange(n_grids).repeat_interleave(N_VISITED)
+    row, col = torch.randint(SIDE, (2, n_grids * N_VISITED))
+    goal = torch.randint(N_STATES, (n_grids * N_VISITED,))
+
+    def update():
+        loss = functional.cross_entropy(network(features)[grid, :, row, col], goal)
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+
+    return update
+
+
+def neural_prediction():
+    network, features = UNet(), torch.rand(1, 4 * N_STATES + 4, SIDE, SIDE)
+
+    @torch.no_grad()
+    def predict():
+        return network(features).softmax(1)
+
+    return predict
+
+
 def perceptron():
     layers = [nn.Linear(DQN_INPUTS, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(128, DQN_ACTIONS))
@@ -182,6 +246,8 @@ def measure(quick):
         report("autoencoder: inference step", inference_step, 9, 20, threads)
         report("dqn: update", dqn_update, 9, 50, threads)
         report("dqn: act", dqn_act, 9, 500, threads)
+        report("neural belief: update", neural_update, 9, 5, threads)
+        report("neural belief: prediction", neural_prediction, 9, 50, threads)
 
 
 def main():

@@ -50,6 +50,14 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
     );
     let fewer = agent(&format!("{suite} coverage --worlds 1")).check(0);
     fewer.check_prints("| coverage ");
+    // Other settings give other rows.
+    agent(&format!("{suite} coverage,beam_exploit --beam-width 2")).check(0);
+    let narrow = read(&path("out/tiny.csv"));
+    assert_ne!(
+        of_policy(&narrow, "beam_exploit"),
+        of_policy(&all, "beam_exploit")
+    );
+    agent(&format!("{suite} coverage,beam_exploit")).check(0);
 
     std::fs::create_dir(path("entries")).expect("a folder");
     std::fs::write(path("page.md"), PAGE).expect("write");
@@ -85,6 +93,74 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
         &board,
         "entry coverage: expected the worlds and steps of task tiny",
     );
+}
+
+/// Rewards of a policy's rows.
+fn of_policy(rows: &str, policy: &str) -> Vec<String> {
+    let rows = rows.lines().filter(|row| row.starts_with(policy));
+    let reward = |row: &str| row.split(',').nth(4).map(str::to_owned);
+    rows.filter_map(reward).collect()
+}
+
+#[test]
+fn a_policy_runs_again_on_what_was_learned_since() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    std::fs::write(path("tiny.toml"), TASK).expect("write");
+    let task = path("tiny.toml");
+    let learn = |seed: u64, out: &str| {
+        let flags = format!("--task {task} --worlds 2 --steps 40 --agent-seed {seed}");
+        agent(&format!("train {flags} --out {out}/tiny")).check(0);
+    };
+    let (first, second, out) = (path("first"), path("second"), path("out"));
+    learn(1, &first);
+    learn(2, &second);
+    let suite = |learned: &str| {
+        let policies = "--policies learned_beam,coverage";
+        agent(&format!(
+            "suite --tasks {task} --out {out} --checkpoints {learned} {policies}"
+        ))
+        .check(0);
+        read(Path::new(&out).join("tiny.csv").as_path())
+    };
+    let rows = suite(&first);
+    assert_eq!(suite(&first), rows, "nothing ran again");
+    let others = suite(&second);
+    assert_ne!(
+        of_policy(&others, "learned_beam"),
+        of_policy(&rows, "learned_beam")
+    );
+    let of_coverage = |rows: &str| {
+        let rows = rows.lines().filter(|row| row.starts_with("coverage"));
+        rows.map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        of_coverage(&others),
+        of_coverage(&rows),
+        "coverage learned nothing"
+    );
+}
+
+#[test]
+fn all_names_are_checked_before_anything_runs() {
+    let folder = TempDir::new().expect("a folder");
+    std::fs::write(folder.path().join("tiny.toml"), TASK).expect("write");
+    let (task, out) = (folder.path().join("tiny.toml"), folder.path().join("out"));
+    for tasks in [
+        format!("{},jacksboro", task.display()),
+        task.display().to_string(),
+    ] {
+        let suite = format!(
+            "suite --tasks {tasks} --out {} --policies coverage,beam_xyz",
+            out.display()
+        );
+        check(
+            AGENT,
+            &suite,
+            "task tiny: policy: expected one of | got \"beam_xyz\"",
+        );
+        assert!(!out.exists(), "nothing ran");
+    }
 }
 
 #[test]

@@ -1,8 +1,9 @@
 //! Tasks: the worlds of a name are those of the same flags, and all that knows the server names it.
 
-use crate::commands::{agent, check_table};
+use crate::commands::{agent, check, check_table};
 use crate::recording::{read_whole, start_recorder, stop};
 use emberwatch_protocol::recording::Event;
+use emberwatch_protocol::task::Task;
 use emberwatch_server::snapshot::decode;
 use tempfile::TempDir;
 use tests::harness::{AGENT, Paths, Program, SERVER, Server, fly, repository, reset, seen_by};
@@ -35,12 +36,19 @@ fn hello_status_and_recordings_name_the_task() {
     assert_eq!(server.info().task.as_deref(), Some("small"));
     let status = server.command("status").check(0).stdout;
     assert!(status.contains(": task small, pid "), "{status}");
+    let json = |server: &Server| {
+        let text = server.command("status --json").check(0).stdout;
+        serde_json::from_str::<serde_json::Value>(&text).expect("JSON")
+    };
+    assert_eq!(json(&server)["task"], "small");
     let recorder = start_recorder(&server.instance, &file, "");
     fly(&mut server.acquire(0..1), Paths::new(1).next(16));
     stop(recorder);
     let named = |event: &Event| matches!(event, Event::Server(info) if info.task.as_deref() == Some("small"));
     assert!(read_whole(&file).iter().any(|record| named(&record.event)));
-    assert_eq!(Server::start(SMALL_BY_HAND).info().task, None);
+    let by_hand = Server::start(SMALL_BY_HAND);
+    assert_eq!(by_hand.info().task, None);
+    assert_eq!(json(&by_hand).get("task"), None);
 }
 
 #[test]
@@ -68,6 +76,40 @@ fn a_snapshot_of_a_task_fits_the_same_worlds_by_flags() {
 
 #[test]
 fn an_agent_refuses_a_server_of_another_task() {
+    let folder = TempDir::new().expect("a folder");
+    let own = folder.path().join("own.toml");
+    let text = std::fs::read_to_string(repository().join("config/tasks/small.toml"));
+    let text = text
+        .expect("the task")
+        .replace("name = \"small\"", "name = \"own\"");
+    std::fs::write(&own, &text).expect("write");
+    let of_own = format!("--task {}", own.display());
+    let server = Server::start(&of_own);
+    let flags = format!("--steps 1 --policy coverage {of_own}");
+    Program::agent(&server.instance, &flags).ends(0);
+    // What counts is what the server runs, not what it is called.
+    for (from, to, words) in [
+        (
+            "burn_in = 3000",
+            "burn_in = 30",
+            "the burn_in of task own: 30, got 3000",
+        ),
+        (
+            "moves = 16",
+            "moves = 15",
+            "the moves of task own: 15, got 16",
+        ),
+        (
+            "wildfire-small",
+            "wildfire",
+            "the model of task own: wildfire, got another",
+        ),
+    ] {
+        assert!(text.contains(from));
+        std::fs::write(&own, text.replace(from, to)).expect("write");
+        let refused = Program::agent(&server.instance, &flags);
+        refused.ends(1).check_says(words);
+    }
     let server = Server::start("--task small");
     let flags = "--steps 1 --policy coverage";
     Program::agent(&server.instance, &format!("{flags} --task small")).ends(0);
@@ -78,7 +120,7 @@ fn an_agent_refuses_a_server_of_another_task() {
 #[test]
 fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
     let folder = TempDir::new().expect("a folder");
-    let csv = folder.path().join("a.csv");
+    let (csv, long) = (folder.path().join("a.csv"), folder.path().join("long.csv"));
     let own = folder.path().join("own.toml");
     let text = std::fs::read_to_string(repository().join("config/tasks/team.toml"));
     let text = text
@@ -95,6 +137,16 @@ fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
     .check(0);
     let rows = std::fs::read_to_string(&csv).expect("a table");
     assert_eq!(rows.lines().count(), 1 + 2, "{rows}");
+    // The task's steps, also where these are more than a comparison has by default.
+    let more = text
+        .replace("end = 32", "end = 1")
+        .replace("max_steps = 3", "max_steps = 1600");
+    std::fs::write(&own, more).expect("write");
+    let compare = format!("compare {task} {policies}");
+    agent(&format!("{compare} --csv {}", long.display())).check(0);
+    let rows = std::fs::read_to_string(&long).expect("a table");
+    assert!(rows.contains("coverage,none,0,1600,"), "{rows}");
+    std::fs::write(&own, text.replace("end = 32", "end = 2")).expect("write");
     let out = folder.path().join("learned");
     agent(&format!(
         "train {task} --worlds 2 --steps 8 --out {}",
@@ -121,6 +173,7 @@ fn flags_that_a_task_decides_are_refused_by_name() {
 --task small --start corner => start: expected no flag beside a task
 --task jacksboro --states-offset 3 => states_offset: expected no flag beside a task
 --task ash => task ash: No such file | expected one, or wildfire, small
+--task= => task : expected a name or a file, got \"\"
 --task FILE => missing field `moves`
 --task OTHER => name: expected one of its own, got small, which is built in";
     let table = table.replace("FILE", &file.display().to_string());
@@ -134,4 +187,42 @@ train --task small --moves 3 --out x => --task <NAME|FILE> | cannot be used with
 evaluate --task ash --checkpoint x => task ash: No such file | expected one, or wildfire, small
 run --task ash => task ash: No such file";
     check_table(AGENT, table);
+}
+
+#[test]
+fn files_that_have_a_built_in_name_or_are_pipes_are_refused() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    for (setting, name, task) in [
+        ("model", "wildfire-small", "small"),
+        ("states", "jacksboro", "jacksboro"),
+    ] {
+        let text = std::fs::read_to_string(repository().join(format!("config/tasks/{task}.toml")));
+        let mine = text
+            .expect("the task")
+            .replace(&format!("name = \"{task}\""), "name = \"mine\"");
+        let file = path(&format!("{setting}.toml"));
+        std::fs::write(&file, mine).expect("write");
+        Task::named(&file.display().to_string()).expect("a task of a built-in name");
+        std::fs::write(path(name), "").expect("write");
+        let words = format!("{setting}: expected a file with a name of its own, got {name}");
+        check(SERVER, &format!("--task {}", file.display()), &words);
+    }
+    // No reader waits for a writer that never comes.
+    let pipe = path("pipe").display().to_string();
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+    assert!(made.expect("mkfifo").success());
+    let words = "expected a regular file, got a pipe";
+    check(SERVER, &format!("--task {pipe}"), words);
+    check(AGENT, &format!("compare --task {pipe}"), words);
+    let model = format!(
+        "name = \"mine\"\nmodel = \"pipe\"\nmoves = 3\nheight = 9\nwidth = 9\nmax_steps = 9\ntest_seeds = {{ start = 0, end = 1 }}\n"
+    );
+    std::fs::write(path("model.toml"), model).expect("write");
+    let words = "model: expected a regular file, got a pipe";
+    check(
+        SERVER,
+        &format!("--task {}", path("model.toml").display()),
+        words,
+    );
 }

@@ -78,3 +78,21 @@ fn decisions_are_learned_on_a_neural_belief() {
     place.train("given", &filter);
     assert!(!place.path("given/belief").exists(), "the belief was given");
 }
+
+#[test]
+fn a_neural_belief_corrects_a_filter() {
+    let place = place();
+    place.train("filter", &format!("{WORLDS} --learner filter --steps 40"));
+    let filter = format!("--checkpoint {}", place.checkpoint("filter").display());
+    place.learn("out", &format!("{WORLDS} {filter} --steps 40"));
+    let again = place.words("out", &format!("{WORLDS} {filter} --resume"));
+    check(AGENT, &again, "--checkpoint: expected none beside --resume");
+    place.learn("out", &format!("{WORLDS} --resume"));
+    let checkpoint = format!("--checkpoint {}", place.checkpoint("out").display());
+    let worlds =
+        "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 --beam-width 4";
+    let policies = "--policies neural_beam --baseline neural_beam";
+    agent(&format!("compare {policies} {worlds} {checkpoint}")).check_prints("neural_beam");
+    let wrong = place.words("other", &format!("{WORLDS} {checkpoint}"));
+    check(AGENT, &wrong, "--checkpoint | what learned_filter acts on");
+}

@@ -4,7 +4,7 @@ use crate::config::{ConfigError, ServerConfig};
 use clap::{Args, ValueEnum};
 use emberwatch_protocol::Cell;
 use emberwatch_protocol::control::CoverageRule;
-use emberwatch_protocol::task::Start;
+use emberwatch_protocol::task::{Start, Task};
 use std::path::PathBuf;
 
 /// The settings of [`ServerConfig`] as flags; each overrides the file.
@@ -129,6 +129,9 @@ impl ServerFlags {
         set(&mut config.states, &self.states);
         set(&mut config.states_symmetries, &self.states_symmetries);
         set(&mut config.states_offset, &self.states_offset);
+        if self.task.as_deref() == Some("") {
+            Task::named("")?;
+        }
         if !config.task.is_empty() {
             self.check_beside("a task", &[])?;
         } else if !config.states.is_empty() {

@@ -6,6 +6,7 @@
 use emberwatch_protocol::grid::Shape;
 use emberwatch_protocol::model::{Description, Model};
 use emberwatch_protocol::program::read_text;
+use emberwatch_protocol::task::BUILT_IN_STATES;
 use ndarray::{Array3, ShapeBuilder};
 use ndarray_npy::npy::header::Header;
 use std::ffi::OsStr;
@@ -18,7 +19,7 @@ use zip::ZipArchive;
 
 /// Those that ship, by name: archive and description.
 const BUILT_IN: [(&str, &[u8], &str); 1] = [(
-    "jacksboro",
+    BUILT_IN_STATES[0],
     include_bytes!("../landscapes/jacksboro/jacksboro.npz"),
     include_str!("../landscapes/jacksboro/jacksboro.toml"),
 )];

@@ -1,5 +1,6 @@
 //! Tasks: worlds with a name, fixed completely, on which results can be compared.
 
+use crate::model::Model;
 use crate::model::grid::Cell;
 use crate::program::read_text;
 use serde::{Deserialize, Serialize};
@@ -9,6 +10,9 @@ use thiserror::Error;
 
 /// Most seeds of worlds that are compared on.
 pub const MAX_SEEDS: u64 = 100_000;
+
+/// Names of the recorded states that are built in.
+pub const BUILT_IN_STATES: [&str; 1] = ["jacksboro"];
 
 /// The built-in tasks by name.
 const BUILT_IN: [(&str, &str); 8] = [
@@ -98,6 +102,7 @@ impl Task {
     pub fn named(name: &str) -> Result<Self, TaskError> {
         let read = match BUILT_IN.iter().find(|(known, _)| *known == name) {
             Some((_, text)) => Self::from_toml(text),
+            None if name.is_empty() => Err("expected a name or a file, got \"\"".into()),
             None => Self::read(Path::new(name)),
         };
         let named = |task| Self {
@@ -121,6 +126,7 @@ impl Task {
     }
 
     fn read(path: &Path) -> Result<Self, String> {
+        check_kind(path)?;
         let text = read_text(path).map_err(|error| {
             let names: Vec<&str> = Self::built_in_names().collect();
             format!("{error}: expected one, or {}", names.join(", "))
@@ -134,11 +140,23 @@ impl Task {
             ));
         }
         let folder = path.parent().unwrap_or(Path::new(""));
-        for file in [&mut task.model, &mut task.states] {
+        let is_model = Model::built_in(&task.model).is_some();
+        let is_states = BUILT_IN_STATES.contains(&&*task.states);
+        for (setting, file, is_built_in) in [
+            ("model", &mut task.model, is_model),
+            ("states", &mut task.states, is_states),
+        ] {
             let beside = folder.join(&*file);
-            if !file.is_empty() && beside.exists() {
-                *file = beside.display().to_string();
+            if file.is_empty() || !beside.exists() {
+                continue;
             }
+            if is_built_in {
+                return Err(format!(
+                    "{setting}: expected a file with a name of its own, got {file}, which is built in (./{file} is the file)"
+                ));
+            }
+            check_kind(&beside).map_err(|problem| format!("{setting}: {problem}"))?;
+            *file = beside.display().to_string();
         }
         Ok(task)
     }
@@ -183,6 +201,17 @@ impl Task {
             return needs("test_seeds", &format!("1 to {MAX_SEEDS}"), &n_seeds);
         }
         Ok(())
+    }
+}
+
+/// Refuses pipes and devices, which may keep a reader waiting and cannot be read twice.
+fn check_kind(path: &Path) -> Result<(), String> {
+    match path.metadata() {
+        Ok(found) if !found.is_file() && !found.is_dir() => Err(format!(
+            "expected a regular file, got a pipe or device at {}",
+            path.display()
+        )),
+        _ => Ok(()),
     }
 }
 

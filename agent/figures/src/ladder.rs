@@ -1,4 +1,4 @@
-//! The ladder: one value per row as a bar, with its standard error and every single world.
+//! The ladder: one value per row as a bar, with an interval around it and every single world.
 
 use crate::axis::{Axis, is_drawable};
 use crate::palette::{Color, GRID, INK, PAPER, blend};
@@ -27,7 +27,7 @@ pub struct Ladder {
     pub bars: Vec<Bar>,
 }
 
-/// A row. What is not finite is not drawn.
+/// A row. What is not finite is not drawn: a value of NaN has no bar, only its worlds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bar {
     pub name: String,
@@ -36,8 +36,8 @@ pub struct Bar {
     pub label: String,
     pub color: Color,
     pub value: f64,
-    /// Its standard error; none where there is none.
-    pub error: Option<f64>,
+    /// The ends of its whisker.
+    pub ends: Option<[f64; 2]>,
     pub worlds: Vec<(u64, f64)>,
 }
 
@@ -112,9 +112,9 @@ impl Plot {
 
 impl Bar {
     fn extent(&self) -> impl Iterator<Item = f64> + '_ {
-        let error = self.error.unwrap_or(0.0);
         let worlds = self.worlds.iter().map(|world| world.1);
-        worlds.chain([self.value, self.value - error, self.value + error])
+        let ends = self.ends.into_iter().flatten();
+        worlds.chain(ends).chain([self.value])
     }
 
     fn draw(&self, page: &mut Svg, plot: &Plot, middle: f64) {
@@ -126,16 +126,13 @@ impl Bar {
             TextStyle::LABEL,
             &label,
         );
-        if !is_drawable(self.value) {
-            return;
-        }
-        let (zero, end) = (plot.x(0.0), plot.x(self.value));
         let (upper, lower) = (middle - BAR / 2.0, middle + BAR / 2.0);
-        page.rectangle((zero.min(end), upper), (zero.max(end), lower), self.color);
+        if is_drawable(self.value) {
+            let (zero, end) = (plot.x(0.0), plot.x(self.value));
+            page.rectangle((zero.min(end), upper), (zero.max(end), lower), self.color);
+        }
         self.draw_worlds(page, plot, upper);
-        let ends = self
-            .error
-            .map(|error| [self.value - error, self.value + error]);
+        let ends = self.ends;
         if let Some(ends) = ends.filter(|ends| ends.iter().all(|&end| is_drawable(end))) {
             let [from, to] = ends.map(|value| plot.x(value));
             page.rule((from, middle), (to, middle), 2.0, INK);

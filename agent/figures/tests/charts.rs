@@ -62,7 +62,7 @@ fn bar(name: &str, value: f64) -> Bar {
         label: "a value".into(),
         color: BLUE,
         value,
-        error: Some(value.abs() / 10.0),
+        ends: Some([0.9 * value, 1.1 * value]),
         worlds: vec![(3, value), (4, value * 1.2)],
     }
 }

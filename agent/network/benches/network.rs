@@ -123,6 +123,7 @@ fn neural_belief(c: &mut Criterion) {
             lessons.push(Lesson {
                 before: before.clone(),
                 frame: frame.clone(),
+                base: Vec::new(),
             });
         }
         for (cell, value) in frame {
@@ -132,11 +133,11 @@ fn neural_belief(c: &mut Criterion) {
     }
     let mut group = c.benchmark_group("neural belief");
     group.sample_size(20);
-    group.bench_function("update (torch, one thread: 40 ms)", |b| {
+    group.bench_function("update", |b| {
         b.iter(|| network.update(2e-3, &lessons).expect("finite"));
     });
-    group.bench_function("prediction (torch, one thread: 0.88 ms)", |b| {
-        b.iter(|| network.predict(&before).expect("a prediction"));
+    group.bench_function("prediction", |b| {
+        b.iter(|| network.predict(&before, None).expect("a prediction"));
     });
     group.finish();
 }

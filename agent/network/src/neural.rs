@@ -11,7 +11,7 @@ use crate::sightings::{Features, Sightings};
 use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::unet::UNet;
 use crate::variables::{Variables, build};
-use candle_core::{D, DType, Device, Tensor};
+use candle_core::{D, DType, Device, Shape, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
 use emberwatch_protocol::grid::Probabilities;
 use std::fmt;
@@ -48,6 +48,9 @@ pub struct Lesson {
     pub before: Sightings,
     /// The cells that the frame shows, by row-major index, and their values; at least one.
     pub frame: Vec<(usize, u8)>,
+    /// The distribution of each of these values as it was predicted by whom the network corrects, `[cells, O]`; empty if
+    /// it predicts alone.
+    pub base: Vec<f32>,
 }
 
 impl NeuralBelief {
@@ -97,11 +100,15 @@ impl NeuralBelief {
         Ok(set(&changes).map_err(NetworkError::from)?)
     }
 
-    /// The distribution of what each cell will show in the present step, `[O, H, W]`.
+    /// The distribution of what each cell will show in the present step, `[O, H, W]`. `base`: that of whom it corrects.
     ///
     /// # Errors
     /// For a number that is not finite, or where the device fails.
-    pub fn predict(&self, sightings: &Sightings) -> Result<Probabilities, NetworkError> {
+    pub fn predict(
+        &self,
+        sightings: &Sightings,
+        base: Option<&Probabilities>,
+    ) -> Result<Probabilities, NetworkError> {
         let crop = Crop::whole(sightings.shape());
         let mut features = Vec::new();
         self.features.add(sightings, &crop, &mut features);
@@ -111,6 +118,13 @@ impl NeuralBelief {
             .squeeze(0)?
             .narrow(0, 0, height)?
             .narrow(1, 0, width)?;
+        let logits = match base {
+            Some(base) => {
+                let base = base.view().permuted_axes([1, 2, 0]);
+                (logits + self.logarithms(base.iter(), (height, width, self.n_observations))?)?
+            }
+            None => logits,
+        };
         let probabilities = softmax(&logits.contiguous()?, D::Minus1)?;
         let n = self.n_observations;
         let probabilities = probabilities.affine(1.0 - n as f64 * LEAST, LEAST)?;
@@ -126,7 +140,7 @@ impl NeuralBelief {
     /// around these cells, and no more lessons than fit into a batch.
     ///
     /// # Panics
-    /// If there is no lesson, or one without cells.
+    /// If there is no lesson, or one without cells, or if some have a base and others have none.
     pub fn loss(&self, lessons: &[Lesson]) -> Result<Tensor, NetworkError> {
         let shape = lessons[0].before.shape();
         let extents = lessons.iter().map(|it| extent(shape, it.cells()));
@@ -147,6 +161,12 @@ impl NeuralBelief {
         let logits = self
             .unet
             .logits_at(&self.tensor(features, n, sides)?, &cells)?;
+        let base = lessons[..n].iter().flat_map(|lesson| &lesson.base);
+        let logits = if lessons[0].base.is_empty() {
+            logits
+        } else {
+            (logits + self.logarithms(base, (cells.len(), self.n_observations))?)?
+        };
         let values = Tensor::new(values, &self.device)?.unsqueeze(1)?;
         let log_p = log_softmax(&logits, D::Minus1)?.gather(&values, 1)?;
         Ok(log_p.mean_all()?.neg()?)
@@ -185,6 +205,15 @@ impl NeuralBelief {
         set(&changes).map_err(NetworkError::from)?;
         self.adam.set_steps(n_updates);
         Ok(())
+    }
+
+    fn logarithms<'a>(
+        &self,
+        probabilities: impl Iterator<Item = &'a f32>,
+        shape: impl Into<Shape>,
+    ) -> candle_core::Result<Tensor> {
+        let logarithms = probabilities.map(|p| p.max(LEAST as f32).ln());
+        Tensor::from_vec(logarithms.collect(), shape.into(), &self.device)
     }
 
     fn tensor(

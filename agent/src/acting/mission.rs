@@ -11,14 +11,16 @@ use emberwatch_protocol::client::Claim;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::model::{Description, ModelError};
+use emberwatch_protocol::task::Task;
+use std::fmt::Display;
 use std::ops::Range;
 use std::time::Duration;
 
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
-    /// The name of the task that the server must have; `None`: any, or none.
-    pub task: Option<String>,
+    /// The task that the server must have, and its model, unless it is recorded; `None`: any, or none.
+    pub task: Option<(Task, Option<Model>)>,
     pub world: u32,
     /// Which robots of the world to fly, on one belief.
     pub robots: Range<u32>,
@@ -62,14 +64,37 @@ impl Mission {
     }
 
     pub(super) fn check_task(&self, info: &ServerInfo) -> Result<()> {
-        let got = info.task.as_deref();
-        if let Some(expected) = self.task.as_deref().filter(|&task| got != Some(task)) {
-            bail!(
-                "instance {:?}: expected task {expected}, got {}",
-                self.instance.name(),
-                got.unwrap_or("none")
+        let Some((task, model)) = &self.task else {
+            return Ok(());
+        };
+        let same = |what: &str, expected: &dyn Display, got: &dyn Display| {
+            let (expected, got) = (expected.to_string(), got.to_string());
+            let instance = self.instance.name();
+            ensure!(
+                expected == got,
+                "instance {instance:?}: expected {what} {expected}, got {got}"
             );
-        }
+            Ok(())
+        };
+        same("task", &task.name, &info.task.as_deref().unwrap_or("none"))?;
+        let of_task = |what: &str| format!("the {what} of task {}:", task.name);
+        same(&of_task("moves"), &task.moves, &info.n_moves)?;
+        same(&of_task("robots"), &task.robots, &info.n_robots)?;
+        same(&of_task("max_steps"), &task.max_steps, &info.max_steps)?;
+        let Some(model) = model else {
+            return Ok(()); // a grid and states of the server's own
+        };
+        same(&of_task("height"), &task.height, &info.height)?;
+        same(&of_task("width"), &task.width, &info.width)?;
+        same(&of_task("burn_in"), &task.burn_in, &info.burn_in)?;
+        let got = info.model.as_deref().map(Model::from_toml).transpose()?;
+        ensure!(
+            got.as_ref().is_none_or(|got| got == model),
+            "instance {:?}: expected {} {}, got another",
+            self.instance.name(),
+            of_task("model"),
+            model.file().name
+        );
         Ok(())
     }
 

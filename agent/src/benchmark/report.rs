@@ -7,6 +7,7 @@ pub mod added;
 mod columns;
 pub mod events;
 pub mod figures;
+pub mod kept;
 pub mod leaderboard;
 mod merit;
 mod number;

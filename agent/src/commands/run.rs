@@ -9,6 +9,7 @@ use emberwatch_agent::config::AgentFlags;
 use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::policy::Policy;
 use emberwatch_network::DeviceKind;
+use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::Task;
@@ -79,7 +80,7 @@ impl RunCommand {
         }?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
-            task: self.task.as_ref().map(|task| task.name.clone()),
+            task: self.task.clone().map(task_with_model).transpose()?,
             world: self.world,
             robots: self
                 .robots
@@ -112,6 +113,11 @@ impl RunCommand {
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
     }
+}
+
+fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
+    let model = (!task.is_recorded()).then(|| model_named(&task.model));
+    Ok((task, model.transpose()?))
 }
 
 /// A rate at which observers see that the agent lives, and at which it is stopped within a second.

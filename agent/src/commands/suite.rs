@@ -1,14 +1,13 @@
 //! `suite`: policies on the test worlds of all tasks, and one score.
 
 use super::compare::run_comparison;
-use super::shared::{make_folder, write};
+use super::shared::{make_folder, model_named, write};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
 use emberwatch_agent::benchmark::compare::Comparison;
-use emberwatch_agent::benchmark::report::added::read_csv;
+use emberwatch_agent::benchmark::report::kept::Kept;
 use emberwatch_agent::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
-use emberwatch_agent::benchmark::report::{PolicyRun, write_csv};
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnServer;
 use emberwatch_agent::config::{AgentConfig, AgentFlags};
@@ -38,7 +37,8 @@ pub struct SuiteCommand {
     /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// A folder for results, a CSV file a task; what it has already is not run again
+    /// A folder for results, a CSV file a task; what it has already is not run again, unless checkpoint or
+    /// settings are others
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Worlds of each task, the first of its test seeds [default: all]
@@ -81,45 +81,74 @@ impl SuiteCommand {
                 folder.display()
             );
         }
+        let plans = tasks.into_iter().map(|task| {
+            let name = task.name.clone();
+            let plan = self.plan(task, &config);
+            plan.with_context(|| format!("task {name}"))
+        });
+        let plans = plans.collect::<Result<Vec<_>>>()?;
         make_folder(&self.out)?;
-        let runs = tasks.iter().map(|task| {
-            self.runs(task, &config)
-                .with_context(|| format!("task {}", task.name))
+        let runs = plans.into_iter().map(|plan| {
+            let name = plan.task.name.clone();
+            let runs = self.carry_out(plan, &config);
+            runs.with_context(|| format!("task {name}"))
         });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
     }
 
-    /// All runs of a task; those that are missing are made and added to its file, policy by policy.
-    fn runs(&self, task: &Task, config: &AgentConfig) -> Result<TaskRuns> {
-        let path = self.out.join(format!("{}.csv", task.name));
-        let mut runs = if path.exists() {
-            read_csv(&path).with_context(|| path.display().to_string())?
-        } else {
-            Vec::new()
-        };
-        let learned = self.learned(task)?;
-        let seeds = self.seeds(task);
+    /// What there is of a task, and what is missing; all names are checked before anything runs.
+    fn plan(&self, task: Task, config: &AgentConfig) -> Result<Plan> {
+        let (learned, checkpoint) = self.learned(&task)?;
+        let seeds = self.seeds(&task);
+        let model = self.model(&task, &seeds)?;
+        let kept = Kept::read(&self.out, &task.name)?;
         let names = [FLOOR, CEILING]
             .into_iter()
             .chain(self.policies.iter().map(|name| &**name));
-        let missing = names.filter(|name| !is_done(&runs, name, &seeds, task.max_steps));
-        let (missing, left): (Vec<&str>, Vec<&str>) =
-            missing.partition(|name| can_run(name, task, &learned));
-        if !left.is_empty() {
-            let (task, policies) = (&task.name, left.join(", "));
-            tracing::warn!("task {task}: without {policies}, which need a model or --checkpoints");
+        let policies = names.map(|name| Policy::named(name, &model));
+        let mut missing = Vec::new();
+        for policy in policies.collect::<Result<Vec<_>>>()? {
+            let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
+            let mark = fingerprint(&task, &model, config, of_checkpoint)?;
+            if !can_run(&policy, &task, &learned) {
+                let (task, policy) = (&task.name, &policy.name);
+                tracing::warn!(
+                    "task {task}: {policy} is not run: it needs a model or --checkpoints"
+                );
+            } else if !kept.has(&policy.name, &mark, &seeds, task.max_steps) {
+                missing.push((policy, mark));
+            }
         }
+        Ok(Plan {
+            task,
+            learned,
+            seeds,
+            kept,
+            missing,
+        })
+    }
+
+    /// All runs of a task; those that are missing are made and added to its file, policy by policy.
+    fn carry_out(&self, plan: Plan, config: &AgentConfig) -> Result<TaskRuns> {
+        let Plan {
+            task,
+            learned,
+            seeds,
+            mut kept,
+            missing,
+        } = plan;
         if !missing.is_empty() {
-            let (mut arena, _server) = self.open(task, &seeds)?;
+            let (mut arena, _server) = self.open(&task, &seeds)?;
             let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
             ensure!(
                 task.max_steps <= longest,
                 "max_steps: expected at most {longest}, as the shortest episode has, got {}",
                 task.max_steps
             );
-            for name in missing {
+            for (policy, mark) in missing {
+                let name = policy.name.clone();
                 let comparison = Comparison {
-                    policies: vec![Policy::named(name, arena.model())?],
+                    policies: vec![policy],
                     teams: vec![if task.robots > 1 {
                         Team::Shared
                     } else {
@@ -132,15 +161,13 @@ impl SuiteCommand {
                     learned: learned.clone(),
                 };
                 let results = run_comparison(&mut arena, &comparison)?;
-                runs.retain(|run| run.policy != name);
-                runs.extend(results.runs);
-                write_csv(&path, &runs)?;
+                kept.replace(name, mark, results.runs)?;
             }
         }
-        runs.retain(|run| seeds.contains(&run.world_seed));
+        kept.runs.retain(|run| seeds.contains(&run.world_seed));
         Ok(TaskRuns {
-            task: task.name.clone(),
-            runs,
+            task: task.name,
+            runs: kept.runs,
         })
     }
 
@@ -152,16 +179,28 @@ impl SuiteCommand {
                 .map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
     }
 
-    fn learned(&self, task: &Task) -> Result<Learned> {
+    /// What was learned of a task, and the checksum of its file.
+    fn learned(&self, task: &Task) -> Result<(Learned, Option<u32>)> {
         let Some(folder) = &self.checkpoints else {
-            return Ok(Learned::default());
+            return Ok((Learned::default(), None));
         };
         let place = folder.join(&task.name).join(CHECKPOINT);
         if !place.exists() {
             tracing::warn!("no {}: no learned policy for this task", place.display());
-            return Ok(Learned::default());
+            return Ok((Learned::default(), None));
         }
-        Learned::read([&*place], &Device::Cpu)
+        let learned = Learned::read([&*place], &Device::Cpu)?;
+        let bytes = std::fs::read(&place).with_context(|| place.display().to_string())?;
+        Ok((learned, Some(crc32fast::hash(&bytes))))
+    }
+
+    /// What states are called; of recorded worlds their server tells.
+    fn model(&self, task: &Task, seeds: &Range<u64>) -> Result<Model> {
+        if !task.is_recorded() {
+            return model_named(&task.model);
+        }
+        let (arena, _server) = self.open(task, seeds)?;
+        Ok(arena.model().clone())
     }
 
     /// A server with a task's worlds, which stops when it is dropped.
@@ -185,20 +224,35 @@ impl SuiteCommand {
     }
 }
 
-/// Whether a policy has what it needs on a task.
-fn can_run(name: &str, task: &Task, learned: &Learned) -> bool {
-    // A name that only the task's own model has is of a policy that needs no more than that model.
-    let policy = Policy::named(name, &Model::wildfire()).ok();
-    policy.is_none_or(|policy| {
-        learned.suits(&policy) && !(task.is_recorded() && policy.estimator.knows_model())
-    })
+/// What is to be done on a task.
+struct Plan {
+    task: Task,
+    learned: Learned,
+    seeds: Range<u64>,
+    kept: Kept,
+    /// Policies to run, each with its fingerprint.
+    missing: Vec<(Policy, String)>,
 }
 
-/// Whether a policy was run on all these worlds, for so many steps.
-fn is_done(runs: &[PolicyRun], policy: &str, seeds: &Range<u64>, steps: u64) -> bool {
-    let has = |seed| {
-        runs.iter()
-            .any(|run| (&*run.policy, run.world_seed, run.steps) == (policy, seed, steps))
+/// Whether a policy has what it needs on a task.
+fn can_run(policy: &Policy, task: &Task, learned: &Learned) -> bool {
+    learned.suits(policy) && !(task.is_recorded() && policy.estimator.knows_model())
+}
+
+/// A checksum of all that the runs of a policy depend on, beside its name, seeds and steps.
+fn fingerprint(
+    task: &Task,
+    model: &Model,
+    config: &AgentConfig,
+    checkpoint: Option<u32>,
+) -> Result<String> {
+    // The name of a built-in task and the path of its file are one.
+    let task = Task {
+        source: String::new(),
+        ..task.clone()
     };
-    seeds.clone().all(has)
+    let (model, config) = (toml::to_string(model.file())?, toml::to_string(config)?);
+    let version = env!("CARGO_PKG_VERSION");
+    let text = format!("{version}\n{task:?}\n{model}\n{config}\n{checkpoint:?}");
+    Ok(format!("{:08x}", crc32fast::hash(text.as_bytes())))
 }

@@ -48,7 +48,8 @@ pub struct TrainCommand {
     /// Whose belief decisions are learned on [default: learned_filter, or the checkpoint's to go on from]
     #[arg(long, value_name = "NAME")]
     estimator: Option<EstimatorKind>,
-    /// That belief, of an earlier training; without it, one is learned first
+    /// That belief, of an earlier training; without it, one is learned first. With --learner neural: a filter, whose
+    /// belief the network then corrects
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     /// Seconds to act for, with a belief that is learned first
@@ -136,20 +137,24 @@ impl TrainCommand {
         })
     }
 
-    /// The belief that was given for decisions; refuses what would be ignored.
+    /// The belief that was given for decisions, or for a network to correct; refuses what would be ignored.
     fn learned(&self, config: &AgentConfig, device: &Device) -> Result<Learned> {
-        let flags = [
-            ("--estimator", self.estimator.is_some()),
-            ("--checkpoint", self.checkpoint.is_some()),
-        ];
-        for (flag, is_given) in flags {
-            ensure!(
-                !is_given || config.learner == LearnerKind::Decisions,
-                "{flag}: expected none, or --learner decisions"
-            );
-        }
+        let is_neural = config.learner == LearnerKind::Neural;
+        let decides = config.learner == LearnerKind::Decisions;
+        ensure!(
+            self.estimator.is_none() || decides,
+            "--estimator: expected none, or --learner decisions"
+        );
+        ensure!(
+            self.checkpoint.is_none() || decides || is_neural,
+            "--checkpoint: expected none, or --learner decisions or neural"
+        );
         let learned = Learned::read(self.checkpoint.as_deref(), device)?;
-        let estimator = config.decisions.estimator;
+        let estimator = if is_neural {
+            EstimatorKind::LEARNED
+        } else {
+            config.decisions.estimator
+        };
         if let Some(path) = &self.checkpoint {
             ensure!(
                 learned.belief(estimator).is_some(),
@@ -169,6 +174,7 @@ impl TrainCommand {
             if training.config.learner == LearnerKind::Neural
                 && let Some(contents) = &contents
             {
+                self.check_no_checkpoint()?;
                 self.go_on_for(contents.state::<SavedNeural>()?.world_steps, training)?;
             }
             return Ok(contents);
@@ -212,12 +218,17 @@ impl TrainCommand {
             expected.label(),
             got.label()
         );
+        self.check_no_checkpoint()?;
+        training.config.decisions.estimator = estimator;
+        Ok(())
+    }
+
+    fn check_no_checkpoint(&self) -> Result<()> {
         ensure!(
             self.checkpoint.is_none(),
             "--checkpoint: expected none beside --resume, which goes on with the belief of {}",
             self.out.display()
         );
-        training.config.decisions.estimator = estimator;
         Ok(())
     }
 

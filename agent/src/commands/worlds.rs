@@ -29,7 +29,7 @@ pub struct WorldFlags {
     /// World seeds, first..end [default: 0..8, or those to test the task on]
     #[arg(long, value_parser = parse_seeds)]
     seeds: Option<Range<u64>>,
-    /// Scored steps of each world [default: 1500, or as many as the shortest episode has]
+    /// Scored steps of each world [default: those of the task, or 1500, or as many as the shortest episode has]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     /// Steps simulated before the first scored one [default: 25000, or the running server's]
@@ -126,7 +126,9 @@ impl WorldFlags {
     /// Scored steps, as many as were asked for or as the benchmark has, if episodes are as long.
     pub fn steps(&self, info: &ServerInfo) -> Result<u64> {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
-        let steps = self.steps.unwrap_or(BENCHMARK_STEPS.min(longest));
+        let of_task = self.task().map(|task| task.max_steps);
+        let usual = of_task.unwrap_or(BENCHMARK_STEPS.min(longest));
+        let steps = self.steps.unwrap_or(usual);
         ensure!(
             steps <= longest,
             "--steps: expected at most {longest}, as the shortest episode has, got {steps}"

@@ -10,7 +10,7 @@ use std::time::SystemTime;
 /// Most files that are kept.
 const MAX_FILES: usize = 32;
 
-/// Most bytes of a file: a belief about 512 x 512 cells in four states.
+/// Most bytes of a belief: one about 512 x 512 cells in four states.
 const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
@@ -29,8 +29,7 @@ impl KeptBelief {
     pub fn new(key: String, dim: (usize, usize, usize)) -> Option<Self> {
         let name = format!("{:08x}.belief", crc32fast::hash(key.as_bytes()));
         let path = cache_folder()?.join("emberwatch/beliefs").join(name);
-        let kept = Self { path, key, dim };
-        (kept.n_bytes() <= MAX_BYTES).then_some(kept)
+        (n_value_bytes(dim) <= MAX_BYTES).then_some(Self { path, key, dim })
     }
 
     /// The belief, if it was kept.
@@ -68,9 +67,12 @@ impl KeptBelief {
     }
 
     fn n_bytes(&self) -> usize {
-        let (n_states, height, width) = self.dim;
-        self.key.len() + n_states * height * width * size_of::<f32>() + CHECKSUM_BYTES
+        self.key.len() + n_value_bytes(self.dim) + CHECKSUM_BYTES
     }
+}
+
+fn n_value_bytes((n_states, height, width): (usize, usize, usize)) -> usize {
+    n_states * height * width * size_of::<f32>()
 }
 
 /// `XDG_CACHE_HOME`, or `.cache` in the home folder; relative paths do not count.
@@ -104,6 +106,13 @@ fn remove_oldest(folder: &Path, most: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_belief_of_the_most_bytes_is_kept_and_none_above() {
+        let is_kept = |dim| KeptBelief::new("a key".into(), dim).is_some();
+        assert!(cache_folder().is_some(), "expected HOME");
+        assert_eq!([(4, 512, 512), (4, 512, 513)].map(is_kept), [true, false]);
+    }
 
     #[test]
     fn the_oldest_files_go() {

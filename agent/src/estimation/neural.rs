@@ -1,17 +1,21 @@
-//! The neural belief as an estimator: what each cell showed and when, and what a network makes of it.
+//! The neural belief as an estimator: what each cell showed and when, and what a network makes of it, alone or as a
+//! correction of a filter's belief.
 //!
 //! The belief is about observations, S = O: after a frame, visited cells are what they showed.
 
-use emberwatch_belief::estimation::bayes::correct;
+use emberwatch_belief::estimation::bayes::{correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
 use emberwatch_network::{NetworkError, NeuralBelief, Sightings};
+use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::{Frame, Shape};
 use ndarray::Array2;
 use std::borrow::Cow;
 
 pub struct NeuralEstimator {
     network: NeuralBelief,
+    /// Whose belief the network corrects.
+    filter: Option<Box<dyn Estimator>>,
     sightings: Sightings,
     /// What frames of the present step will show; after a frame, what it showed at visited cells.
     belief: Belief,
@@ -22,12 +26,17 @@ pub struct NeuralEstimator {
 }
 
 impl NeuralEstimator {
-    /// Before the first frame.
-    pub fn new(network: &NeuralBelief, shape: Shape) -> Result<Self, NetworkError> {
+    /// Before the first frame; `filter`: whose belief the network corrects, if it was learned so.
+    pub fn new(
+        network: &NeuralBelief,
+        filter: Option<Box<dyn Estimator>>,
+        shape: Shape,
+    ) -> Result<Self, NetworkError> {
         let sightings = Sightings::new(shape);
         Ok(Self {
-            belief: predicted(network, &sightings)?,
+            belief: predicted(network, filter.as_deref(), &sightings)?,
             network: network.clone(),
+            filter,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
             failure: None,
@@ -42,6 +51,9 @@ impl Estimator for NeuralEstimator {
         if let Some(failure) = self.failure.take() {
             return Err(EstimatorError::Network(failure.into()));
         }
+        if let Some(filter) = &mut self.filter {
+            filter.correct(frame)?;
+        }
         correct(&mut self.belief, &self.likelihood, frame)?;
         self.sightings.see(frame);
         Ok(())
@@ -49,7 +61,10 @@ impl Estimator for NeuralEstimator {
 
     fn predict(&mut self) {
         self.sightings.pass();
-        match predicted(&self.network, &self.sightings) {
+        if let Some(filter) = &mut self.filter {
+            filter.predict();
+        }
+        match predicted(&self.network, self.filter.as_deref(), &self.sightings) {
             Ok(belief) => self.belief = belief,
             Err(failure) => self.failure = Some(failure),
         }
@@ -61,6 +76,10 @@ impl Estimator for NeuralEstimator {
 
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         Some(Cow::Borrowed(&self.likelihood))
+    }
+
+    fn base(&self) -> Option<&dyn Estimator> {
+        self.filter.as_deref()
     }
 
     fn handover(&self) -> Option<&dyn Handover> {
@@ -78,34 +97,56 @@ impl Handover for NeuralEstimator {
         let numbers = numbers.iter().flat_map(|(_, _, numbers)| numbers);
         let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
         let checksum = crc32fast::hash(&bytes);
-        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings")
+        let filter = self.base().and_then(|it| it.handover());
+        let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
+        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
     }
 
     fn to_bytes(&self) -> Vec<u8> {
-        [self.belief.to_bytes(), self.sightings.to_bytes()].concat()
+        let filter = self.base().and_then(|it| it.handover());
+        let filter = filter.map_or(Vec::new(), Handover::to_bytes);
+        [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
 
     fn restore(&mut self, bytes: &[u8]) -> bool {
         let dim = self.belief.probabilities().dim();
         let n_bytes = 4 * self.belief.as_slice().len();
-        let Some((belief, sightings)) = bytes.split_at_checked(n_bytes) else {
+        let Some((belief, rest)) = bytes.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let n_bytes = self.sightings.to_bytes().len();
+        let Some((sightings, rest)) = rest.split_at_checked(n_bytes) else {
             return false;
         };
         let belief = Belief::from_bytes(belief, dim);
         let sightings = Sightings::from_bytes(sightings, self.sightings.shape(), dim.0);
-        let restored = belief.zip(sightings);
-        let is_taken = restored.is_some();
-        if let Some((belief, sightings)) = restored {
-            (self.belief, self.sightings, self.failure) = (belief, sightings, None);
+        let Some((belief, sightings)) = belief.zip(sightings) else {
+            return false;
+        };
+        let filter = self.filter.as_mut().and_then(|it| it.handover_mut());
+        if !filter.map_or(rest.is_empty(), |filter| filter.restore(rest)) {
+            return false;
         }
-        is_taken
+        (self.belief, self.sightings, self.failure) = (belief, sightings, None);
+        true
     }
 }
 
-fn predicted(network: &NeuralBelief, sightings: &Sightings) -> Result<Belief, NetworkError> {
-    let probabilities = network.predict(sightings)?;
+fn predicted(
+    network: &NeuralBelief,
+    filter: Option<&dyn Estimator>,
+    sightings: &Sightings,
+) -> Result<Belief, NetworkError> {
+    let base = filter.and_then(predicted_observations);
+    let probabilities = network.predict(sightings, base.as_ref())?;
     let belief = Belief::from_probabilities(probabilities);
     Ok(belief.expect("invariant: a softmax is on the simplex"))
+}
+
+/// What an estimator whose belief is about X_{k+1} expects frames to show, `[O, H, W]`.
+pub fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
+    let likelihood = estimator.likelihood()?;
+    Some(observations(estimator.belief(), &likelihood))
 }
 
 #[cfg(test)]
@@ -115,7 +156,7 @@ mod tests {
 
     fn estimator() -> NeuralEstimator {
         let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-        NeuralEstimator::new(&network, shape()).expect("a belief")
+        NeuralEstimator::new(&network, None, shape()).expect("a belief")
     }
 
     fn shape() -> Shape {
@@ -158,7 +199,7 @@ mod tests {
         assert!(second.restore(&bytes));
         assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
         let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
-        let other = NeuralEstimator::new(&other, shape()).expect("a belief");
+        let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
         assert_ne!(other.kind(), first.kind());
     }
 }

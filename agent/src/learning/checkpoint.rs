@@ -29,7 +29,7 @@ const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 
 /// Changes with what any state holds.
-const VERSION: &str = "3";
+const VERSION: &str = "4";
 
 /// The tensor of bytes.
 const STATE: &str = "state";
@@ -362,9 +362,9 @@ mod tests {
         };
         let words = "expected a checkpoint of others, got one of tests";
         assert_eq!(refused("others", "kernel", "kernel"), words);
-        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"3""#, "none")] {
-            let words = format!("emberwatch.format: expected 3, got {got}");
-            assert_eq!(refused("tests", r#"format":"3""#, to), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"4""#, "none")] {
+            let words = format!("emberwatch.format: expected 4, got {got}");
+            assert_eq!(refused("tests", r#"format":"4""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();

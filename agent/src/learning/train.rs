@@ -100,12 +100,8 @@ impl TrainingLoop {
         contents: Option<Contents>,
     ) -> Result<Self> {
         let place = spec.out.join(CHECKPOINT);
-        if let Some(contents) = &contents
-            && toml::to_string(&spec.config)? != contents.settings
-        {
-            tracing::warn!(
-                "settings: other than the checkpoint was trained with; these hold from here on"
-            );
+        if let Some(contents) = &contents {
+            warn_of_other_settings(spec, contents)?;
         }
         let connection = connect(instance)?;
         let claim = Claim {
@@ -120,12 +116,7 @@ impl TrainingLoop {
         if spec.freeze {
             learner.freeze();
         }
-        let mut observations = client.observe(client.robots())?;
-        let over = ended(&client, &observations);
-        for (robot, seen) in reset(&mut client, &over)? {
-            observations[(robot - client.robots().start) as usize] = seen;
-        }
-        let attached = learner.attach(observations);
+        let attached = learner.attach(running(&mut client)?);
         let n_gone_on = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
         let n_new = client.robots().len() - n_gone_on;
         if spec.resume && n_new > 0 {
@@ -156,9 +147,10 @@ impl TrainingLoop {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
-            let updates = match spec.freeze {
-                true => Ok(Vec::new()),
-                false => self.learner.learn(),
+            let updates = if spec.freeze {
+                Ok(Vec::new())
+            } else {
+                self.learner.learn()
             };
             let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             self.summary.updates = self.learner.n_updates();
@@ -257,6 +249,25 @@ impl Told {
             score: Score::default(),
         }
     }
+}
+
+fn warn_of_other_settings(spec: &TrainingSpec, contents: &Contents) -> Result<()> {
+    if toml::to_string(&spec.config)? != contents.settings {
+        tracing::warn!(
+            "settings: other than the checkpoint was trained with; these hold from here on"
+        );
+    }
+    Ok(())
+}
+
+/// What the client's robots show, in new episodes where the last ones have ended.
+fn running(client: &mut Client) -> Result<Vec<Observation>, ConnectionError> {
+    let mut observations = client.observe(client.robots())?;
+    let over = ended(client, &observations);
+    for (robot, seen) in reset(client, &over)? {
+        observations[(robot - client.robots().start) as usize] = seen;
+    }
+    Ok(observations)
 }
 
 fn is_over(seen: &Observation) -> bool {

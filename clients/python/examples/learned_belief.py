@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from emberwatch.benchmark import evaluate, summary
+from emberwatch.benchmark import evaluate, suite, summary
 from emberwatch.model import Model
 from emberwatch.planning import beam_search
 
@@ -272,6 +272,7 @@ def arguments() -> argparse.Namespace:
         help="seeds, FIRST..END; below 1000: test",
     )
     parser.add_argument("--steps", type=positive, default=100, help="paths of each world evaluated")
+    parser.add_argument("--suite", type=Path, help="a folder: test on the task small instead")
     parser.add_argument("--load", type=Path, help="a network to begin with")
     parser.add_argument("--name", default="learned_belief", help="in the benchmark's table")
     parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
@@ -296,15 +297,17 @@ def main() -> None:
     training.learn()
     training.envs.close()
     draw(args.out)
+    shared = {"name": args.name, "env": ENV, "estimator": "network", "observation": PARTS}
+    if args.suite is not None:
+        rows = suite(training.policy, folder=args.suite, tasks=["small"], timeout=60.0, **shared)
+        print(summary(rows["small"]))
+        return
     rows = evaluate(
         training.policy,
-        name=args.name,
-        env=ENV,
-        estimator="network",
         seeds=args.evaluate,
         steps=args.steps,
         csv=args.out / "rows.csv",
-        observation=PARTS,
+        **shared,
         **world(args),
     )
     print(summary(rows))

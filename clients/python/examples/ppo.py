@@ -23,7 +23,7 @@ import torch
 from torch import nn
 from torch.distributions import Categorical
 
-from emberwatch.benchmark import evaluate, summary
+from emberwatch.benchmark import evaluate, suite, summary
 from emberwatch.planning import beam_search
 
 ENV = "emberwatch/WildfireMoves-v0"
@@ -303,6 +303,7 @@ def arguments() -> argparse.Namespace:
         "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
     )
     parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--suite", type=Path, help="a folder: test on the task small instead")
     parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
     parser.add_argument("--load", type=Path, help="a network to begin with")
     parser.add_argument("--name", default="ppo", help="in the benchmark's table")
@@ -336,16 +337,22 @@ def main() -> None:
     training.envs.close()
     training.log.close()
     draw(args.out)
-    first, end = map(int, args.evaluate.split(".."))
-    rows = evaluate(
-        acting(training.network, sampled=args.sampled),
-        name=args.name,
-        seeds=range(first, end),
-        steps=args.steps,
-        csv=args.out / "rows.csv",
-        observation=args.observation,
-        **world(args),
-    )
+    policy = acting(training.network, sampled=args.sampled)
+    shared = {"name": args.name, "observation": args.observation}
+    if args.suite is not None:
+        rows = suite(
+            policy, folder=args.suite, tasks=["small"], window=args.window, timeout=60.0, **shared
+        )["small"]
+    else:
+        first, end = map(int, args.evaluate.split(".."))
+        rows = evaluate(
+            policy,
+            seeds=range(first, end),
+            steps=args.steps,
+            csv=args.out / "rows.csv",
+            **shared,
+            **world(args),
+        )
     print(summary(rows))
 
 

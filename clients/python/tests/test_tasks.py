@@ -87,20 +87,22 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
 
 @pytest.mark.parametrize("name", PREFIXES)
 def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
-    n_rows = 2 * built_in_tasks()[name].robots
-    worlds: list[Any] = [
-        gymnasium.make_vec(f"emberwatch/{PREFIXES[name]}-v0", num_envs=n_rows),
-        gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=n_rows, **by_hand(name)),
-    ]
-    first, second = [rollout(envs, 3, seed=5) for envs in worlds]
-    assert_same(first, second)
-    for envs in worlds:
-        envs.close()
+    task = built_in_tasks()[name]
+    n_rows = 2 * task.robots
+    for kind, steps in (("-v0", 3), ("Moves-v0", 2 * task.n_moves)):
+        worlds: list[Any] = [
+            gymnasium.make_vec(f"emberwatch/{PREFIXES[name]}{kind}", num_envs=n_rows),
+            gymnasium.make_vec(f"emberwatch/Wildfire{kind}", num_envs=n_rows, **by_hand(name)),
+        ]
+        first, second = [rollout(envs, steps, seed=5) for envs in worlds]
+        assert_same(first, second)
+        for envs in worlds:
+            envs.close()
 
 
 @pytest.mark.parametrize("name", ALONE)
 def test_gymnasium_finds_no_fault(name: str) -> None:
-    for kind in ("-v0", "Moves-v0"):
+    for kind in ("-v0", "Moves-v0", "Objective-v1"):
         with no_warnings():
             env = gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}", disable_env_checker=True)
             check_env(env.unwrapped, skip_render_check=True)
@@ -162,6 +164,40 @@ def test_a_running_server_must_have_the_task() -> None:
         env.close()
         with refuses("task: expected 'small', as the server has, or None, got 'sparse'"):
             gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
+        with refuses("task ash: No such file"):
+            gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task="ash")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("small", "moves = 16", "moves = 15", "moves of task 'own': expected 16, as the server"),
+        ("small", "burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected 3000, as"),
+        ("small", "max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected 300"),
+        ("small", "wildfire-small", "wildfire", "states of task 'own': expected those that the"),
+        ("team", "robots = 4", "robots = 3", "robots of task 'own': expected 4, as the server"),
+    ],
+)
+def test_a_running_server_must_run_what_the_task_says(
+    tmp_path: Path, name: str, old: str, new: str, words: str
+) -> None:
+    file = tmp_path / "own.toml"
+    text = (CONFIG / f"tasks/{name}.toml").read_text("utf-8").replace(f'"{name}"', '"own"')
+    file.write_text(text, "utf-8")
+    plain = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
+    with serving(task=file, **plain) as lab:
+        env = gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task=file, robot=0)
+        env.reset()
+        env.close()
+        assert old in text
+        file.write_text(text.replace(old, new), "utf-8")
+        with refuses(words):
+            gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task=file, robot=0)
+
+
+def test_a_task_needs_a_name() -> None:
+    with refuses('task : expected a name or a file, got ""'):
+        gymnasium.make("emberwatch/Wildfire-v0", task="")
 
 
 def test_an_evaluation_takes_seeds_and_steps_of_its_task(tmp_path: Path) -> None:

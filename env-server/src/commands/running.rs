@@ -6,6 +6,7 @@ use clap::Args;
 use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus};
+use serde::Serialize;
 use std::time::Duration;
 
 /// How long to wait for the server.
@@ -35,13 +36,24 @@ struct Target {
     json: bool,
 }
 
+/// The answer to `status`, with the task that the worlds are, if any.
+#[derive(Serialize)]
+struct NamedStatus<'a> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    task: Option<&'a str>,
+    #[serde(flatten)]
+    status: ServerStatus,
+}
+
 impl StatusCommand {
     /// Prints the answer.
     pub fn run(&self) -> Result<()> {
         let (info, reply) = self.target.ask(&Request::Status {})?;
         match reply {
             Reply::Status(status) if self.target.json => {
-                print(&(serde_json::to_string_pretty(&status)? + "\n"))
+                let task = info.task.as_deref();
+                let named = NamedStatus { task, status };
+                print(&(serde_json::to_string_pretty(&named)? + "\n"))
             }
             Reply::Status(status) => print(&describe(&self.target.instance, &info, &status)),
             other => anyhow::bail!("expected a status, got {other:?}"),

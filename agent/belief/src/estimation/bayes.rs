@@ -1,6 +1,7 @@
 //! Bayes' rule on the cells that a frame shows (paper eqs. 5 and 10).
 
 use crate::estimation::belief::Belief;
+use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::{Cell, Frame};
 use ndarray::Array2;
 use thiserror::Error;
@@ -15,6 +16,22 @@ pub struct ZeroEvidence {
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<f32>,
+}
+
+/// The distribution of what each cell shows, `[O, H, W]`, under a belief: `B' u`. `likelihood` is `P(y | x)`, `[S, O]`.
+///
+/// # Panics
+/// If the likelihood is of another number of states.
+pub fn observations(belief: &Belief, likelihood: &Array2<f64>) -> Probabilities {
+    let (height, width) = belief.shape().dim();
+    let (n_states, n_observations) = likelihood.dim();
+    let states = belief.view();
+    let states = states.to_shape((n_states, height * width));
+    let states = states.expect("likelihood: expected the belief's states");
+    let observations = likelihood.t().mapv(|p| p as f32).dot(&states);
+    let dim = (n_observations, height, width);
+    let observations = observations.into_shape_with_order(dim);
+    observations.expect("invariant: one number per observation and cell")
 }
 
 /// Bayes' rule on the cells that a frame shows, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.

@@ -29,6 +29,11 @@ pub trait Estimator: Send {
         None
     }
 
+    /// The estimator whose belief it begins with in each step, if it corrects another's.
+    fn base(&self) -> Option<&dyn Estimator> {
+        None
+    }
+
     /// The hidden vector `h_k` behind the belief, for a DQN that decides on it (paper section III.E).
     fn hidden(&self) -> Option<&[f32]> {
         None

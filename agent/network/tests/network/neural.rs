@@ -94,6 +94,7 @@ fn lessons(n: u64) -> Vec<Lesson> {
         lessons.push(Lesson {
             before: before.clone(),
             frame: frame.clone(),
+            base: Vec::new(),
         });
         for (cell, value) in frame {
             before.see_cell(cell, value);
@@ -117,7 +118,9 @@ fn one_and_more_threads_give_the_same_bits_and_so_does_a_resume() {
     let learn = |network: &mut NeuralBelief| {
         let losses = lessons.chunks(10).map(|batch| network.update(2e-3, batch));
         let losses: Vec<f64> = losses.map(|loss| loss.expect("finite")).collect();
-        let belief = network.predict(&lessons[20].before).expect("a belief");
+        let belief = network
+            .predict(&lessons[20].before, None)
+            .expect("a belief");
         (losses, belief, tensors(network))
     };
     let on = |n_threads| rayon_pool(n_threads).install(|| learn(&mut neural()));
@@ -155,11 +158,51 @@ fn it_learns_where_what_is_seen() {
     }
     // Half of the cells always show 1, the others one of two values: ln 2 / 2 if nothing else is known.
     assert!(loss(&network) < 0.4, "{}", loss(&network));
-    let belief = network.predict(&lessons[50].before).expect("a belief");
+    let belief = network
+        .predict(&lessons[50].before, None)
+        .expect("a belief");
     assert_eq!(belief.dim(), (3, 21, 18));
     assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));
     let sums = belief.sum_axis(ndarray::Axis(0));
     assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
+}
+
+#[test]
+fn it_corrects_the_distributions_of_another() {
+    let (mut network, mut lessons) = (neural(), lessons(60));
+    // Knows all but which of the two values: that the steps tell.
+    let base = |cell: usize| {
+        if cell % 18 < 9 {
+            [0.1, 0.8, 0.1]
+        } else {
+            [0.45, 0.1, 0.45]
+        }
+    };
+    for lesson in &mut lessons {
+        lesson.base = lesson.frame.iter().flat_map(|it| base(it.0)).collect();
+    }
+    let loss = |network: &NeuralBelief| numbers(&network.loss(&lessons[50..]).expect("a loss"))[0];
+    let of_last = lessons[50..].iter().flat_map(|lesson| &lesson.frame);
+    let (mut sum, mut n) = (0.0, 0.0);
+    for (cell, value) in of_last {
+        sum -= f64::from(base(*cell)[usize::from(*value)]).ln();
+        n += 1.0;
+    }
+    let difference = loss(&network) - sum / n;
+    assert!(
+        difference.abs() < 1e-5,
+        "as the other at first: {difference}"
+    );
+    let of_cells = ndarray::Array3::from_shape_fn((3, 21, 18), |(y, _, col)| base(col)[y]);
+    let belief = network.predict(&lessons[50].before, Some(&of_cells));
+    let belief = belief.expect("a belief");
+    let differences = belief.iter().zip(&of_cells).map(|(a, b)| (a - b).abs());
+    assert!(differences.fold(0.0, f32::max) < 1e-5);
+    for update in 0..100 {
+        let batch = &lessons[update % 40..][..10];
+        network.update(5e-3, batch).expect("finite");
+    }
+    assert!(loss(&network) < 0.4, "{}", loss(&network));
 }
 
 #[test]

@@ -111,6 +111,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         own_filter: filter(true),
         neural: Some(NeuralModel {
             network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
+            filter: None,
             target: 1,
         }),
         network: Some(Arc::new(network)),

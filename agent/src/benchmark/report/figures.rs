@@ -78,16 +78,36 @@ pub fn save(path: &Path, svg: &str) -> Result<()> {
 /// [`FIRE_CELLS_PER_STEP`].
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     let title = "Reward of each policy on the same worlds";
-    draw_bars(path, runs, title, ladder_note(runs), axis_label)
+    let means = groups(runs).iter().filter_map(mean).collect::<Vec<_>>();
+    let decimals = decimals(means.iter().map(|it| it.mean));
+    let height = |group: &Group<'_>| {
+        let estimate = mean(group);
+        Height {
+            value: estimate.map_or(f64::NAN, |it| it.mean),
+            ends: estimate.and_then(|it| {
+                let error = it.standard_error?;
+                Some([it.mean - error, it.mean + error])
+            }),
+            label: with_error(estimate, decimals),
+        }
+    };
+    draw_bars(path, runs, [title, &ladder_note(runs), axis_label], &height)
 }
 
-/// Draws a bar a policy, the best at the top, with a mark for each of its runs.
+/// How long a bar is, and what is said of it.
+pub(super) struct Height {
+    /// NaN: there is no bar.
+    pub(super) value: f64,
+    pub(super) ends: Option<[f64; 2]>,
+    pub(super) label: String,
+}
+
+/// Draws a bar a policy, the best at the top, with a mark for each of its runs; words are title, note and axis.
 pub(super) fn draw_bars(
     path: &Path,
     runs: &[PolicyRun],
-    title: &str,
-    note: String,
-    axis_label: &str,
+    [title, note, axis]: [&str; 3],
+    height: &dyn Fn(&Group<'_>) -> Height,
 ) -> Result<()> {
     ensure!(
         !runs.is_empty(),
@@ -97,30 +117,32 @@ pub(super) fn draw_bars(
         check_finite(run, "mean reward", std::iter::once(run.mean_reward))?;
     }
     let groups = groups(runs);
-    let mut bars: Vec<(&Group<'_>, Estimate)> = groups.iter().filter_map(estimated).collect();
-    bars.sort_by(|a, b| b.1.mean.total_cmp(&a.1.mean));
-    let decimals = decimals(bars.iter().map(|bar| bar.1.mean));
-    let bars: Vec<Bar> = bars
-        .into_iter()
-        .map(|it| bar(it.0, &groups, it.1, decimals))
-        .collect();
+    let of_group = |group| bar(group, &groups, height(group));
+    let mut bars: Vec<Bar> = groups.iter().map(of_group).collect();
+    let rank = |bar: &Bar| {
+        if bar.value.is_nan() {
+            f64::NEG_INFINITY
+        } else {
+            bar.value
+        }
+    };
+    bars.sort_by(|a, b| rank(b).total_cmp(&rank(a)));
     let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
     let ladder = Ladder {
         title: title.into(),
-        note,
-        axis: axis_label.into(),
+        note: note.into(),
+        axis: axis.into(),
         legend: FAMILIES.into_iter().filter(is_used).collect(),
         bars,
     };
     save(path, &ladder.svg())
 }
 
-fn estimated<'a>(group: &'a Group<'a>) -> Option<(&'a Group<'a>, Estimate)> {
-    let estimate = group.estimate(|run| Some(run.mean_reward));
-    estimate.map(|estimate| (group, estimate))
+fn mean(group: &Group<'_>) -> Option<Estimate> {
+    group.estimate(|run| Some(run.mean_reward))
 }
 
-fn bar(group: &Group<'_>, groups: &[Group<'_>], reward: Estimate, decimals: usize) -> Bar {
+fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
     let team = format!("{} {}", group.team, group.robots);
     let team = groups.iter().any(Group::is_team).then_some(&*team);
     let estimator = Some(group.estimator).filter(|name| *name != "none");
@@ -133,10 +155,10 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], reward: Estimate, decimals: usiz
     Bar {
         name: readable(group.policy),
         remark,
-        label: with_error(Some(reward), decimals),
+        label: height.label,
         color: FAMILIES[family(group)].1,
-        value: reward.mean,
-        error: reward.standard_error,
+        value: height.value,
+        ends: height.ends,
         worlds: group.runs.iter().map(pair).collect(),
     }
 }

@@ -1,15 +1,15 @@
 //! Entries of the leaderboard, a CSV file each, and the page that they make together.
 
 use crate::benchmark::report::columns::markdown;
-use crate::benchmark::report::figures::draw_bars;
+use crate::benchmark::report::figures::{Height, draw_bars};
 use crate::benchmark::report::number::number;
-use crate::benchmark::report::policy_run::{ALONE, PolicyRun};
+use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
-use crate::benchmark::report::suite::{FLOOR, TaskRuns, by_score, render_suite};
+use crate::benchmark::report::suite::{Aggregate, FLOOR, TaskRuns, by_score, render_suite, told};
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// One policy: who made it, how, and its reward of each world of each task.
@@ -205,6 +205,7 @@ pub fn render_page(entries: &[Entry]) -> String {
         "commit",
     ];
     let rows = by_score(&tasks).into_iter().map(|(policy, score)| {
+        let score = told(score);
         let entry = entries.iter().find(|entry| entry.about.policy == policy);
         let about = &entry.expect("invariant: each policy is an entry's").about;
         let seconds = number(about.training_seconds, 0);
@@ -220,7 +221,7 @@ pub fn render_page(entries: &[Entry]) -> String {
     format!("{}\n\n{}", markdown(&headings, rows), render_suite(&tasks))
 }
 
-/// Draws each entry's mean score over tasks, with a mark for each task.
+/// Draws each entry's score over tasks, with a mark for its mean of each task; of entries that lack tasks the marks alone.
 pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let tasks = merged(entries);
     let runs = entries.iter().flat_map(|entry| {
@@ -244,15 +245,25 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     if runs.is_empty() {
         return Ok(()); // of one end of the scale alone there are no scores
     }
-    let title = "Mean score of each policy over tasks";
-    let note = format!("A mark for each of {} tasks", tasks.len());
-    draw_bars(
-        path,
-        &runs,
-        title,
-        note,
+    let scores: BTreeMap<&str, Option<Aggregate>> = by_score(&tasks).into_iter().collect();
+    let height = |group: &Group<'_>| match scores.get(group.policy).copied().flatten() {
+        Some(score) => Height {
+            value: score.mean,
+            ends: Some([score.low, score.high]),
+            label: told(Some(score)),
+        },
+        None => Height {
+            value: f64::NAN,
+            ends: None,
+            label: format!("{} of {} tasks", group.runs.len(), tasks.len()),
+        },
+    };
+    let words = [
+        "Score of each policy over tasks",
+        "bars are interquartile means over tasks and worlds, whiskers 95 % intervals, dots means of single tasks",
         "score: 0 is a random walk's, 1 an oracle's",
-    )
+    ];
+    draw_bars(path, &runs, words, &height)
 }
 
 /// The tasks of the first entry and then those of others, each with the runs of all entries.

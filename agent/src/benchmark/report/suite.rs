@@ -104,10 +104,10 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
             .chain(last)
             .collect::<Vec<String>>()
     };
-    let rows = policies.iter().cloned().map(|policy| scores(tasks, policy));
+    let rows = policies.iter().map(|policy| scores(tasks, *policy));
     let scores = markdown(&heading(Some("score [95 %]")), rows);
     let belief = |value: fn(&PolicyRun) -> Option<f64>| {
-        let row = |(policy, _): &(&str, String)| {
+        let row = |(policy, _): &(&str, Option<Aggregate>)| {
             let means: Vec<Option<f64>> =
                 tasks.iter().map(|task| task.mean(policy, value)).collect();
             let cells = || {
@@ -132,19 +132,19 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
 }
 
 /// The cells of a policy's row: its mean score of each task, and over all.
-fn scores(tasks: &[TaskRuns], (policy, score): (&str, String)) -> Vec<String> {
+fn scores(tasks: &[TaskRuns], (policy, score): (&str, Option<Aggregate>)) -> Vec<String> {
     let mean = |task: &TaskRuns| {
         Estimate::of(&task.scores(policy)).map_or(NOTHING.into(), |it| number(it.mean, 3))
     };
     [policy.to_owned()]
         .into_iter()
         .chain(tasks.iter().map(mean))
-        .chain([score])
+        .chain([told(score)])
         .collect()
 }
 
 /// All policies with their scores over tasks, the highest first; then those that lack a task, by name.
-pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, String)> {
+pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
     let names = tasks
         .iter()
         .flat_map(|task| task.runs.iter().map(|run| &*run.policy));
@@ -160,17 +160,16 @@ pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, String)> {
     let mut all: Vec<_> = names.into_iter().map(|name| (name, score(name))).collect();
     let mean = |score: Option<Aggregate>| score.map_or(f64::NEG_INFINITY, |score| score.mean);
     all.sort_by(|a, b| mean(b.1).total_cmp(&mean(a.1)));
-    let text = |Aggregate { mean, low, high }| {
-        format!(
-            "{} [{}, {}]",
-            number(mean, 3),
-            number(low, 3),
-            number(high, 3)
-        )
+    all
+}
+
+/// A score with its interval, as tables and figures show it.
+pub fn told(score: Option<Aggregate>) -> String {
+    let Some(Aggregate { mean, low, high }) = score else {
+        return NOTHING.into();
     };
-    all.into_iter()
-        .map(|(name, score)| (name, score.map_or(NOTHING.into(), text)))
-        .collect()
+    let [mean, low, high] = [mean, low, high].map(|it| number(it, 3));
+    format!("{mean} [{low}, {high}]")
 }
 
 fn reward(run: &PolicyRun) -> Option<f64> {

@@ -15,40 +15,6 @@ const POINTS: usize = 200;
 
 pub fn draw_training(folder: &Path) -> Result<()> {
     let rows = Rows::read(folder)?;
-    let curve = |column: &str, name: &str| averages(&rows, column, name);
-    let panel = |title: &str, scale, curves| Panel {
-        title: title.into(),
-        scale,
-        curves,
-        shade: None,
-    };
-    let (linear, logarithmic) = (Scale::Linear, Scale::Logarithmic);
-    let rates = [curve("rate", "model"), curve("dqn_rate", "DQN")];
-    let quotient = quotient(&rates);
-    let [model, dqn] = rates;
-    let panels = vec![
-        panel(
-            "reward per world step",
-            linear,
-            vec![curve("mean_reward", "reward")],
-        ),
-        panel(
-            "loss of the model on its window, nats per observed cell",
-            linear,
-            vec![curve("loss", "loss")],
-        ),
-        panel(
-            "log-likelihood of new frames before they are learned from, nats per observed cell",
-            linear,
-            vec![curve("held_out_log_likelihood", "log-likelihood")],
-        ),
-        panel(
-            "loss of the DQN",
-            logarithmic,
-            vec![curve("dqn_loss", "DQN loss")],
-        ),
-        panel("step sizes", logarithmic, vec![model, dqn, quotient]),
-    ];
     let per_point = rows.len().div_ceil(POINTS).max(1);
     let page = Lines {
         title: "Learning while acting".into(),
@@ -60,13 +26,50 @@ pub fn draw_training(folder: &Path) -> Result<()> {
             ),
         },
         axis: "world steps, of all worlds together".into(),
-        panels,
+        panels: panels(&rows),
     };
     let svg = page.svg().context("curves: expected metrics, got none")?;
     for name in FIGURES {
         save(&folder.join(name), &svg)?;
     }
     Ok(())
+}
+
+fn panels(rows: &Rows) -> Vec<Panel> {
+    let curve = |column: &str, name: &str| averages(rows, column, name);
+    let rates = [curve("rate", "model"), curve("dqn_rate", "DQN")];
+    let quotient = quotient(&rates);
+    let [model, dqn] = rates;
+    let panels = [
+        (
+            "reward per world step",
+            Scale::Linear,
+            vec![curve("mean_reward", "reward")],
+        ),
+        (
+            "loss of the model on its window, nats per observed cell",
+            Scale::Linear,
+            vec![curve("loss", "loss")],
+        ),
+        (
+            "log-likelihood of new frames before they are learned from, nats per observed cell",
+            Scale::Linear,
+            vec![curve("held_out_log_likelihood", "log-likelihood")],
+        ),
+        (
+            "loss of the DQN",
+            Scale::Logarithmic,
+            vec![curve("dqn_loss", "DQN loss")],
+        ),
+        ("step sizes", Scale::Logarithmic, vec![model, dqn, quotient]),
+    ];
+    let panel = |(title, scale, curves): (&str, _, _)| Panel {
+        title: title.into(),
+        scale,
+        curves,
+        shade: None,
+    };
+    panels.map(panel).into()
 }
 
 /// A column's means over equal parts of the rows, at the last world step of each, with their standard

@@ -9,8 +9,9 @@ pub use self::base::Base;
 pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
 
 use self::run::Run;
-use self::saved::{Held, SavedBelief, SavedRun, belief_tensors};
+use self::saved::{Held, SavedRun, belief_tensors};
 use crate::config::AgentConfig;
+use crate::learning::belief::SavedBelief;
 use crate::learning::checkpoint::{Contents, check};
 use crate::learning::learners::base::{Learner, Worlds, without_truth};
 use crate::learning::metrics::{ModelUpdate, Tick};

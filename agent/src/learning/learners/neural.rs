@@ -14,8 +14,11 @@ use self::replay::Replay;
 use self::saved::SavedRun;
 use crate::config::AgentConfig;
 use crate::estimation::NeuralEstimator;
+use crate::estimation::neural::predicted_observations;
+use crate::learning::belief::SavedModel;
 use crate::learning::checkpoint::{Contents, check};
 use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::{RewardEstimate, met};
 use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
@@ -25,8 +28,10 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Target;
 use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::client::Observation;
+use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use emberwatch_protocol::{Move, path};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
@@ -36,6 +41,8 @@ pub struct NeuralLearner {
     worlds: Worlds,
     config: AgentConfig,
     network: NeuralBelief,
+    /// The filter that it corrects, if it does.
+    filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
     replay: Replay,
     runs: Vec<Run>,
@@ -56,9 +63,10 @@ struct Run {
 }
 
 impl NeuralLearner {
-    /// Before the first frame, or going on from a checkpoint.
+    /// Before the first frame, or going on from a checkpoint. `filter`: what it is to correct.
     pub fn new(
         contents: Option<&Contents>,
+        filter: Option<&LearnedModel>,
         worlds: Worlds,
         config: &AgentConfig,
         device: &Device,
@@ -66,6 +74,7 @@ impl NeuralLearner {
         let n_observations = worlds.n_observations;
         let mut learner = Self {
             network: NeuralBelief::new(n_observations, config.seed, device)?,
+            filter: filter.cloned().map(Box::new),
             reward: RewardEstimate::new(n_observations),
             replay: Replay::new(config.neural.replay_frames),
             runs: Vec::new(),
@@ -102,7 +111,9 @@ impl NeuralLearner {
 
     /// A robot before it takes in what its world shows.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
-        let estimator = NeuralEstimator::new(&self.network, self.worlds.shape)?;
+        let shape = self.worlds.shape;
+        let filter = self.filter.as_ref().map(|it| it.estimator(true, shape));
+        let estimator = NeuralEstimator::new(&self.network, filter, shape)?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, config) = (self.policy(), &self.config);
         let estimator = Box::new(estimator);
@@ -113,9 +124,11 @@ impl NeuralLearner {
 
     /// A robot that has taken in what its world shows, with a track that begins there.
     fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
-        self.replay.begin(robot, self.worlds.shape);
-        self.replay.push(robot, &observation.frame);
         let mut rollout = self.rollout_at(observation)?;
+        self.replay.begin(robot, self.worlds.shape);
+        let base = predicted_base(&rollout);
+        self.replay
+            .push(robot, &rollout.observation().frame, base.as_ref());
         rollout.correct()?;
         rollout.agent.predict();
         Ok(Run {
@@ -141,15 +154,25 @@ impl NeuralLearner {
         let (expected, got) = (self.worlds.n_observations, saved.n_observations);
         check(got == expected, "n_observations", expected, got)?;
         saved.load_into(&mut self.network, contents)?;
+        self.filter = saved.filter(contents)?;
         let shape = self.worlds.shape;
         if saved.shape == shape {
             saved.check_worlds()?;
-            self.replay.resume(saved.replay);
+            self.replay.resume(saved.replay.into_owned());
             (self.left, self.earned) = (saved.worlds, saved.earned);
         }
-        (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
+        (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
         Ok(())
     }
+}
+
+/// What the filter that an agent's network corrects expects of its next frame.
+fn predicted_base(rollout: &Rollout) -> Option<Probabilities> {
+    rollout
+        .agent
+        .estimator()
+        .base()
+        .and_then(predicted_observations)
 }
 
 impl Run {
@@ -238,16 +261,19 @@ impl Learner for NeuralLearner {
     }
 
     fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let bases = self.runs.iter().map(|run| predicted_base(&run.rollout));
+        let bases: Vec<_> = bases.collect();
         let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let turns = see_all(rollouts, without_truth(observations))?;
+        let turns = see_all(rollouts, without_truth(observations))?.into_iter();
         let mut tick = Tick::default();
-        for ((robot, run), turn) in self.worlds.numbers.clone().zip(&self.runs).zip(turns) {
+        let runs = self.worlds.numbers.clone().zip(&self.runs);
+        for ((robot, run), (turn, base)) in runs.zip(turns.zip(bases)) {
             let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
             let reward = observation.robot.reward;
             let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &run.path);
             self.reward
                 .add(&met(belief, flight.visited.iter().copied()), reward);
-            self.replay.push(robot, &observation.frame);
+            self.replay.push(robot, &observation.frame, base.as_ref());
             tick.reward += reward;
             tick.score += turn.score.unwrap_or_default();
         }
@@ -310,18 +336,20 @@ impl Learner for NeuralLearner {
         let runs = self.runs.iter();
         let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
-        // As `SavedNeural`, without a copy of the replay.
-        let state = (
-            self.worlds.shape,
-            self.worlds.n_observations,
-            self.n_updates(),
-            self.world_steps,
-            self.earned,
-            &self.reward,
-            &self.replay,
+        let state = SavedNeural {
+            shape: self.worlds.shape,
+            n_observations: self.worlds.n_observations,
+            n_updates: self.n_updates(),
+            world_steps: self.world_steps,
+            earned: self.earned,
+            filter: self.filter.as_deref().map(SavedModel::of),
+            reward: Cow::Borrowed(&self.reward),
+            replay: Cow::Borrowed(&self.replay),
             worlds,
-        );
-        Ok(Contents::new(self.network.named_tensors()?, &state))
+        };
+        let filter = self.filter.iter().flat_map(|it| it.corrected_tensors());
+        let tensors = self.network.named_tensors()?.into_iter().chain(filter);
+        Ok(Contents::new(tensors, &state))
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

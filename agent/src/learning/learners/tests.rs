@@ -5,7 +5,7 @@ use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::Contents;
 use crate::learning::learners::decisions::{Base, DecisionsLearner};
 use crate::learning::learners::filter::FilterLearner;
-use crate::learning::learners::filter::fit::FilterFit;
+use crate::learning::learners::filter::fit::{FilterFit, LearnedModel};
 use crate::learning::learners::network::{NetworkLearner, Progress};
 use crate::learning::learners::neural::{NeuralLearner, NeuralModel};
 use crate::learning::learners::{Learner, Worlds};
@@ -158,7 +158,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
             let path = |choice| path(config, choice, config.objective(choice), belief, step);
             choices.iter().map(path).collect()
         });
-        let learner = NeuralLearner::new(None, worlds(), config, &Device::Cpu);
+        let learner = NeuralLearner::new(None, None, worlds(), config, &Device::Cpu);
         check(learner.expect("a network"), basis, beam);
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
@@ -193,6 +193,17 @@ fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     learner.contents().expect("whole")
 }
 
+/// What a filter knows before it has learned.
+fn learned_filter(sees_own_state: bool) -> LearnedModel {
+    let dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+        sees_own_state,
+    };
+    FilterFit::new(dimensions, worlds().shape, &config(BasisKind::Estimate)).learned()
+}
+
 #[test]
 fn decisions_resume_bit_for_bit() {
     let mut config = config(BasisKind::Estimate);
@@ -200,22 +211,27 @@ fn decisions_resume_bit_for_bit() {
         config.decisions.learning.batch,
         config.decisions.updates_per_step,
     ) = (4, 1.0);
-    let filter = |sees_own_state| {
-        let dimensions = Dimensions {
-            n_states: 3,
-            n_observations: 3,
-            kernel: (3, 3),
-            sees_own_state,
-        };
-        let fit = FilterFit::new(dimensions, worlds().shape, &config);
-        LearnedBelief::Filter(Box::new(fit.learned()))
-    };
+    let filter = |sees_own_state| Box::new(learned_filter(sees_own_state));
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    let neural = NeuralModel { network, target: 1 };
+    let neural = |filter| {
+        let network = network.clone();
+        LearnedBelief::Neural(NeuralModel {
+            network,
+            filter,
+            target: 1,
+        })
+    };
     for (kind, belief) in [
-        (EstimatorKind::learned(true), filter(true)),
-        (EstimatorKind::LEARNED.spatial(), filter(false)),
-        (EstimatorKind::Neural, LearnedBelief::Neural(neural)),
+        (
+            EstimatorKind::learned(true),
+            LearnedBelief::Filter(filter(true)),
+        ),
+        (
+            EstimatorKind::LEARNED.spatial(),
+            LearnedBelief::Filter(filter(false)),
+        ),
+        (EstimatorKind::Neural, neural(None)),
+        (EstimatorKind::Neural, neural(Some(filter(false)))),
     ] {
         let base = Base::learned(kind, belief, worlds().shape);
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
@@ -237,35 +253,43 @@ fn decisions_resume_bit_for_bit() {
 }
 
 /// A neural belief that learns at every step.
-fn neural(contents: Option<&Contents>, worlds: Worlds) -> anyhow::Result<NeuralLearner> {
+fn neural(
+    contents: Option<&Contents>,
+    filter: Option<&LearnedModel>,
+    worlds: Worlds,
+) -> anyhow::Result<NeuralLearner> {
     let mut config = config(BasisKind::Estimate);
     config.neural.steps = 40;
     (config.neural.batch, config.neural.updates_per_step) = (4, 1.0);
-    NeuralLearner::new(contents, worlds, &config, &Device::Cpu)
+    NeuralLearner::new(contents, filter, worlds, &config, &Device::Cpu)
 }
 
 #[test]
 fn a_neural_belief_resumes_bit_for_bit() {
-    let mut learner = neural(None, worlds()).expect("new");
-    learner.attach(vec![observation(0)]).expect("possible");
-    let left = learn(&mut learner, 1..20);
-    let mut resumed = neural(Some(&left), worlds()).expect("its own");
-    let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
-    assert_eq!(n_gone_on, 1);
-    let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 20..40));
-    assert!(contents[0] == contents[1] && learner.n_updates() > 30);
-    let mut elsewhere = neural(Some(&left), worlds()).expect("its own");
-    let n_gone_on = elsewhere.attach(vec![observation(7)]).expect("possible");
-    assert_eq!((n_gone_on, elsewhere.n_updates()), (0, 19));
+    let filter = learned_filter(false);
+    for filter in [None, Some(&filter)] {
+        let mut learner = neural(None, filter, worlds()).expect("new");
+        learner.attach(vec![observation(0)]).expect("possible");
+        let left = learn(&mut learner, 1..20);
+        let resumed = || neural(Some(&left), None, worlds()).expect("its own");
+        let mut gone_on = resumed();
+        let n_gone_on = gone_on.attach(vec![observation(19)]).expect("possible");
+        assert_eq!(n_gone_on, 1);
+        let contents = [&mut learner, &mut gone_on].map(|learner| learn(learner, 20..40));
+        assert!(contents[0] == contents[1] && learner.n_updates() > 30);
+        let mut elsewhere = resumed();
+        let n_gone_on = elsewhere.attach(vec![observation(7)]).expect("possible");
+        assert_eq!((n_gone_on, elsewhere.n_updates()), (0, 19));
+    }
 }
 
 #[test]
 fn what_does_not_fit_a_neural_belief_is_named() {
-    let mut learner = neural(None, worlds()).expect("new");
+    let mut learner = neural(None, None, worlds()).expect("new");
     learner.attach(vec![observation(0)]).expect("possible");
     let left = learn(&mut learner, 1..5);
     let refused = |contents: &Contents, worlds: Worlds, words: &str| {
-        let learner = neural(Some(contents), worlds).map(drop);
+        let learner = neural(Some(contents), None, worlds).map(drop);
         let error = learner.expect_err(words).to_string();
         assert!(error.starts_with(words), "{error}");
     };

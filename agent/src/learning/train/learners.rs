@@ -41,7 +41,8 @@ pub fn learner(
             })
         }
         LearnerKind::Neural => {
-            let learner = NeuralLearner::new(contents, worlds, config, &spec.device);
+            let filter = spec.learned.filter.as_ref();
+            let learner = NeuralLearner::new(contents, filter, worlds, config, &spec.device);
             Box::new(learner.with_context(of_file)?)
         }
         LearnerKind::Autoencoder => {
@@ -49,14 +50,7 @@ pub fn learner(
             if let Some(contents) = contents {
                 progress.load(contents).with_context(of_file)?;
             }
-            let full_frames = config.autoencoder.full_frames;
-            let wants = progress.position.iterations < full_frames && !spec.freeze;
-            if wants && info.coverage == CoverageRule::Path {
-                bail!(
-                    "autoencoder.full_frames: {full_frames} frames that show every cell need a server with \
-                     --coverage client or full, or the setting 0"
-                );
-            }
+            check_full_frames(&progress, spec, info)?;
             Box::new(NetworkLearner::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
@@ -74,6 +68,23 @@ pub fn learner(
             Box::new(learner.with_context(of_file)?)
         }
     })
+}
+
+/// Refuses a server without the first frames that the settings ask for, which show every cell.
+fn check_full_frames(
+    progress: &network::Progress,
+    spec: &TrainingSpec,
+    info: &ServerInfo,
+) -> Result<()> {
+    let full_frames = spec.config.autoencoder.full_frames;
+    let wants = progress.position.iterations < full_frames && !spec.freeze;
+    if wants && info.coverage == CoverageRule::Path {
+        bail!(
+            "autoencoder.full_frames: {full_frames} frames that show every cell need a server with --coverage client \
+             or full, or the setting 0"
+        );
+    }
+    Ok(())
 }
 
 /// What keeps the beliefs that decisions are learned on: what was learned, or the filter of the server's model.

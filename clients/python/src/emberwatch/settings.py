@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
+from os import fspath
 from pathlib import Path
 from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
@@ -16,6 +17,7 @@ from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import local, utf8
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
+from emberwatch.tasks import Task
 from emberwatch.wire import Shape
 
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
@@ -227,8 +229,8 @@ def running_spec(
             raise InvalidArgumentError(
                 f"{name}: expected {default}, as the running server has its own"
             )
-    if settings.task not in (None, info.task):
-        raise invalid("task", f"{info.task!r}, as the server has, or None", repr(settings.task))
+    if settings.task is not None:
+        _check_task(settings.task, info)
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
     for name in ("height", "width", "n_moves", "burn_in", "robots"):
@@ -255,6 +257,26 @@ def running_spec(
         description=info.recorded_states,
     )
     return spec, robots
+
+
+def _check_task(asked: str | Path, info: ServerInfo) -> None:
+    """Refuses a server of another task, and one whose worlds are not those of the task."""
+    task = Task.named(asked)
+    if task.name != info.task:
+        raise invalid("task", f"{info.task!r}, as the server has, or None", repr(task.name))
+    own = check_settings([f"--task={fspath(asked)}"])
+    has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
+    has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
+    for name, got in has.items():
+        if own[name] != got:
+            raise invalid(f"{name} of task {task.name!r}", f"{got}, as the server has", own[name])
+    if own["states"]:
+        described, served = _description(local(own["states"])), info.recorded_states
+    else:
+        described = Model.checked(local(own["model"]))
+        served = None if info.model is None else Model.from_toml(info.model)
+    if served not in (None, described):
+        raise invalid(f"states of task {task.name!r}", "those that the server has", described.name)
 
 
 def _description(states: str) -> Description:

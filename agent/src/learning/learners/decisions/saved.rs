@@ -1,17 +1,11 @@
 //! Decisions in a checkpoint: the DQN, the belief that they were learned on, and where the robots are.
 
-use crate::learning::belief::LearnedBelief;
-use crate::learning::checkpoint::{
-    Contents, check, check_belief, check_counts, check_numbers, wrong,
-};
+use crate::learning::belief::{LearnedBelief, SavedBelief};
+use crate::learning::checkpoint::{Contents, check, check_belief, check_counts, check_numbers};
 use crate::learning::learners::base::{Place, place};
-use crate::learning::learners::filter::fit::LearnedModel;
-use crate::learning::learners::neural::{NeuralModel, new_network};
 use crate::policy::EstimatorKind;
 use anyhow::Result;
-use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_belief::planning::{BasisKind, Memory, OPTIONS};
 use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor, SavedDqn, Track};
@@ -64,20 +58,6 @@ pub struct SavedDecisions {
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
-/// A belief that was learned, without its tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) enum SavedBelief {
-    Filter {
-        dimensions: Dimensions,
-        target: usize,
-        correlations: Box<Correlations>,
-    },
-    Neural {
-        n_observations: usize,
-        target: usize,
-    },
-}
-
 /// Where a world was left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedRun {
@@ -109,22 +89,6 @@ impl LearnedDecisions {
     }
 }
 
-impl SavedBelief {
-    pub(super) fn of(belief: &LearnedBelief) -> Self {
-        match belief {
-            LearnedBelief::Filter(model) => Self::Filter {
-                dimensions: model.tables.dimensions,
-                target: model.target,
-                correlations: Box::new(model.correlations.clone()),
-            },
-            LearnedBelief::Neural(model) => Self::Neural {
-                n_observations: model.network.n_observations(),
-                target: model.target,
-            },
-        }
-    }
-}
-
 impl SavedDecisions {
     /// The belief that was learned, if it was; a network computes on `device`.
     pub fn belief(&self, contents: &Contents, device: &Device) -> Result<Option<LearnedBelief>> {
@@ -132,48 +96,9 @@ impl SavedDecisions {
         let fits = is_neural == (self.estimator == EstimatorKind::Neural);
         check(fits, "belief", self.estimator.label(), "another")?;
         let find = |name: &str, shape: &[usize]| contents.tensor(&format!("{BELIEF}{name}"), shape);
-        let belief = self.belief.as_ref().map(|saved| match saved {
-            SavedBelief::Filter {
-                dimensions,
-                target,
-                correlations,
-            } => {
-                let parameters = self.parameters(*dimensions, find)?;
-                check_target(*target, parameters.dimensions.n_states)?;
-                let model = LearnedModel::new(parameters, *target, *correlations.clone());
-                Ok(LearnedBelief::Filter(Box::new(model)))
-            }
-            &SavedBelief::Neural {
-                n_observations,
-                target,
-            } => {
-                check_target(target, n_observations)?;
-                let mut network = new_network(n_observations, device)?;
-                network.set_parameters(find)?;
-                Ok(LearnedBelief::Neural(NeuralModel { network, target }))
-            }
-        });
-        belief.transpose()
-    }
-
-    /// Those of the filter.
-    fn parameters(
-        &self,
-        dimensions: Dimensions,
-        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
-    ) -> Result<Parameters> {
-        let dimensions = Dimensions {
-            sees_own_state: self.estimator.sees_own_state(),
-            ..dimensions
-        };
-        let dimensions = dimensions.check();
-        let dimensions =
-            dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-        let mut parameters = Parameters::zeros(dimensions);
-        for (at, shape) in dimensions.shapes().iter().enumerate() {
-            parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
-        }
-        Ok(parameters)
+        let is_own = self.estimator.sees_own_state();
+        let belief = self.belief.as_ref();
+        belief.map(|it| it.read(is_own, find, device)).transpose()
     }
 
     pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
@@ -227,26 +152,10 @@ impl SavedRun {
     }
 }
 
-fn check_target(target: usize, n_states: usize) -> Result<()> {
-    let expected = format!("less than {n_states}");
-    check(target < n_states, "target", expected, target)
-}
-
 /// The tensors of a belief that was learned.
 pub(super) fn belief_tensors(belief: &LearnedBelief) -> Result<Vec<NamedTensor>> {
     let named = |(name, shape, numbers)| (format!("{BELIEF}{name}"), shape, numbers);
-    let tensors = match belief {
-        LearnedBelief::Filter(model) => {
-            let parameters = &model.parameters;
-            let shapes = parameters.dimensions.shapes().into_iter();
-            let names = Parameters::NAMES.iter().map(|name| (*name).to_owned());
-            let tensors = names.zip(shapes).zip(parameters.tensors.clone());
-            let tensors = tensors.map(|((name, shape), numbers)| (name, shape, numbers));
-            tensors.collect()
-        }
-        LearnedBelief::Neural(model) => model.network.parameters()?,
-    };
-    Ok(tensors.into_iter().map(named).collect())
+    Ok(belief.tensors()?.into_iter().map(named).collect())
 }
 
 #[cfg(test)]

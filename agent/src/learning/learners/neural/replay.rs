@@ -3,10 +3,12 @@
 //! A *block* is what one robot saw in some steps in a row. It keeps what had been seen before its first frame, so that all
 //! that was known before any of its frames is found by going through those before it.
 
-use crate::learning::checkpoint::check;
+use crate::learning::checkpoint::{check, check_numbers};
 use anyhow::Result;
 use emberwatch_network::{Lesson, Sightings};
+use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::{Frame, Shape};
+use ndarray::s;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
@@ -16,8 +18,13 @@ use std::ops::Range;
 /// Frames of a block, at most.
 const BLOCK_FRAMES: usize = 256;
 
-/// The cells that a frame shows, by row-major index, and their values.
-type Seen = Vec<(usize, u8)>;
+/// A frame: the cells that it shows, by row-major index, with their values, and what was predicted of each by whom the
+/// network corrects, if there is one, `[cells, O]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Seen {
+    cells: Vec<(usize, u8)>,
+    base: Vec<f32>,
+}
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Block {
@@ -70,13 +77,22 @@ impl Replay {
         self.full.extend(ended.into_values());
     }
 
-    /// Adds the next frame of a robot.
+    /// Adds the next frame of a robot. `base`: what was predicted of it by whom the network corrects, `[O, H, W]`.
     ///
     /// # Panics
     /// If its track was not begun.
-    pub fn push(&mut self, robot: u32, frame: &Frame) {
+    pub fn push(&mut self, robot: u32, frame: &Frame, base: Option<&Probabilities>) {
         let block = self.open.get_mut(&robot).expect("a track that was begun");
-        block.frames.push(frame.observed().collect());
+        let shape = block.before.shape();
+        let cells: Vec<_> = frame.observed().collect();
+        let of_cell = |base: &Probabilities, cell: usize| {
+            let at = shape.cell(cell);
+            base.slice(s![.., at.row, at.col]).to_vec()
+        };
+        let base = base.iter();
+        let base = base.flat_map(|base| cells.iter().flat_map(|it| of_cell(base, it.0)));
+        let base = base.collect();
+        block.frames.push(Seen { cells, base });
         if block.frames.len() >= BLOCK_FRAMES {
             let before = block.before_frame(BLOCK_FRAMES);
             self.open(robot, before);
@@ -100,11 +116,13 @@ impl Replay {
             let mut at = rng.next_u64().checked_rem(n_frames as u64)? as usize;
             for block in blocks() {
                 match block.frames.get(at) {
-                    Some(frame) if frame.is_empty() => return None,
-                    Some(frame) => {
-                        let before = block.before_frame(at);
-                        let frame = frame.clone();
-                        return Some(Lesson { before, frame });
+                    Some(seen) if seen.cells.is_empty() => return None,
+                    Some(seen) => {
+                        return Some(Lesson {
+                            before: block.before_frame(at),
+                            frame: seen.cells.clone(),
+                            base: seen.base.clone(),
+                        });
                     }
                     None => at -= block.frames.len(),
                 }
@@ -124,11 +142,13 @@ impl Replay {
         (self.full, self.open) = (other.full, other.open);
     }
 
-    /// Refuses one that is not of a grid and of so many observations, or lacks a robot.
+    /// Refuses one that is not of a grid and of so many observations, or lacks a robot. `has_base`: whether another's
+    /// predictions belong to the frames.
     pub fn check(
         &self,
         shape: Shape,
         n_observations: usize,
+        has_base: bool,
         mut robots: impl Iterator<Item = u32>,
     ) -> Result<()> {
         let (name, expected) = (
@@ -138,9 +158,17 @@ impl Replay {
         for block in self.full.iter().chain(self.open.values()) {
             let fits = block.before.are_of(shape, n_observations);
             check(fits, name, &expected, "others")?;
-            for (cell, value) in block.frames.iter().flatten().copied() {
-                let fits = cell < shape.n_cells() && usize::from(value) < n_observations;
-                check(fits, name, &expected, format!("{value} in cell {cell}"))?;
+            for seen in &block.frames {
+                for &(cell, value) in &seen.cells {
+                    let fits = cell < shape.n_cells() && usize::from(value) < n_observations;
+                    check(fits, name, &expected, format!("{value} in cell {cell}"))?;
+                }
+                let n = if has_base {
+                    seen.cells.len() * n_observations
+                } else {
+                    0
+                };
+                check_numbers("replay.base", &seen.base, n)?;
             }
         }
         let lacking = robots.find(|robot| !self.open.contains_key(robot));
@@ -154,7 +182,7 @@ impl Block {
     fn before_frame(&self, at: usize) -> Sightings {
         let mut sightings = self.before.clone();
         for frame in &self.frames[..at] {
-            for &(cell, value) in frame {
+            for &(cell, value) in &frame.cells {
                 sightings.see_cell(cell, value);
             }
             sightings.pass();
@@ -184,7 +212,7 @@ mod tests {
                 if step % 10 != 9 {
                     frame.observe(robot as usize - 3, (step % 100) as u8);
                 }
-                replay.push(robot, &frame);
+                replay.push(robot, &frame, None);
             }
         }
         replay
@@ -199,7 +227,7 @@ mod tests {
         );
         let lessons = replay.lessons(500, &mut stream(1, Purpose::Replay, 0));
         assert!((400..500).contains(&lessons.len()), "a tenth shows nothing");
-        for Lesson { before, frame } in lessons {
+        for Lesson { before, frame, .. } in lessons {
             let (cell, value) = frame[0];
             match before.last(cell) {
                 Some((last, age)) => assert_eq!((u32::from(last) + age) % 100, u32::from(value)),
@@ -219,7 +247,7 @@ mod tests {
         assert_eq!(replay(1100, 1000).full.len(), 3);
         let replay = replay(300, 1000);
         let check = |n_observations, robots: [u32; 2]| {
-            let check = replay.check(shape(), n_observations, robots.into_iter());
+            let check = replay.check(shape(), n_observations, false, robots.into_iter());
             check.map_err(|error| error.to_string())
         };
         assert_eq!(check(100, [3, 4]), Ok(()));

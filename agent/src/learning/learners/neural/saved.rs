@@ -2,18 +2,22 @@
 
 use super::behaviour::Behaviour;
 use super::replay::Replay;
+use crate::estimation::NeuralEstimator;
+use crate::learning::belief::SavedModel;
 use crate::learning::checkpoint::{Contents, check, check_belief, check_counts};
 use crate::learning::learners::base::{Place, place};
+use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::reward::RewardEstimate;
 use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_network::{Device, NeuralBelief};
+use emberwatch_network::{Device, NetworkError, NeuralBelief};
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::model::MAX_VALUES;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// More updates than a step of all worlds earns.
@@ -23,13 +27,15 @@ const MOST_EARNED: f64 = 2e6;
 #[derive(Debug, Clone)]
 pub struct NeuralModel {
     pub network: NeuralBelief,
+    /// The filter that it corrects, if it does.
+    pub filter: Option<Box<LearnedModel>>,
     /// The value that pays most.
     pub target: usize,
 }
 
 /// All of a checkpoint of a neural belief but the tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct SavedNeural {
+pub struct SavedNeural<'a> {
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
@@ -37,8 +43,9 @@ pub struct SavedNeural {
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
     pub(super) earned: f64,
-    pub(super) reward: RewardEstimate,
-    pub(super) replay: Replay,
+    pub(super) filter: Option<SavedModel>,
+    pub(super) reward: Cow<'a, RewardEstimate>,
+    pub(super) replay: Cow<'a, Replay>,
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
@@ -57,7 +64,9 @@ pub(super) struct SavedRun {
 impl PartialEq for NeuralModel {
     fn eq(&self, other: &Self) -> bool {
         let parameters = |model: &Self| model.network.parameters().ok();
-        self.target == other.target && parameters(self) == parameters(other)
+        self.target == other.target
+            && self.filter == other.filter
+            && parameters(self) == parameters(other)
     }
 }
 
@@ -68,7 +77,17 @@ impl NeuralModel {
         let mut network = new_network(saved.n_observations, device)?;
         saved.load_into(&mut network, contents)?;
         let target = saved.reward.target().unwrap_or(saved.n_observations - 1);
-        Ok(Self { network, target })
+        Ok(Self {
+            network,
+            filter: saved.filter(contents)?,
+            target,
+        })
+    }
+
+    /// Before the first frame.
+    pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator, NetworkError> {
+        let filter = self.filter.as_ref().map(|it| it.estimator(true, shape));
+        NeuralEstimator::new(&self.network, filter, shape)
     }
 }
 
@@ -80,7 +99,14 @@ pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelie
     Ok(NeuralBelief::new(n_observations, 0, device)?)
 }
 
-impl SavedNeural {
+impl SavedNeural<'_> {
+    /// The filter that it corrects.
+    pub(super) fn filter(&self, contents: &Contents) -> Result<Option<Box<LearnedModel>>> {
+        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
+        let filter = self.filter.as_ref().map(|it| it.read_corrected(find));
+        Ok(filter.transpose()?.map(Box::new))
+    }
+
     /// Loads the network; refuses what does not fit.
     pub(super) fn load_into(&self, network: &mut NeuralBelief, contents: &Contents) -> Result<()> {
         check_counts(&[
@@ -98,7 +124,8 @@ impl SavedNeural {
         let fits = (0.0..MOST_EARNED).contains(&self.earned);
         check(fits, "earned", format!("0 to {MOST_EARNED}"), self.earned)?;
         let (shape, n) = (self.shape, self.n_observations);
-        self.replay.check(shape, n, self.worlds.keys().copied())?;
+        let robots = self.worlds.keys().copied();
+        self.replay.check(shape, n, self.filter.is_some(), robots)?;
         self.worlds.values().try_for_each(|left| {
             let estimates = left.estimate.iter();
             let mut estimates = estimates.map(|it| check_belief("worlds.estimate", it, n, shape));
