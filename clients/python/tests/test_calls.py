@@ -3,11 +3,10 @@
 import os
 import signal
 import threading
-from pathlib import Path
 
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, eventually, script, server
+from processes import LONG, PATIENCE, asleep, eventually, script, server
 
 from emberwatch import errors
 from emberwatch.client import connect

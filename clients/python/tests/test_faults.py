@@ -12,6 +12,7 @@ from processes import (
     PATIENCE,
     Script,
     Server,
+    asleep,
     connects,
     eventually,
     is_running,
@@ -71,7 +72,12 @@ SIGNALS = {
 def check_kill(started: Server, call: Callable[[], object]) -> None:
     """Kills the server while a call waits for it, which says so."""
     started.stop()
-    killer = threading.Timer(0.2, started.kill)
+
+    def kill() -> None:
+        asleep()
+        started.kill()
+
+    killer = threading.Thread(target=kill)
     killer.start()
     with pytest.raises(errors.ServerGoneError, match=started.instance):
         call()
