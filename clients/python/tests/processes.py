@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from emberwatch.client import Client
@@ -199,6 +200,20 @@ def _state(pid: int) -> str:
             return file.read().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
         return ""
+
+
+def asleep() -> None:
+    """Waits until the main thread sleeps, as it does on the answer of a stopped server."""
+    place = Path(f"/proc/{os.getpid()}/task/{threading.main_thread().native_id}/stat")
+    looks = 0
+
+    def is_asleep() -> bool:
+        nonlocal looks
+        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
+        looks = looks + 1 if sleeps else 0
+        return looks > 20
+
+    assert eventually(is_asleep)
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:

@@ -12,6 +12,7 @@ from processes import (
     PATIENCE,
     Script,
     Server,
+    asleep,
     connects,
     eventually,
     is_running,
@@ -37,6 +38,10 @@ env.reset(seed=1)
 env.step([3] * 6)
 session = env._session
 print(session._client.info.pid, session.instance, flush=True)
+
+def fly():
+    while True:
+        env.step([3] * 6)
 """
 
 #: How it may end by itself, and the exit code.
@@ -48,6 +53,9 @@ ENDS = {
     "os._exit(4)": 4,
     "os.abort()": -signal.SIGABRT,
     "import threading; threading.Thread(target=lambda: time.sleep(0.1)).start()": 0,
+    "env.itself = env": 0,
+    "import atexit; atexit.register(lambda: env.step([3] * 6))": 0,
+    "import threading; threading.Thread(target=fly, daemon=True).start(); time.sleep(0.1)": 0,
 }
 
 ABRUPT = ("os._exit(4)", "os.abort()")
@@ -64,7 +72,12 @@ SIGNALS = {
 def check_kill(started: Server, call: Callable[[], object]) -> None:
     """Kills the server while a call waits for it, which says so."""
     started.stop()
-    killer = threading.Timer(0.2, started.kill)
+
+    def kill() -> None:
+        asleep()
+        started.kill()
+
+    killer = threading.Thread(target=kill)
     killer.start()
     with pytest.raises(errors.ServerGoneError, match=started.instance):
         call()
