@@ -162,3 +162,6 @@ class Recording:
 
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
         """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
+
+def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
+    """Integers below `n_choices`, as bytes; None if it is no plain array of one for each row."""
