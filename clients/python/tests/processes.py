@@ -28,6 +28,9 @@ LONG = 5 * PATIENCE
 #: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 
+#: Where iceoryx2 keeps files of nodes and services.
+CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
+
 #: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
 at_the_end = ExitStack()
 
@@ -214,6 +217,16 @@ def asleep() -> None:
         return looks > 20
 
     assert eventually(is_asleep)
+
+
+def services(instance: str) -> list[Path]:
+    """The files of an instance's services."""
+    found = []
+    for path in (CHANNELS / "services").iterdir():
+        with suppress(FileNotFoundError):  # of a program that ends now
+            if f"/{instance}/" in path.read_text(errors="replace"):
+                found.append(path)
+    return found
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from processes import (
+    CHANNELS,
     LONG,
     PATIENCE,
     Script,
@@ -18,14 +19,12 @@ from processes import (
     is_running,
     script,
     server,
+    services,
 )
 
 from emberwatch import errors
 from emberwatch.client import connect
 from emberwatch.env import WildfireEnv
-
-#: Where iceoryx2 keeps files of nodes and services.
-CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
 SMALL = {"height": 5, "width": 7, "n_moves": 6, "burn_in": 20}
 
@@ -155,12 +154,6 @@ class Remains:
         nodes = (path for path in (CHANNELS / "nodes").iterdir() if path.name.isdecimal())
         pids = (int(path.name) >> 64 & 0xFFFFFFFF for path in nodes)
         return [*map(str, found), *(str(pid) for pid in pids if pid in self._pids)]
-
-
-def services(instance: str) -> list[Path]:
-    """The files of an instance's services."""
-    paths = (CHANNELS / "services").iterdir()
-    return [path for path in paths if f"/{instance}/" in path.read_text(errors="replace")]
 
 
 def embedded(end: str) -> tuple[Script, int, str]:
