@@ -66,14 +66,6 @@ impl SuiteCommand {
             "--policies: expected none that is told the next states, as these act only in `compare`"
         );
         let config = self.settings.effective()?;
-        let tasks = if self.tasks.is_empty() {
-            Task::built_in_names()
-                .map(Task::named)
-                .collect::<Result<Vec<_>, _>>()
-        } else {
-            self.tasks.iter().map(|name| Task::named(name)).collect()
-        };
-        let tasks = tasks?;
         if let Some(folder) = &self.checkpoints {
             ensure!(
                 folder.is_dir(),
@@ -81,19 +73,29 @@ impl SuiteCommand {
                 folder.display()
             );
         }
-        let plans = tasks.into_iter().map(|task| {
+        let of_task = |name: &str| format!("task {name}");
+        let plans = self.tasks()?.into_iter().map(|task| {
             let name = task.name.clone();
-            let plan = self.plan(task, &config);
-            plan.with_context(|| format!("task {name}"))
+            self.plan(task, &config).with_context(|| of_task(&name))
         });
         let plans = plans.collect::<Result<Vec<_>>>()?;
         make_folder(&self.out)?;
         let runs = plans.into_iter().map(|plan| {
             let name = plan.task.name.clone();
-            let runs = self.carry_out(plan, &config);
-            runs.with_context(|| format!("task {name}"))
+            self.carry_out(plan, &config)
+                .with_context(|| of_task(&name))
         });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
+    }
+
+    fn tasks(&self) -> Result<Vec<Task>> {
+        let names: Vec<&str> = if self.tasks.is_empty() {
+            Task::built_in_names().collect()
+        } else {
+            self.tasks.iter().map(|name| &**name).collect()
+        };
+        let tasks = names.into_iter().map(Task::named);
+        Ok(tasks.collect::<Result<_, _>>()?)
     }
 
     /// What there is of a task, and what is missing; all names are checked before anything runs.
@@ -106,8 +108,11 @@ impl SuiteCommand {
             .into_iter()
             .chain(self.policies.iter().map(|name| &**name));
         let policies = names.map(|name| Policy::named(name, &model));
-        let mut missing = Vec::new();
+        let mut missing: Vec<(Policy, String)> = Vec::new();
         for policy in policies.collect::<Result<Vec<_>>>()? {
+            if missing.iter().any(|(other, _)| *other == policy) {
+                continue;
+            }
             let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
             let mark = fingerprint(&task, &model, config, of_checkpoint)?;
             if !can_run(&policy, &task, &learned) {
@@ -145,15 +150,16 @@ impl SuiteCommand {
                 "max_steps: expected at most {longest}, as the shortest episode has, got {}",
                 task.max_steps
             );
+            let team = if task.robots > 1 {
+                Team::Shared
+            } else {
+                Team::Alone
+            };
             for (policy, mark) in missing {
                 let name = policy.name.clone();
                 let comparison = Comparison {
                     policies: vec![policy],
-                    teams: vec![if task.robots > 1 {
-                        Team::Shared
-                    } else {
-                        Team::Alone
-                    }],
+                    teams: vec![team],
                     seeds: seeds.clone(),
                     steps: task.max_steps,
                     recent_steps: RECENT_STEPS,

@@ -43,6 +43,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     ];
     let os = py.import("os")?;
     os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
+    module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
     module.add_class::<connection::Server>()?;
     module.add_class::<connection::Agent>()?;
     module.add_class::<flights::Flights>()?;

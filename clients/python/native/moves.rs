@@ -1,7 +1,7 @@
 //! Moves that a caller hands in: arrays of integers, which become bytes.
 
 use emberwatch_protocol::path::check_moves;
-use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
+use numpy::{Element, PyArray1, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
@@ -19,6 +19,22 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyRes
     let module = given.py().import("emberwatch.arguments")?;
     let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
     Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
+}
+
+/// Integers below `n_choices`, one for each row, as bytes; `None` if they are no plain array of that.
+#[pyfunction]
+pub fn choices<'py>(
+    given: &Bound<'py, PyAny>,
+    n_rows: usize,
+    n_choices: u8,
+) -> Option<Bound<'py, PyArray1<u8>>> {
+    let is_plain = given
+        .cast::<PyUntypedArray>()
+        .is_ok_and(|it| it.ndim() == 1);
+    let byte = |value| u8::try_from(value).unwrap_or(u8::MAX);
+    let chosen = is_plain.then(|| read::<i64>(given, (1, n_rows), byte));
+    let chosen = chosen?.filter(|chosen| chosen.iter().all(|&choice| choice < n_choices))?;
+    Some(PyArray1::from_vec(given.py(), chosen))
 }
 
 fn read<T: Element + Copy>(

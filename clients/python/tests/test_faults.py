@@ -8,23 +8,23 @@ from pathlib import Path
 
 import pytest
 from processes import (
+    CHANNELS,
     LONG,
     PATIENCE,
     Script,
     Server,
+    asleep,
     connects,
     eventually,
     is_running,
     script,
     server,
+    services,
 )
 
 from emberwatch import errors
 from emberwatch.client import connect
 from emberwatch.env import WildfireEnv
-
-#: Where iceoryx2 keeps files of nodes and services.
-CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
 SMALL = {"height": 5, "width": 7, "n_moves": 6, "burn_in": 20}
 
@@ -37,6 +37,10 @@ env.reset(seed=1)
 env.step([3] * 6)
 session = env._session
 print(session._client.info.pid, session.instance, flush=True)
+
+def fly():
+    while True:
+        env.step([3] * 6)
 """
 
 #: How it may end by itself, and the exit code.
@@ -48,6 +52,9 @@ ENDS = {
     "os._exit(4)": 4,
     "os.abort()": -signal.SIGABRT,
     "import threading; threading.Thread(target=lambda: time.sleep(0.1)).start()": 0,
+    "env.itself = env": 0,
+    "import atexit; atexit.register(lambda: env.step([3] * 6))": 0,
+    "import threading; threading.Thread(target=fly, daemon=True).start(); time.sleep(0.1)": 0,
 }
 
 ABRUPT = ("os._exit(4)", "os.abort()")
@@ -64,7 +71,12 @@ SIGNALS = {
 def check_kill(started: Server, call: Callable[[], object]) -> None:
     """Kills the server while a call waits for it, which says so."""
     started.stop()
-    killer = threading.Timer(0.2, started.kill)
+
+    def kill() -> None:
+        asleep()
+        started.kill()
+
+    killer = threading.Thread(target=kill)
     killer.start()
     with pytest.raises(errors.ServerGoneError, match=started.instance):
         call()
@@ -142,12 +154,6 @@ class Remains:
         nodes = (path for path in (CHANNELS / "nodes").iterdir() if path.name.isdecimal())
         pids = (int(path.name) >> 64 & 0xFFFFFFFF for path in nodes)
         return [*map(str, found), *(str(pid) for pid in pids if pid in self._pids)]
-
-
-def services(instance: str) -> list[Path]:
-    """The files of an instance's services."""
-    paths = (CHANNELS / "services").iterdir()
-    return [path for path in paths if f"/{instance}/" in path.read_text(errors="replace")]
 
 
 def embedded(end: str) -> tuple[Script, int, str]:

@@ -1,14 +1,12 @@
 """Observers and truth readers: what is published, who gets it, and what they miss."""
 
-import os
 import subprocess
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from failures import fails, refuses
-from processes import PATIENCE, eventually, server
+from processes import PATIENCE, eventually, server, services
 
 from emberwatch import wire
 from emberwatch.observer import (
@@ -275,9 +273,7 @@ def test_a_bad_instance_name_is_refused() -> None:
 
 def test_a_reader_whose_files_are_removed_says_so() -> None:
     with observe(unused_instance()) as observer:
-        name = f"emberwatch/v{wire.VERSION}/{observer.instance}/"
-        for path in Path(f"/dev/shm/emberwatch-{os.getuid()}/services").iterdir():
-            if name in path.read_text(errors="replace"):
-                path.unlink()
+        for path in services(observer.instance):
+            path.unlink()
         with fails("channel", match="was removed while it was in use"):
             observer.receive(PATIENCE)

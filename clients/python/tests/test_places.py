@@ -12,16 +12,13 @@ from pathlib import Path
 
 import pytest
 from failures import fails, refuses
-from processes import PATIENCE, connects, eventually, server
+from processes import CHANNELS, PATIENCE, connects, eventually, server
 
 from emberwatch import errors
 from emberwatch.client import connect
 from emberwatch.programs import unused_instance
 
 US = os.getpid()
-
-#: Where iceoryx2 keeps files of nodes and services.
-CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
 
 def test_a_seventeenth_client_is_told_the_limit_and_others_go_on() -> None:

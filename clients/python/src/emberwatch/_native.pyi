@@ -215,3 +215,6 @@ class MeritTally:
 
     def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
         """The fields of `Merit`."""
+
+def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
+    """Integers below `n_choices`, as bytes; None if it is no plain array of one for each row."""

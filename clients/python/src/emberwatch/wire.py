@@ -196,9 +196,9 @@ class StepAnswer:
 
     def result(self, index: int = 0) -> StepResult:
         """The results of one robot and its world; `index` counts from the first."""
-        world = self._shape.n_worlds(self.first_robot, index + 1) - 1
-        offset = self._head + index * ROBOT.size
+        world = self._shape.n_worlds(self.first_robot, index + 1) - 1 if index else 0
+        payload, offset = self._payload.data, self._head + index * ROBOT.size
         return StepResult(
-            WorldResult(*WORLD.unpack_from(self._payload.data, world * WORLD.size)),
-            RobotResult(*ROBOT.unpack_from(self._payload.data, offset)),
+            WorldResult._make(WORLD.unpack_from(payload, world * WORLD.size)),
+            RobotResult._make(ROBOT.unpack_from(payload, offset)),
         )
