@@ -205,9 +205,10 @@ def _state(pid: int) -> str:
         return ""
 
 
-def asleep() -> None:
-    """Waits until the main thread sleeps, as it does on the answer of a stopped server."""
-    place = Path(f"/proc/{os.getpid()}/task/{threading.main_thread().native_id}/stat")
+def asleep(thread: threading.Thread | None = None) -> None:
+    """Waits until a thread, else the main one, sleeps as on the answer of a stopped server."""
+    thread = thread or threading.main_thread()
+    place = Path(f"/proc/{os.getpid()}/task/{thread.native_id}/stat")
     looks = 0
 
     def is_asleep() -> bool:

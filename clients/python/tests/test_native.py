@@ -2,16 +2,16 @@
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from failures import fails, refuses
-from processes import LONG, eventually, script, server
+from processes import LONG, asleep, eventually, script, server
 
 from emberwatch import _native, errors, recording
 from emberwatch.belief import Transition, initial_prior
@@ -85,9 +85,9 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
     asleep(steps)
 
     def interrupt() -> None:
-        asleep(threading.main_thread())
+        asleep()
         os.kill(os.getpid(), signal.SIGINT)
-        asleep(threading.main_thread())
+        asleep()
         started.wake_up()  # Else nothing ends a close that is not interrupted.
 
     thread = threading.Thread(target=interrupt)
@@ -100,20 +100,6 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
     client.close()
     with fails("closed"):
         client.status()
-
-
-def asleep(thread: threading.Thread) -> None:
-    """Waits until a thread sleeps for a while."""
-    place = Path(f"/proc/self/task/{thread.native_id}/stat")
-    looks = 0
-
-    def is_asleep() -> bool:
-        nonlocal looks
-        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
-        looks = looks + 1 if sleeps else 0
-        return looks > 20
-
-    assert eventually(is_asleep)
 
 
 def test_phi_of_single_precision_is_that_of_double() -> None:
@@ -160,39 +146,31 @@ def test_phi_of_no_grid_is_refused(height: int) -> None:
         Transition(WILDFIRE, height=height, width=3)
 
 
-def apply(beliefs: Any) -> None:
-    _native.Transition(WILDFIRE.toml, 600, 600).apply(beliefs)
-
-
-def correct(beliefs: Any) -> None:
-    frames = np.zeros((beliefs.shape[1], 600, 600), np.uint8)
-    _native.correct(beliefs, WILDFIRE.observation_matrix, frames)
-
-
-@pytest.mark.parametrize("work", [apply, correct])
-def test_other_threads_run_beside_work_on_large_grids(work: Callable[[Any], None]) -> None:
+def test_other_threads_run_beside_work_on_large_grids() -> None:
     prior = initial_prior(WILDFIRE, height=600, width=600)
-    beliefs = np.repeat(prior[:, np.newaxis], 8, axis=1)
-    called: list[str] = []
+    beliefs, frames = np.repeat(prior[:, np.newaxis], 2, axis=1), np.zeros((2, 600, 600), np.uint8)
+    phi = _native.Transition(WILDFIRE.toml, 600, 600)
+    meets(lambda: phi.apply(beliefs), RuntimeError, "borrowed")
+    correct = partial(_native.correct, beliefs, WILDFIRE.observation_matrix, frames)
+    meets(correct, errors.InvalidArgumentError, "in use")
 
-    def watch(_frame: object, event: str, _argument: object) -> None:
-        called.append(event)
 
-    def run() -> None:
-        sys.setprofile(watch)
-        work(beliefs)
-        sys.setprofile(None)
+def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None:
+    """Two threads do the same work, until one is refused while the other is in the midst of it."""
+    refused = threading.Event()
 
-    thread, beside = threading.Thread(target=run), 0
+    def is_refused() -> bool:
+        try:
+            work()
+        except kind as error:
+            assert words in str(error)
+            refused.set()
+        return refused.is_set()
+
+    thread = threading.Thread(target=lambda: eventually(is_refused))
     thread.start()
-    n_called = 0
-    while thread.is_alive():
-        beside = beside + 1 if len(called) == n_called and called[-1:] == ["c_call"] else 0
-        n_called = len(called)
-        if beside > 1000:
-            break
+    assert eventually(is_refused)
     thread.join()
-    assert beside > 1000
 
 
 def test_flights_refuse_rows_and_states_of_others() -> None:
