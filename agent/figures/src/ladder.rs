@@ -144,7 +144,8 @@ impl Bar {
 
     fn draw_worlds(&self, page: &mut Svg, plot: &Plot, upper: f64) {
         let dot = blend(self.color, INK, 0.55);
-        let worlds = if self.worlds.len() > 1 {
+        // The only world of a bar is its end.
+        let worlds = if self.worlds.len() > 1 || !is_drawable(self.value) {
             &self.worlds[..]
         } else {
             &[]

@@ -88,6 +88,17 @@ fn ladders_of_none_one_and_many() {
 }
 
 #[test]
+fn a_row_without_a_value_has_its_worlds_alone() {
+    let n_dots = |bar: Bar| ladder(vec![bar]).svg().matches("<circle").count();
+    let mut row = bar("beam", 40.0);
+    let of_two = n_dots(row.clone());
+    (row.value, row.ends) = (f64::NAN, None);
+    assert_eq!(n_dots(row.clone()), of_two);
+    row.worlds.truncate(1);
+    assert_eq!(n_dots(row), of_two / 2);
+}
+
+#[test]
 fn names_are_escaped_and_shortened() {
     let long = "a very long name ".repeat(40);
     let hostile = "</text><script>&amp;\u{1}\"'";
@@ -116,7 +127,7 @@ fn names_are_escaped_and_shortened() {
 fn extreme_values_are_drawn_or_left_out() {
     for value in EXTREME {
         let mut other = bar("error", 2.0);
-        (other.error, other.worlds) = (Some(value), vec![(1, value), (2, 1.0)]);
+        (other.ends, other.worlds) = (Some([0.0, 2.0 * value]), vec![(1, value), (2, 1.0)]);
         check(&ladder(vec![bar("value", value), other, bar("usual", 3.0)]).svg());
         for scale in [Scale::Linear, Scale::Logarithmic] {
             let mut curve = Curve::new("extreme", vec![(0.0, value), (value, 1.0), (5.0, 2.0)]);

@@ -48,8 +48,7 @@ pub struct Lesson {
     pub before: Sightings,
     /// The cells that the frame shows, by row-major index, and their values; at least one.
     pub frame: Vec<(usize, u8)>,
-    /// The distribution of each of these values as it was predicted by whom the network corrects, `[cells, O]`; empty if
-    /// it predicts alone.
+    /// What the filter that the network corrects predicted of each of these cells, `[cells, O]`; empty without one.
     pub base: Vec<f32>,
 }
 
@@ -100,7 +99,8 @@ impl NeuralBelief {
         Ok(set(&changes).map_err(NetworkError::from)?)
     }
 
-    /// The distribution of what each cell will show in the present step, `[O, H, W]`. `base`: that of whom it corrects.
+    /// The distribution of what each cell will show in the present step, `[O, H, W]`. `base`: that of the filter that it
+    /// corrects.
     ///
     /// # Errors
     /// For a number that is not finite, or where the device fails.

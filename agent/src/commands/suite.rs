@@ -15,7 +15,6 @@ use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::learning::train::CHECKPOINT;
 use emberwatch_agent::policy::Policy;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_network::Device;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;
 use std::ops::Range;
@@ -37,8 +36,8 @@ pub struct SuiteCommand {
     /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// A folder for results, a CSV file a task; what it has already is not run again, unless checkpoint or
-    /// settings are others
+    /// A folder for results, a CSV file a task; what it has already is not run again, unless its checkpoint
+    /// or the settings have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Worlds of each task, the first of its test seeds [default: all]
@@ -66,14 +65,6 @@ impl SuiteCommand {
             "--policies: expected none that is told the next states, as these act only in `compare`"
         );
         let config = self.settings.effective()?;
-        let tasks = if self.tasks.is_empty() {
-            Task::built_in_names()
-                .map(Task::named)
-                .collect::<Result<Vec<_>, _>>()
-        } else {
-            self.tasks.iter().map(|name| Task::named(name)).collect()
-        };
-        let tasks = tasks?;
         if let Some(folder) = &self.checkpoints {
             ensure!(
                 folder.is_dir(),
@@ -81,19 +72,29 @@ impl SuiteCommand {
                 folder.display()
             );
         }
-        let plans = tasks.into_iter().map(|task| {
+        let of_task = |name: &str| format!("task {name}");
+        let plans = self.tasks()?.into_iter().map(|task| {
             let name = task.name.clone();
-            let plan = self.plan(task, &config);
-            plan.with_context(|| format!("task {name}"))
+            self.plan(task, &config).with_context(|| of_task(&name))
         });
         let plans = plans.collect::<Result<Vec<_>>>()?;
         make_folder(&self.out)?;
         let runs = plans.into_iter().map(|plan| {
             let name = plan.task.name.clone();
-            let runs = self.carry_out(plan, &config);
-            runs.with_context(|| format!("task {name}"))
+            self.carry_out(plan, &config)
+                .with_context(|| of_task(&name))
         });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
+    }
+
+    fn tasks(&self) -> Result<Vec<Task>> {
+        let names: Vec<&str> = if self.tasks.is_empty() {
+            Task::built_in_names().collect()
+        } else {
+            self.tasks.iter().map(|name| &**name).collect()
+        };
+        let tasks = names.into_iter().map(Task::named);
+        Ok(tasks.collect::<Result<_, _>>()?)
     }
 
     /// What there is of a task, and what is missing; all names are checked before anything runs.
@@ -106,10 +107,29 @@ impl SuiteCommand {
             .into_iter()
             .chain(self.policies.iter().map(|name| &**name));
         let policies = names.map(|name| Policy::named(name, &model));
-        let mut missing = Vec::new();
-        for policy in policies.collect::<Result<Vec<_>>>()? {
+        let mark = |policy: &Policy| {
             let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
-            let mark = fingerprint(&task, &model, config, of_checkpoint)?;
+            fingerprint(&task, &model, config, of_checkpoint)
+        };
+        let policies = policies.collect::<Result<Vec<_>>>()?;
+        let is_asked = |name: &str| policies.iter().any(|policy| policy.name == name);
+        let mut stale = Vec::new();
+        for name in kept.marked().filter(|name| !is_asked(name)) {
+            let is_same = kept.has_mark(name, &mark(&Policy::named(name, &model)?)?);
+            if !is_same {
+                let task = &task.name;
+                tracing::warn!(
+                    "task {task}: {name} is left out: it was run with other settings or another checkpoint"
+                );
+                stale.push(name.to_owned());
+            }
+        }
+        let mut missing: Vec<(Policy, String)> = Vec::new();
+        for policy in policies {
+            if missing.iter().any(|(other, _)| *other == policy) {
+                continue;
+            }
+            let mark = mark(&policy)?;
             if !can_run(&policy, &task, &learned) {
                 let (task, policy) = (&task.name, &policy.name);
                 tracing::warn!(
@@ -125,6 +145,7 @@ impl SuiteCommand {
             seeds,
             kept,
             missing,
+            stale,
         })
     }
 
@@ -136,6 +157,7 @@ impl SuiteCommand {
             seeds,
             mut kept,
             missing,
+            stale,
         } = plan;
         if !missing.is_empty() {
             let (mut arena, _server) = self.open(&task, &seeds)?;
@@ -145,15 +167,16 @@ impl SuiteCommand {
                 "max_steps: expected at most {longest}, as the shortest episode has, got {}",
                 task.max_steps
             );
+            let team = if task.robots > 1 {
+                Team::Shared
+            } else {
+                Team::Alone
+            };
             for (policy, mark) in missing {
                 let name = policy.name.clone();
                 let comparison = Comparison {
                     policies: vec![policy],
-                    teams: vec![if task.robots > 1 {
-                        Team::Shared
-                    } else {
-                        Team::Alone
-                    }],
+                    teams: vec![team],
                     seeds: seeds.clone(),
                     steps: task.max_steps,
                     recent_steps: RECENT_STEPS,
@@ -164,7 +187,8 @@ impl SuiteCommand {
                 kept.replace(name, mark, results.runs)?;
             }
         }
-        kept.runs.retain(|run| seeds.contains(&run.world_seed));
+        kept.runs
+            .retain(|run| seeds.contains(&run.world_seed) && !stale.contains(&run.policy));
         Ok(TaskRuns {
             task: task.name,
             runs: kept.runs,
@@ -189,8 +213,9 @@ impl SuiteCommand {
             tracing::warn!("no {}: no learned policy for this task", place.display());
             return Ok((Learned::default(), None));
         }
-        let learned = Learned::read([&*place], &Device::Cpu)?;
-        let bytes = std::fs::read(&place).with_context(|| place.display().to_string())?;
+        let of_file = || format!("checkpoint {}", place.display());
+        let bytes = std::fs::read(&place).with_context(of_file)?;
+        let learned = Learned::from_bytes(&bytes).with_context(of_file)?;
         Ok((learned, Some(crc32fast::hash(&bytes))))
     }
 
@@ -232,6 +257,8 @@ struct Plan {
     kept: Kept,
     /// Policies to run, each with its fingerprint.
     missing: Vec<(Policy, String)>,
+    /// Policies that were run before, with other settings or another checkpoint.
+    stale: Vec<String>,
 }
 
 /// Whether a policy has what it needs on a task.
@@ -253,6 +280,8 @@ fn fingerprint(
     };
     let (model, config) = (toml::to_string(model.file())?, toml::to_string(config)?);
     let version = env!("CARGO_PKG_VERSION");
-    let text = format!("{version}\n{task:?}\n{model}\n{config}\n{checkpoint:?}");
+    // Built-in states are no file.
+    let states = std::fs::read(&task.states).map_or(0, |bytes| crc32fast::hash(&bytes));
+    let text = format!("{version}\n{task:?}\n{states}\n{model}\n{config}\n{checkpoint:?}");
     Ok(format!("{:08x}", crc32fast::hash(text.as_bytes())))
 }

@@ -150,7 +150,9 @@ impl SavedBelief {
                 check_target(*target, *n_observations)?;
                 let mut network = new_network(*n_observations, device)?;
                 network.set_parameters(&find)?;
-                let filter = filter.as_ref().map(|it| it.read_corrected(&find));
+                let filter = filter
+                    .as_ref()
+                    .map(|it| it.read_corrected(*n_observations, &find));
                 LearnedBelief::Neural(NeuralModel {
                     network,
                     target: *target,
@@ -191,11 +193,14 @@ impl SavedModel {
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
 
-    /// One that a neural belief corrects.
+    /// One that a neural belief corrects, about so many observations.
     pub fn read_corrected(
         &self,
+        n_observations: usize,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
     ) -> Result<LearnedModel> {
+        let (name, got) = ("filter.n_observations", self.dimensions.n_observations);
+        check(got == n_observations, name, n_observations, got)?;
         self.read(false, |name, shape| find(&format!("{FILTER}{name}"), shape))
     }
 }

@@ -42,6 +42,10 @@ pub fn learner(
         }
         LearnerKind::Neural => {
             let filter = spec.learned.filter.as_ref();
+            if let Some(filter) = filter {
+                let got = filter.tables.dimensions.n_observations;
+                same_observations(worlds.n_observations, got)?;
+            }
             let learner = NeuralLearner::new(contents, filter, worlds, config, &spec.device);
             Box::new(learner.with_context(of_file)?)
         }
@@ -59,15 +63,19 @@ pub fn learner(
                 Some(base) => base,
                 None => base(spec, info, worlds.shape)?,
             };
-            let (expected, got) = (worlds.n_observations, base.n_observations());
-            ensure!(
-                got == expected,
-                "checkpoint: expected {expected} observations as the world's, got {got}"
-            );
+            same_observations(worlds.n_observations, base.n_observations())?;
             let learner = DecisionsLearner::new(base, contents, worlds, config);
             Box::new(learner.with_context(of_file)?)
         }
     })
+}
+
+fn same_observations(expected: usize, got: usize) -> Result<()> {
+    ensure!(
+        got == expected,
+        "checkpoint: expected {expected} observations as the world's, got {got}"
+    );
+    Ok(())
 }
 
 /// Refuses a server without the first frames that the settings ask for, which show every cell.

@@ -18,8 +18,8 @@ use std::ops::Range;
 /// Frames of a block, at most.
 const BLOCK_FRAMES: usize = 256;
 
-/// A frame: the cells that it shows, by row-major index, with their values, and what was predicted of each by whom the
-/// network corrects, if there is one, `[cells, O]`.
+/// A frame: the cells that it shows, by row-major index, with their values, and what the filter that the network corrects
+/// predicted of each, if there is one, `[cells, O]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Seen {
     cells: Vec<(usize, u8)>,
@@ -77,7 +77,7 @@ impl Replay {
         self.full.extend(ended.into_values());
     }
 
-    /// Adds the next frame of a robot. `base`: what was predicted of it by whom the network corrects, `[O, H, W]`.
+    /// Adds the next frame of a robot. `base`: what the filter that the network corrects predicted, `[O, H, W]`.
     ///
     /// # Panics
     /// If its track was not begun.
@@ -142,7 +142,7 @@ impl Replay {
         (self.full, self.open) = (other.full, other.open);
     }
 
-    /// Refuses one that is not of a grid and of so many observations, or lacks a robot. `has_base`: whether another's
+    /// Refuses one that is not of a grid and of so many observations, or lacks a robot. `has_base`: whether a filter's
     /// predictions belong to the frames.
     pub fn check(
         &self,

@@ -103,7 +103,8 @@ impl SavedNeural<'_> {
     /// The filter that it corrects.
     pub(super) fn filter(&self, contents: &Contents) -> Result<Option<Box<LearnedModel>>> {
         let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
-        let filter = self.filter.as_ref().map(|it| it.read_corrected(find));
+        let filter = self.filter.as_ref();
+        let filter = filter.map(|it| it.read_corrected(self.n_observations, find));
         Ok(filter.transpose()?.map(Box::new))
     }
 
