@@ -139,6 +139,10 @@ fn a_policy_runs_again_on_what_was_learned_since() {
         of_coverage(&rows),
         "coverage learned nothing"
     );
+    let others = "--policies coverage --beam-width 3";
+    let ended = agent(&format!("suite --tasks {task} --out {out} {others}"));
+    ended.check_says("learned_beam is left out");
+    assert!(!ended.stdout.contains("learned_beam"), "{}", ended.stdout);
 }
 
 #[test]

@@ -215,9 +215,8 @@ fn files_that_have_a_built_in_name_or_are_pipes_are_refused() {
     let words = "expected a regular file, got a pipe";
     check(SERVER, &format!("--task {pipe}"), words);
     check(AGENT, &format!("compare --task {pipe}"), words);
-    let model = format!(
-        "name = \"mine\"\nmodel = \"pipe\"\nmoves = 3\nheight = 9\nwidth = 9\nmax_steps = 9\ntest_seeds = {{ start = 0, end = 1 }}\n"
-    );
+    let model = "name = \"mine\"\nmodel = \"pipe\"\nmoves = 3\nheight = 9\nwidth = 9\nmax_steps = 9\n\
+                 test_seeds = { start = 0, end = 1 }\n";
     std::fs::write(path("model.toml"), model).expect("write");
     let words = "model: expected a regular file, got a pipe";
     check(

@@ -147,7 +147,7 @@ impl Task {
             ("states", &mut task.states, is_states),
         ] {
             let beside = folder.join(&*file);
-            if file.is_empty() || !beside.exists() {
+            if file.is_empty() || !beside.exists() || (is_built_in && beside.is_dir()) {
                 continue;
             }
             if is_built_in {
@@ -234,7 +234,7 @@ mod tests {
         for name in Task::built_in_names() {
             let task = Task::named(name).expect(name);
             assert_eq!((&*task.name, &*task.source), (name, name));
-            let model = crate::Model::built_in(&task.model);
+            let model = Model::built_in(&task.model);
             assert_eq!(model.is_none(), task.is_recorded(), "{name}");
         }
     }

@@ -15,7 +15,6 @@ use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::learning::train::CHECKPOINT;
 use emberwatch_agent::policy::Policy;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_network::Device;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;
 use std::ops::Range;
@@ -37,8 +36,8 @@ pub struct SuiteCommand {
     /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// A folder for results, a CSV file a task; what it has already is not run again, unless checkpoint or
-    /// settings are others
+    /// A folder for results, a CSV file a task; what it has already is not run again, unless its checkpoint
+    /// or the settings have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Worlds of each task, the first of its test seeds [default: all]
@@ -108,13 +107,29 @@ impl SuiteCommand {
             .into_iter()
             .chain(self.policies.iter().map(|name| &**name));
         let policies = names.map(|name| Policy::named(name, &model));
+        let mark = |policy: &Policy| {
+            let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
+            fingerprint(&task, &model, config, of_checkpoint)
+        };
+        let policies = policies.collect::<Result<Vec<_>>>()?;
+        let is_asked = |name: &str| policies.iter().any(|policy| policy.name == name);
+        let mut stale = Vec::new();
+        for name in kept.marked().filter(|name| !is_asked(name)) {
+            let is_same = kept.has_mark(name, &mark(&Policy::named(name, &model)?)?);
+            if !is_same {
+                let task = &task.name;
+                tracing::warn!(
+                    "task {task}: {name} is left out: it was run with other settings or another checkpoint"
+                );
+                stale.push(name.to_owned());
+            }
+        }
         let mut missing: Vec<(Policy, String)> = Vec::new();
-        for policy in policies.collect::<Result<Vec<_>>>()? {
+        for policy in policies {
             if missing.iter().any(|(other, _)| *other == policy) {
                 continue;
             }
-            let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
-            let mark = fingerprint(&task, &model, config, of_checkpoint)?;
+            let mark = mark(&policy)?;
             if !can_run(&policy, &task, &learned) {
                 let (task, policy) = (&task.name, &policy.name);
                 tracing::warn!(
@@ -130,6 +145,7 @@ impl SuiteCommand {
             seeds,
             kept,
             missing,
+            stale,
         })
     }
 
@@ -141,6 +157,7 @@ impl SuiteCommand {
             seeds,
             mut kept,
             missing,
+            stale,
         } = plan;
         if !missing.is_empty() {
             let (mut arena, _server) = self.open(&task, &seeds)?;
@@ -170,7 +187,8 @@ impl SuiteCommand {
                 kept.replace(name, mark, results.runs)?;
             }
         }
-        kept.runs.retain(|run| seeds.contains(&run.world_seed));
+        kept.runs
+            .retain(|run| seeds.contains(&run.world_seed) && !stale.contains(&run.policy));
         Ok(TaskRuns {
             task: task.name,
             runs: kept.runs,
@@ -195,8 +213,9 @@ impl SuiteCommand {
             tracing::warn!("no {}: no learned policy for this task", place.display());
             return Ok((Learned::default(), None));
         }
-        let learned = Learned::read([&*place], &Device::Cpu)?;
-        let bytes = std::fs::read(&place).with_context(|| place.display().to_string())?;
+        let of_file = || format!("checkpoint {}", place.display());
+        let bytes = std::fs::read(&place).with_context(of_file)?;
+        let learned = Learned::from_bytes(&bytes).with_context(of_file)?;
         Ok((learned, Some(crc32fast::hash(&bytes))))
     }
 
@@ -238,6 +257,8 @@ struct Plan {
     kept: Kept,
     /// Policies to run, each with its fingerprint.
     missing: Vec<(Policy, String)>,
+    /// Policies that were run before, with other settings or another checkpoint.
+    stale: Vec<String>,
 }
 
 /// Whether a policy has what it needs on a task.
@@ -259,6 +280,8 @@ fn fingerprint(
     };
     let (model, config) = (toml::to_string(model.file())?, toml::to_string(config)?);
     let version = env!("CARGO_PKG_VERSION");
-    let text = format!("{version}\n{task:?}\n{model}\n{config}\n{checkpoint:?}");
+    // Built-in states are no file.
+    let states = std::fs::read(&task.states).map_or(0, |bytes| crc32fast::hash(&bytes));
+    let text = format!("{version}\n{task:?}\n{states}\n{model}\n{config}\n{checkpoint:?}");
     Ok(format!("{:08x}", crc32fast::hash(text.as_bytes())))
 }

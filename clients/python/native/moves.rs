@@ -43,9 +43,7 @@ fn read<T: Element + Copy>(
     byte: impl Fn(T) -> u8,
 ) -> Option<Vec<u8>> {
     // Not of a subclass, which may mask values.
-    let is_plain = given
-        .get_type()
-        .is(&PyUntypedArray::type_object(given.py()));
+    let is_plain = given.get_type().is(PyUntypedArray::type_object(given.py()));
     let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
     let array = array?.ok()?;
     let shape = array.shape();

@@ -12,11 +12,14 @@ use pyo3::prelude::*;
 type World = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
 type Robot = (f64, f64, u32, u32, u32, u32, u32, u32, u32, u32);
 
+/// Its result, what it saw, and the path that it flew.
+type RobotFrame<'py> = (Robot, Bound<'py, PyArray2<u8>>, Bound<'py, PyArray1<u8>>);
+
 #[derive(IntoPyObject)]
 pub struct Frame<'py> {
     world: u32,
     result: World,
-    robots: Vec<(Robot, Bound<'py, PyArray2<u8>>, Bound<'py, PyArray1<u8>>)>,
+    robots: Vec<RobotFrame<'py>>,
     n_lost: u64,
 }
 

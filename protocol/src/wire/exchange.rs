@@ -113,7 +113,7 @@ impl Exchange {
 
     fn answer<Q: Header, R: Header, T>(
         &self,
-        pending: &PendingResponse<Ipc, [u8], Q, [u8], R>,
+        pending: &Pending<Q, R>,
         timeout: Duration,
         read: impl Fn(&R, &[u8]) -> T,
     ) -> Result<Option<T>, ConnectionError> {
@@ -153,12 +153,15 @@ impl Exchange {
     }
 }
 
+/// A request that waits for its answer.
+type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+
 /// Sends a request, once the one before is released.
 fn send<Q: Header, R: Header>(
     client: &Client<Ipc, [u8], Q, [u8], R>,
     header: Q,
     payload: &[u8],
-) -> Result<PendingResponse<Ipc, [u8], Q, [u8], R>, ChannelError> {
+) -> Result<Pending<Q, R>, ChannelError> {
     let start = Instant::now();
     loop {
         let request = client.loan_slice_uninit(payload.len());

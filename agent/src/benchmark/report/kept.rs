@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 pub struct Kept {
     path: PathBuf,
     pub runs: Vec<PolicyRun>,
-    /// Of each policy what its runs depend on, shortened; others have written no such thing.
+    /// Of each policy what its runs depend on, shortened. Rows from Python have none.
     marks: BTreeMap<String, String>,
 }
 
@@ -43,7 +43,17 @@ impl Kept {
             let mut runs = self.runs.iter();
             runs.any(|run| (&*run.policy, run.world_seed, run.steps) == (policy, seed, steps))
         };
-        self.marks.get(policy).is_some_and(|it| it == mark) && seeds.clone().all(has)
+        self.has_mark(policy, mark) && seeds.clone().all(has)
+    }
+
+    /// Whether a policy was run with the same fingerprint.
+    pub fn has_mark(&self, policy: &str, mark: &str) -> bool {
+        self.marks.get(policy).is_some_and(|it| it == mark)
+    }
+
+    /// The policies that have a fingerprint.
+    pub fn marked(&self) -> impl Iterator<Item = &str> {
+        self.marks.keys().map(|name| &**name)
     }
 
     /// Puts runs in the place of those that a policy has.
@@ -65,5 +75,5 @@ impl Kept {
 }
 
 fn marks_beside(path: &Path) -> PathBuf {
-    path.with_extension("toml")
+    path.with_extension("fingerprints.toml")
 }

@@ -239,4 +239,4 @@ class WildfireVectorEnv(WorldVectorEnv):
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(actions, flown)
         part, name = self._pays
-        return self._results[part][name]
+        return self._results[part][name].copy()  # later steps write to the results
