@@ -1,5 +1,5 @@
 //! What every client may rely on: the handshake, echoes, and refusals that change nothing. One suite,
-//! through the Rust crate and through the Python package.
+//! through the Rust crate and through `wire_reference.py`.
 
 use crate::python::PythonWire;
 use emberwatch_protocol::Model;
@@ -30,7 +30,7 @@ enum Client {
 }
 
 impl Client {
-    /// Opens both channels of an instance, without a handshake.
+    /// Opens both channels of an instance; what a test says next need not be a handshake.
     fn open(self, instance: &Instance) -> Box<dyn RawClient> {
         match self {
             Self::Rust => Box::new(Wire::open(instance)),

@@ -1,7 +1,7 @@
 //! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! What they share is in `src`; `python` lets the Python package speak the protocol, `random_robot` is the example of a
+//! What they share is in `src`; `python` lets `wire_reference.py` speak the protocol, `random_robot` is the example of a
 //! client; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own.
 //! `cargo test -p tests -- --ignored` adds the long run of the hostile clients, and what needs Python (`scripts/test`
 //! installs it).

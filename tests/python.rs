@@ -1,4 +1,5 @@
-//! The protocol byte by byte through the Python package: `wire_driver.py` sends what it is told.
+//! The protocol byte by byte through a client that shares no code with the others: `wire_reference.py` sends what it
+//! is told, and checks the answers itself.
 
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use emberwatch_protocol::channels::Instance;
@@ -18,16 +19,16 @@ pub struct PythonWire {
 }
 
 impl PythonWire {
-    /// Opens both channels of an instance, without a handshake.
+    /// Opens both channels of an instance; it says hello by itself.
     pub fn open(instance: &Instance) -> Self {
         let python = python();
-        let driver = repository().join("clients/python/tests/wire_driver.py");
+        let program = repository().join("tests/wire_reference.py");
         let mut process = Command::new(&python)
-            .args([driver.as_os_str(), instance.name().as_ref()])
+            .args([program.as_os_str(), instance.name().as_ref()])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
-            .expect("start the driver");
+            .expect("start the client");
         Self {
             requests: RefCell::new(process.stdin.take()),
             answers: RefCell::new(BufReader::new(process.stdout.take().expect("piped"))),
@@ -35,7 +36,7 @@ impl PythonWire {
         }
     }
 
-    /// Waits for one answer; the driver ends if none comes in time.
+    /// Waits for one answer; the client ends if none comes in time, or a wrong one.
     fn exchange<R: AnyBitPattern>(
         &self,
         service: &str,
@@ -49,11 +50,11 @@ impl PythonWire {
         });
         let mut requests = self.requests.borrow_mut();
         let requests = requests.as_mut().expect("open until it is dropped");
-        writeln!(requests, "{request}").expect("tell the driver");
+        writeln!(requests, "{request}").expect("tell the client");
         let mut line = String::new();
         let mut answers = self.answers.borrow_mut();
-        answers.read_line(&mut line).expect("hear the driver");
-        let answer: Value = serde_json::from_str(&line).expect("an answer by the driver");
+        answers.read_line(&mut line).expect("hear the client");
+        let answer: Value = serde_json::from_str(&line).expect("an answer by the client");
         let bytes = |key: &str| bytes_of_hex(answer[key].as_str().expect("hexadecimal"));
         (pod_read_unaligned(&bytes("header")), bytes("payload"))
     }

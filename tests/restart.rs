@@ -1,10 +1,10 @@
 //! Servers that end: by signal, by kill, and what their agents and successors make of it.
 
-use emberwatch_protocol::channels::{Instance, Ipc, node_config};
-use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::channels::{ChannelError, Instance, Ipc, create_node, node_config};
+use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::observer::Observer;
-use iceoryx2::prelude::{CallbackProgression, Service};
+use iceoryx2::prelude::{CallbackProgression, Service, ServiceName};
 use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -77,6 +77,31 @@ fn a_client_that_waits_learns_that_its_server_was_killed() {
         matches!(refused, Err(ConnectionError::ServerGone { .. })),
         "{refused:?}"
     );
+}
+
+#[test]
+fn a_server_of_another_version_is_called_so() {
+    let instance = new_instance();
+    let node = create_node().expect("a node");
+    let name = format!("emberwatch/v3/{}/control", instance.name());
+    let name = ServiceName::new(&name).expect("a name");
+    let service = node.service_builder(&name).request_response::<[u8], [u8]>();
+    let service = service.create().expect("a service of the next version");
+    let refused = Connection::open(&instance, "test", PATIENCE).err();
+    let other = Connection::open(&new_instance(), "test", PATIENCE).err();
+    let words = refused.map(|error| error.to_string()).unwrap_or_default();
+    assert!(
+        words.contains("the client speaks 2, the server 3;"),
+        "{words}"
+    );
+    let is_none = |error: &ConnectionError| {
+        matches!(
+            error,
+            ConnectionError::Channel(ChannelError::NoServer { .. })
+        )
+    };
+    assert!(other.as_ref().is_some_and(is_none), "{other:?}");
+    drop(service);
 }
 
 #[test]

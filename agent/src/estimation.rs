@@ -3,7 +3,6 @@
 pub mod autoencoder;
 pub mod first_belief;
 pub mod follower;
-mod kept_belief;
 pub mod neural;
 
 pub use autoencoder::AutoencoderEstimator;

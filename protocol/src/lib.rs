@@ -24,9 +24,10 @@ pub use model::transition::{self, Transition};
 pub use model::{Model, randomness, vectors};
 pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
+pub use wire::decider::Decider;
 pub use wire::{
-    agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
-    payload, recording, responder, shared_memory, turn, wait,
+    agent_belief, channels, cleanup, control, decisions, failed_connections, interrupt, message,
+    observer, payload, recording, responder, shared_memory, turn, wait,
 };
 
 #[cfg(doctest)]

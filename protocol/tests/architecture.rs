@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 10] = [
+const SOURCES: [&str; 11] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
@@ -17,6 +17,7 @@ const SOURCES: [&str; 10] = [
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",
+    "clients/python/native",
     "clients/python/src/emberwatch",
 ];
 

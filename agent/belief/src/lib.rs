@@ -1,5 +1,5 @@
 //! Beliefs about a grid of hidden states that robots see in part, and plans on them. Pure: frames, seeds and
-//! steps come as arguments; no clock, no files, no logging.
+//! steps come as arguments; no clock, no logging, and no files but for [`estimation::kept_belief`].
 //!
 //! - [`estimation`]: from frames to a belief about every cell (paper sections III.A to III.C)
 //! - [`planning`]: from a belief to a path (paper section III.D)

@@ -1,7 +1,7 @@
 //! A filter's first belief: simulating it may take long, so it is announced, and kept for later runs.
 
-use super::kept_belief::KeptBelief;
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::kept_belief::KeptBelief;
 use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::{Model, Shape};
@@ -19,7 +19,7 @@ pub fn first_belief(
     let Prior::Simulated { n_worlds, burn_in } = prior else {
         return prior.belief(model, shape, seed);
     };
-    let kept = KeptBelief::new(key(prior, model, shape, seed), dim(model, shape));
+    let kept = KeptBelief::new(prior, model, shape, seed);
     if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
         return Ok(belief);
     }
@@ -32,19 +32,8 @@ pub fn first_belief(
         "simulating the first belief"
     );
     let belief = prior.belief(model, shape, seed)?;
-    if let Some(kept) = kept {
-        kept.write(&belief);
+    if let Some(Err(error)) = kept.map(|kept| kept.write(&belief)) {
+        tracing::debug!("the first belief is not kept: {error}");
     }
     Ok(belief)
-}
-
-/// All that a simulated belief depends on.
-fn key(prior: Prior, model: &Model, shape: Shape, seed: u64) -> String {
-    let version = env!("CARGO_PKG_VERSION");
-    let model = toml::to_string(model.file()).expect("invariant: model files serialise");
-    format!("emberwatch {version}: {prior:?}, {shape}, seed {seed}\n{model}\n")
-}
-
-fn dim(model: &Model, shape: Shape) -> (usize, usize, usize) {
-    (model.n_states(), shape.height(), shape.width())
 }

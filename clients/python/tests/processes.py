@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from emberwatch.client import Client
@@ -26,6 +27,9 @@ LONG = 5 * PATIENCE
 
 #: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
+
+#: Where iceoryx2 keeps files of nodes and services.
+CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
 #: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
 at_the_end = ExitStack()
@@ -199,6 +203,31 @@ def _state(pid: int) -> str:
             return file.read().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
         return ""
+
+
+def asleep(thread: threading.Thread | None = None) -> None:
+    """Waits until a thread, else the main one, sleeps as on the answer of a stopped server."""
+    thread = thread or threading.main_thread()
+    place = Path(f"/proc/{os.getpid()}/task/{thread.native_id}/stat")
+    looks = 0
+
+    def is_asleep() -> bool:
+        nonlocal looks
+        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
+        looks = looks + 1 if sleeps else 0
+        return looks > 20
+
+    assert eventually(is_asleep)
+
+
+def services(instance: str) -> list[Path]:
+    """The files of an instance's services."""
+    found = []
+    for path in (CHANNELS / "services").iterdir():
+        with suppress(FileNotFoundError):  # of a program that ends now
+            if f"/{instance}/" in path.read_text(errors="replace"):
+                found.append(path)
+    return found
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:

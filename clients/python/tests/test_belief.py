@@ -1,10 +1,11 @@
-"""The known-model filter: against the authors' numbers, its formulas, and for any model."""
+"""The known-model filter: against the authors' numbers, and the oracle for any model."""
 
 import json
 import pickle
 from pathlib import Path
 
 import numpy as np
+import oracle
 import pytest
 from failures import fails, refuses
 from hypothesis import given, settings
@@ -138,32 +139,6 @@ def test_masked_posteriors_along_a_path_are_the_authors() -> None:
         )
 
 
-def formula(model: Model, belief: NDArray) -> NDArray[np.float64]:
-    """Eqs. 2-4 as they stand, by the cell's own state where the model has a kernel for each."""
-    if model.sees_own_state:
-        return sum(
-            belief[own] * _formula_of(model.kernels[own], model.bias, belief, own=own)
-            for own in range(model.n_states)
-        )
-    return _formula_of(model.kernel, model.bias, belief)
-
-
-def _formula_of(
-    kernel: NDArray, bias: NDArray, belief: NDArray, own: int | None = None
-) -> NDArray[np.float64]:
-    _, _, kernel_height, kernel_width = kernel.shape
-    out = np.zeros_like(belief)
-    for to, i, j in np.ndindex(belief.shape):
-        out[to, i, j] = bias[to]
-        for start, a, c in np.ndindex(kernel.shape[1:]):
-            row, col = i + a - kernel_height // 2, j + c - kernel_width // 2
-            if own is not None and (row, col) == (i, j):
-                out[to, i, j] += kernel[to, start, a, c] * (start == own)
-            elif 0 <= row < belief.shape[1] and 0 <= col < belief.shape[2]:
-                out[to, i, j] += kernel[to, start, a, c] * belief[start, row, col]
-    return out / out.sum(axis=0)
-
-
 @st.composite
 def any_model(draw: st.DrawFn) -> Model:
     """Random weights, a third of them zero, random biases, any S, O and kernel, or one by state."""
@@ -184,7 +159,7 @@ def test_phi_is_its_formula_for_any_model(model: Model, height: int, width: int,
     belief = np.moveaxis(rng.dirichlet(np.ones(model.n_states), (height, width)), -1, 0)
     transition = Transition(model, height=height, width=width)
     transition.apply(np.ones_like(belief))  # leaves nothing behind
-    assert_near(transition.apply(belief), formula(model, belief), 1e-12)
+    assert_near(transition.apply(belief), oracle.phi(oracle.parameters(model.toml), belief), 1e-12)
 
 
 def test_phi_by_own_state_is_that_of_the_rust_filter() -> None:
@@ -198,6 +173,7 @@ def test_phi_by_own_state_is_that_of_the_rust_filter() -> None:
 def test_beliefs_stay_on_the_simplex(model: Model, height: int, width: int, key: int) -> None:
     rng = np.random.default_rng(key)
     filter = Filter(model, prior=initial_prior(model, height=height, width=width))
+    parameters = oracle.parameters(model.toml)
     for _ in range(5):
         frame = rng.integers(0, model.n_observations, (height, width)).astype(np.uint8)
         frame[rng.random((height, width)) < 0.5] = UNOBSERVED
@@ -205,7 +181,9 @@ def test_beliefs_stay_on_the_simplex(model: Model, height: int, width: int, key:
         filter.correct(frame)
         after = filter.belief
         assert (after[:, frame == UNOBSERVED] == before[:, frame == UNOBSERVED]).all()
+        assert_near(after, oracle.bayes(parameters, before, frame), 1e-14)
         filter.predict()
+        assert_near(filter.belief, oracle.phi(parameters, after), 1e-12)
         for belief in (after, filter.belief):
             assert (belief >= 0).all()
             assert_near(belief.sum(axis=0), np.ones((height, width)), 1e-12)

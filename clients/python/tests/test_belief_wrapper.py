@@ -1,8 +1,5 @@
 """The wrapper that observes beliefs, on a stub of the environment."""
 
-import json
-import sys
-import types
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +11,6 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from emberwatch import programs
 from emberwatch.belief import Filter, initial_prior, uniform_prior
 from emberwatch.model import Model
 from emberwatch.prior import simulated_prior
@@ -23,18 +19,6 @@ from emberwatch.wrappers import BeliefObservation
 WILDFIRE = Model.wildfire()
 SHAPE = (4, 6)
 GRID = {"height": 4, "width": 6}
-
-AGENT = """#!{python}
-import json, sys
-import numpy as np
-arguments = dict(argument.split("=", 1) for argument in sys.argv[2:])
-text = open(arguments["--model"]).read()
-with open("{log}", "a") as log:
-    print(json.dumps([sys.argv[1], text, arguments["--burn-in"]]), file=log)
-shape = 3, int(arguments["--height"]), int(arguments["--width"])
-{body}
-"""
-WRITES = 'np.save(arguments["--out"], np.full(shape, 1 / 3, np.float32))'
 
 
 class Stub(gymnasium.Env[Any, Any]):
@@ -63,28 +47,6 @@ class Stub(gymnasium.Env[Any, Any]):
 
 
 gymnasium.register("test/Stub-v0", entry_point=f"{__name__}:Stub")
-
-
-@pytest.fixture
-def agent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Puts a script in the agent's place; returns how to write it and a list of its calls."""
-    script, log = tmp_path / "emberwatch-agent", tmp_path / "calls"
-
-    def install(body: str = WRITES) -> None:
-        script.write_text(AGENT.format(python=sys.executable, log=log, body=body))
-        script.chmod(0o755)
-
-    real = programs.find
-
-    def find(name: str) -> Path:
-        return script if name == "emberwatch-agent" else real(name)
-
-    monkeypatch.setattr(programs, "find", find)
-    simulated_prior.cache_clear()
-    install()
-    calls = lambda: [json.loads(line) for line in log.read_text().splitlines()]  # noqa: E731
-    yield types.SimpleNamespace(install=install, calls=calls)
-    simulated_prior.cache_clear()
 
 
 def test_a_reset_observes_the_prior_and_a_step_the_posterior() -> None:
@@ -177,30 +139,11 @@ def test_priors_by_name_and_by_array() -> None:
         BeliefObservation(Stub(), prior=given * 2)
 
 
-def test_a_burn_in_is_simulated_once(agent: Any) -> None:
-    observations = [BeliefObservation(Stub(burn_in=50)).reset()[0] for _ in range(2)]
-    assert all(np.allclose(observation, 1 / 3) for observation in observations)
-    assert agent.calls() == [["prior", WILDFIRE.toml, "50"]]
-    BeliefObservation(Stub(burn_in=51))
-    BeliefObservation(Stub(), prior="simulated")
-    assert [call[2] for call in agent.calls()] == ["50", "51", "0"]
-    with pytest.raises(ValueError, match="read-only"):
-        simulated_prior(WILDFIRE, **GRID, burn_in=51)[:] = 0
-
-
-@pytest.mark.parametrize(
-    ("body", "expected"),
-    [
-        ("sys.exit('no such model')", "ended with code 1: no such model"),
-        ("", "expected an .npy file"),
-        ("open(arguments['--out'], 'w').write('prior')", "expected an .npy file"),
-        (WRITES.replace("shape", "shape[1:]", 1), r"expected shape \(3, 4, 6\), got \(4, 6\)"),
-    ],
-)
-def test_a_failed_simulation_is_told(agent: Any, body: str, expected: str) -> None:
-    agent.install(body)
-    with fails("program", match=expected):
-        BeliefObservation(Stub(burn_in=1))
+def test_a_burn_in_is_simulated() -> None:
+    for stub, prior in ((Stub(burn_in=50), None), (Stub(), "simulated")):
+        observation, _ = BeliefObservation(stub, prior=prior).reset()
+        expected = simulated_prior(WILDFIRE, **GRID, burn_in=stub.burn_in)
+        assert np.allclose(observation, expected, atol=1e-6)
 
 
 def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:

@@ -3,11 +3,10 @@
 import os
 import signal
 import threading
-from pathlib import Path
 
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, eventually, script, server
+from processes import LONG, PATIENCE, asleep, eventually, script, server
 
 from emberwatch import errors
 from emberwatch.client import connect
@@ -145,20 +144,6 @@ print("child", code)
 def test_a_forked_child_is_refused_and_its_parent_goes_on(how: str, code: int) -> None:
     ended, out, err = script(FORK, how).end()
     assert (ended, out) == (0, f"child {code}\n"), err
-
-
-def asleep() -> None:
-    """Waits until the main thread sleeps, as it does on the answer of a stopped server."""
-    place = Path(f"/proc/{US}/task/{threading.main_thread().native_id}/stat")
-    looks = 0
-
-    def is_asleep() -> bool:
-        nonlocal looks
-        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
-        looks = looks + 1 if sleeps else 0
-        return looks > 20
-
-    assert eventually(is_asleep)
 
 
 def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on() -> None:

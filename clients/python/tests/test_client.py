@@ -289,9 +289,9 @@ def test_each_refusal_of_a_step_has_its_exception() -> None:
     refused(lambda: step(step=1), "early", 0)
     sentence = refused(lambda: step(lease=0), "no_lease", 0)
     assert sentence == "no lease on robot 0: acquire it first"
-    moves = np.full(6, 9, np.uint8)
-    call = table.lease.step_moves
-    refused(lambda: call(moves, range(1), timeout=PATIENCE), "bad_move", 8)
+    body = bytes(8) + bytes([9] * 6)
+    place = table.lease.number, 0, 1, 0
+    refused(lambda: table.client.exchange(1, *place, body, timeout=PATIENCE), "bad_move", 8)
     table.lease.step(paths(2))
     refused(lambda: step(), "late", 1)
     table.lease.step(paths(2))

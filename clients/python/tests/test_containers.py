@@ -17,7 +17,7 @@ import pytest
 from failures import fails
 from processes import server
 
-from emberwatch import prior, programs, resources
+from emberwatch import programs, resources
 from emberwatch.model import Model
 from emberwatch.programs import Program, unused_instance
 
@@ -254,8 +254,5 @@ FOLDER = tempfile.TemporaryDirectory
 
 def test_no_temporary_folder_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(programs.tempfile, "TemporaryFile", _no_folder)
-    monkeypatch.setattr(prior.tempfile, "TemporaryDirectory", _no_folder)
     assert server().status().pid > 0
-    model = Model.named("wildfire-small")
-    found = prior.simulated_prior(model, height=4, width=5, burn_in=3)
-    assert found.shape == (model.n_states, 4, 5)
+    assert Model.named("wildfire-small").n_states > 1

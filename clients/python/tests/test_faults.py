@@ -1,29 +1,28 @@
-"""Faults: processes killed and stopped at the worst moment; other versions."""
+"""Faults: processes killed and stopped at the worst moment."""
 
 import os
 import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-from unittest import mock
 
-import iceoryx2 as iox2
 import pytest
-from failures import fails
 from processes import (
+    CHANNELS,
     LONG,
     PATIENCE,
     Script,
     Server,
+    asleep,
     connects,
     eventually,
     is_running,
     script,
     server,
+    services,
 )
 
-from emberwatch import channels, errors, ports, wire
+from emberwatch import errors
 from emberwatch.client import connect
 from emberwatch.env import WildfireEnv
 
@@ -38,6 +37,10 @@ env.reset(seed=1)
 env.step([3] * 6)
 session = env._session
 print(session._client.info.pid, session.instance, flush=True)
+
+def fly():
+    while True:
+        env.step([3] * 6)
 """
 
 #: How it may end by itself, and the exit code.
@@ -49,6 +52,9 @@ ENDS = {
     "os._exit(4)": 4,
     "os.abort()": -signal.SIGABRT,
     "import threading; threading.Thread(target=lambda: time.sleep(0.1)).start()": 0,
+    "env.itself = env": 0,
+    "import atexit; atexit.register(lambda: env.step([3] * 6))": 0,
+    "import threading; threading.Thread(target=fly, daemon=True).start(); time.sleep(0.1)": 0,
 }
 
 ABRUPT = ("os._exit(4)", "os.abort()")
@@ -65,17 +71,16 @@ SIGNALS = {
 def check_kill(started: Server, call: Callable[[], object]) -> None:
     """Kills the server while a call waits for it, which says so."""
     started.stop()
-    sleep = ports.Peer._sleep
 
-    def be_killed_and_sleep(peer: ports.Peer, *arguments: Any) -> Any:
+    def kill() -> None:
+        asleep()
         started.kill()
-        return sleep(peer, *arguments)
 
-    with (
-        mock.patch.object(ports.Peer, "_sleep", be_killed_and_sleep),
-        pytest.raises(errors.ServerGoneError, match=started.instance),
-    ):
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(errors.ServerGoneError, match=started.instance):
         call()
+    killer.join()
 
 
 @pytest.mark.parametrize("what", ["step", "control"])
@@ -146,20 +151,9 @@ class Remains:
     def left(self) -> list[str]:
         """What is left. iceoryx2 keeps one file of 16 bytes for all processes."""
         found = [path for path in self._files if path.exists() and path.stat().st_size > 16]
-        nodes = iox2.Node.list(iox2.ServiceType.Ipc, channels._config())
-        return [*map(str, found), *(str(pid) for pid in map(_pid, nodes) if pid in self._pids)]
-
-
-def _pid(node: Any) -> int:
-    """The process of an entry in the list of nodes, alive or dead."""
-    return node[0].id.pid(iox2.ServiceType.Ipc)
-
-
-def services(instance: str) -> list[str]:
-    """The services of an instance that iceoryx2 still knows."""
-    known = iox2.Service.list(channels._config(), iox2.ServiceType.Ipc)
-    names = [details.name().to_string() for details in known]
-    return [name for name in names if f"/{instance}/" in name]
+        nodes = (path for path in (CHANNELS / "nodes").iterdir() if path.name.isdecimal())
+        pids = (int(path.name) >> 64 & 0xFFFFFFFF for path in nodes)
+        return [*map(str, found), *(str(pid) for pid in pids if pid in self._pids)]
 
 
 def embedded(end: str) -> tuple[Script, int, str]:
@@ -247,54 +241,3 @@ def test_killed_clients_use_up_no_limit() -> None:
         clients.end()
     assert eventually(lambda: started.status().n_clients == 1)
     assert all(eventually(lambda: connects(started)) for _ in range(15))
-
-
-def check_mismatch(raised: pytest.ExceptionInfo[errors.EmberwatchError]) -> None:
-    assert raised.value.detail == 2
-    words = str(raised.value)
-    assert "the client speaks 3, the server 2;" in words
-    assert "use a client and a server of one release" in words
-
-
-def test_a_client_of_another_version_is_told_both_and_what_to_do(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    started = server()
-    monkeypatch.setattr(wire, "VERSION", 3)
-    with fails("version_mismatch") as raised:
-        connect(started.instance)
-    monkeypatch.undo()
-    check_mismatch(raised)
-    assert started.status().n_clients == 1
-
-
-def test_a_server_refuses_the_header_of_another_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    started = server()
-    client = started.connect()
-    name = channels.Node._name
-    monkeypatch.setattr(wire, "VERSION", 3)
-    # By the services of version 2, as nobody should.
-    monkeypatch.setattr(
-        channels.Node,
-        "_name",
-        lambda self, service: iox2.ServiceName.new(f"emberwatch/v2/{self.instance}/{service}"),
-    )
-    with fails("version_mismatch") as raised:
-        connect(started.instance)
-    with fails("version_mismatch") as on_step:
-        client.observe()
-    monkeypatch.undo()
-    assert channels.Node._name is name
-    check_mismatch(raised)
-    assert on_step.value.detail == 2 and "one release" in str(on_step.value)
-    assert client.observe().result().world.step == 0
-
-
-def test_a_server_of_another_version_elsewhere_is_not_meant(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    started = server()
-    monkeypatch.setattr(wire, "VERSION", 3)
-    for instance in (started.instance + "0", started.instance[:-1] + "x", "nobody"):
-        with pytest.raises(errors.NoServerError):
-            connect(instance)

@@ -8,6 +8,7 @@ from typing import Any
 import document
 import numpy as np
 import pytest
+from headers import header
 from numpy.typing import NDArray
 from PIL import Image
 from test_recording import FILE_HEADER, deflated, packed
@@ -46,22 +47,22 @@ def frame(
     late: int = 0,
 ) -> bytes:
     """Robot r flies right and down from column r of the first row; they see `SEEN`."""
-    header = wire.FrameHeader(version=2, world=world, first_robot=world * robots, n_robots=robots)
-    header.height, header.width = HEIGHT, WIDTH
-    result = (step, 7, episode, reward, hovered, late, 0, 3, 0, 0, 0)
-    header.result[:] = wire.WORLD.pack(*result)
+    result = wire.WORLD.pack(step, 7, episode, reward, hovered, late, 0, 3, 0, 0, 0)
+    sizes = {"n_robots": robots, "height": HEIGHT, "width": WIDTH}
+    place = {"world": world, "first_robot": world * robots}
+    head = header("FrameHeader", result=result, **place, **sizes)
     results = paths = b""
     for robot in range(robots):
         flew = not (hovered | late) >> robot & 1
         place = (0, robot, 1, robot + 1) if flew else (0, robot, 0, robot)
         results += wire.ROBOT.pack(reward, reward, 3, 0, *place, 1, 2 * flew)
         paths += b"\3\1" * flew
-    return packed(2, deflated(bytes(header) + results + SEEN.tobytes() * robots + paths))
+    return packed(2, deflated(head + results + SEEN.tobytes() * robots + paths))
 
 
 def truth(step: int) -> bytes:
-    header = wire.TruthHeader(version=2, height=HEIGHT, width=WIDTH, step=step, seed=7)
-    return packed(3, deflated(bytes(header) + TRUTH.tobytes()))
+    head = header("TruthHeader", height=HEIGHT, width=WIDTH, step=step, seed=7)
+    return packed(3, deflated(head + TRUTH.tobytes()))
 
 
 def both(*steps: int) -> list[bytes]:

@@ -28,7 +28,6 @@ from failures import fails
 from processes import at_once, eventually, is_running, server
 
 import emberwatch
-from emberwatch import ports
 from emberwatch.wrappers import BeliefObservation
 
 #: An interrupt within the end of a generator, or a callback of the garbage collector that a test's
@@ -207,7 +206,7 @@ def test_a_close_that_was_interrupted_is_closed_again() -> None:
 def test_an_unfinished_step_asks_for_a_reset_of_all_worlds() -> None:
     envs = begun(make_vec(3, autoreset_mode="Disabled"))
     actions = action(envs, 1)
-    assert interrupted(lambda: envs.step(actions), 60)
+    assert interrupted(lambda: envs.step(actions), 20)
     with pytest.raises(gymnasium.error.ResetNeeded, match="expected all worlds, as an earlier"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
     with fails("interrupted", match=r"did not finish .* reset\(options={'resume': True}\)"):
@@ -228,7 +227,7 @@ def test_a_refused_step_is_not_an_unfinished_one() -> None:
 
 def test_a_lone_robot_is_never_late() -> None:
     env = begun(make())
-    env.unwrapped._session._lease._steps[:] = 0  # as if a step had gone unseen
+    env.unwrapped._session._lease._native.note(0, 0)  # as if a step had gone unseen
     with fails("late"):
         env.step([0, 0, 0, 0])
     with fails("interrupted"):
@@ -239,23 +238,21 @@ def test_a_lone_robot_is_never_late() -> None:
 
 @pytest.mark.parametrize("seed", [5, None])
 @pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
-def test_a_reset_waits_for_the_one_that_was_interrupted(
-    monkeypatch: pytest.MonkeyPatch, name: str, seed: int | None
-) -> None:
+def test_a_reset_waits_for_the_one_that_was_interrupted(name: str, seed: int | None) -> None:
     started = server(burn_in=3_000_000)  # takes longer than the timeout below
     env = make(name, instance=started.instance)
     env.reset(seed=1)
     env.step(first := np.zeros(env.action_space.shape, int))
-    wait = ports.Peer.wait
 
-    def interrupt(*_: object) -> None:
-        monkeypatch.setattr(ports.Peer, "wait", wait)
+    def interrupt() -> None:
         assert eventually(lambda: started.status().worlds[0].resetting)
-        raise KeyboardInterrupt
+        os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(ports.Peer, "wait", interrupt)
+    thread = threading.Thread(target=interrupt)
     with pytest.raises(KeyboardInterrupt):
+        thread.start()
         env.reset(seed=7)
+    thread.join()
     with impatient(env, 0.5):
         env.reset(seed=seed, options={"resume": True} if seed is None else None)
     assert started.status().worlds[0].seed == (seed or 7)

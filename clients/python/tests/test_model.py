@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import oracle
 import pytest
 from failures import refuses
 from hypothesis import given
@@ -80,6 +81,14 @@ def test_wildfire_has_the_published_parameters() -> None:
     assert model.target_state == 2
     assert model.state_names == model.observation_names == ("normal", "latent", "fire")
     assert model.state_colors[2] == model.observation_colors[2] == (0xC8, 0x37, 0x1B)
+
+
+@pytest.mark.parametrize("file", sorted(CONFIG.iterdir()), ids=lambda file: file.stem)
+def test_files_are_read_as_the_oracle_reads_them(file: Path) -> None:
+    model, expected = Model.from_toml(file.read_text()), oracle.parameters(file.read_text())
+    got = model.kernels, model.bias, model.observation_matrix, model.initial
+    for one, other in zip(got, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-15)
 
 
 def test_road_ice_keeps_names_and_shapes() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ from gymnasium.utils.env_checker import check_env
 from processes import eventually, server, stopped
 
 import emberwatch
-from emberwatch import errors, programs
-from emberwatch.programs import Program
+from emberwatch import errors
+from emberwatch.programs import Program, find
 from emberwatch.wrappers import BeliefObservation
 
 
@@ -92,8 +93,9 @@ def trained(folder: Path, **world: object) -> Path:
     settings.write_text("[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n")
     flags = {"worlds": 2, "steps": 40, "config": settings, "out": folder / "out", "moves": 4}
     flags |= world
-    command = ["train", *(f"--{name.replace('_', '-')}={flag}" for name, flag in flags.items())]
-    programs.run("emberwatch-agent", command, timeout=120)
+    command = [find("emberwatch-agent"), "train"]
+    command += [f"--{name.replace('_', '-')}={flag}" for name, flag in flags.items()]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
     return folder / "out" / "checkpoint.safetensors"
 
 
@@ -310,7 +312,7 @@ def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
 
 def test_another_world_has_no_agent(env: Any) -> None:
     env.reset(seed=1000)
-    with pytest.raises(errors.NoServerError, match="no agent serves decisions for world 7"):
+    with pytest.raises(errors.NoServerError, match="no agent serves decisions of world 7"):
         emberwatch.Decisions(env.instance, 7)
 
 

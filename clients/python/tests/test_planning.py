@@ -1,4 +1,4 @@
-"""Beam search in NumPy."""
+"""Beam search: the best paths, and the refusal of what makes no sense."""
 
 from itertools import product
 from typing import Any
@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.moves import DIRECTIONS
 from emberwatch.planning import beam_search
-from emberwatch.view import DIRECTIONS
 
 RNG = np.random.default_rng(3)
 
@@ -39,6 +39,17 @@ def test_visited_cells_are_worth_nothing() -> None:
     assert paths.tolist() == [[0]]
 
 
+def test_the_generator_breaks_ties() -> None:
+    values, robots = np.ones((40, 9, 9)), np.full((40, 2), 4)
+    first, again, other = (
+        beam_search(values, robots, 3, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    # Up, down, left and right are alike.
+    counts = np.bincount(np.concatenate((first, other))[:, 0], minlength=4)
+    assert counts.min() >= 5, counts
+
+
 def test_small_integers_are_cells_too() -> None:
     values = np.zeros((1, 64, 64))
     values[0, 40, 41] = 1.0
@@ -48,8 +59,8 @@ def test_small_integers_are_cells_too() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"n_moves": 0}, "n_moves: expected an integer from 1 on, got 0"),
-        ({"width": 2.5}, "width: expected an integer from 1 on, got 2.5"),
+        ({"n_moves": 0}, "n_moves: expected an integer within 1 to 4096, got 0"),
+        ({"width": 2.5}, "width: expected an integer within 1 to 65536, got 2.5"),
         ({"values": np.zeros((2, 2))}, r"values: expected .*, got shape \(2, 2\)"),
         ({"values": np.full((1, 2, 2), np.nan)}, "values: expected finite numbers"),
         ({"robots": np.zeros((1, 2))}, "robots: expected integers .*, got float64"),

@@ -176,60 +176,55 @@ impl TryFrom<&Sample<AgentHeader>> for AgentBelief {
     type Error = BeliefError;
 
     fn try_from(sample: &Sample<AgentHeader>) -> Result<Self, BeliefError> {
+        let garbled = |problem: String| BeliefError { problem };
         let header = sample.header;
-        let dim = header.dim()?;
-        let n_numbers = dim.0 * dim.1 * dim.2;
-        let parts = sample
+        if header.version != VERSION {
+            let got = header.version;
+            return Err(garbled(format!("version: expected {VERSION}, got {got}")));
+        }
+        let shape = Shape::new(header.height as usize, header.width as usize)
+            .map_err(|error| garbled(error.to_string()))?;
+        if !(1..=MAX_STATES).contains(&header.n_states) {
+            let got = header.n_states;
+            return Err(garbled(format!(
+                "states: expected 1 to {MAX_STATES}, got {got}"
+            )));
+        }
+        let n_numbers = header.n_states as usize * shape.n_cells();
+        let (numbers, text) = sample
             .payload
-            .split_at_checked(n_numbers * size_of::<f32>());
-        let (numbers, text) = parts.ok_or_else(|| {
-            let got = sample.payload.len();
-            garbled(format!(
-                "belief: expected {n_numbers} numbers, got {got} bytes"
-            ))
-        })?;
+            .split_at_checked(n_numbers * size_of::<f32>())
+            .ok_or_else(|| {
+                let got = sample.payload.len();
+                garbled(format!(
+                    "belief: expected {n_numbers} numbers, got {got} bytes"
+                ))
+            })?;
         if text.len() > MAX_INTENT_BYTES {
             let got = text.len();
             return Err(garbled(format!(
                 "intent: expected at most {MAX_INTENT_BYTES} bytes, got {got}"
             )));
         }
-        let numbers = numbers.chunks_exact(size_of::<f32>());
-        let numbers: Vec<f32> = numbers.map(bytemuck::pod_read_unaligned).collect();
+        let numbers: Vec<f32> = numbers
+            .chunks_exact(size_of::<f32>())
+            .map(bytemuck::pod_read_unaligned)
+            .collect();
         if let Some(got) = numbers.iter().find(|p| !(0.0..=1.0).contains(*p)) {
             return Err(garbled(format!(
                 "belief: expected probabilities, got {got}"
             )));
         }
-        let belief = Probabilities::from_shape_vec(dim, numbers);
-        let intent = serde_json::from_slice(text);
+        let (height, width) = shape.dim();
         Ok(Self {
             header,
-            belief: belief.expect("invariant: counted above"),
-            intent: intent.map_err(|error| garbled(format!("intent: {error}")))?,
+            belief: Probabilities::from_shape_vec(
+                (header.n_states as usize, height, width),
+                numbers,
+            )
+            .expect("invariant: counted above"),
+            intent: serde_json::from_slice(text)
+                .map_err(|error| garbled(format!("intent: {error}")))?,
         })
     }
-}
-
-impl AgentHeader {
-    /// Number of states, rows and columns, checked.
-    fn dim(&self) -> Result<(usize, usize, usize), BeliefError> {
-        if self.version != VERSION {
-            let got = self.version;
-            return Err(garbled(format!("version: expected {VERSION}, got {got}")));
-        }
-        let shape = Shape::new(self.height as usize, self.width as usize);
-        let (height, width) = shape.map_err(|error| garbled(error.to_string()))?.dim();
-        if !(1..=MAX_STATES).contains(&self.n_states) {
-            let got = self.n_states;
-            return Err(garbled(format!(
-                "states: expected 1 to {MAX_STATES}, got {got}"
-            )));
-        }
-        Ok((self.n_states as usize, height, width))
-    }
-}
-
-fn garbled(problem: String) -> BeliefError {
-    BeliefError { problem }
 }

@@ -6,6 +6,7 @@
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::error::Ipc;
+use super::message::VERSION;
 use super::own_nodes;
 use super::process::{if_there, node_pid, process_state};
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
@@ -225,6 +226,21 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Error> {
         Some(entries) => entries.map(|entry| Ok(entry?.path())).collect(),
         None => Ok(Vec::new()),
     }
+}
+
+/// The version of the protocol in which a channel of an instance exists, if in another than ours. Of the files themselves:
+/// iceoryx2 would open each service, and may wait for one without end.
+pub(super) fn other_version(instance: &str, channel: &str) -> Option<u32> {
+    let end = format!("/{instance}/{channel}\"");
+    let version = |text: &str| {
+        let (_, name) = text.split_once("service_name = \"emberwatch/v")?;
+        let (name, _) = name.split_once('\n')?;
+        name.strip_suffix(&end)?.parse().ok()
+    };
+    let files = entries(&channel_directory().join("services")).unwrap_or_default();
+    let texts = files.iter().filter_map(|path| std::fs::read(path).ok());
+    let versions = texts.filter_map(|text| version(&String::from_utf8_lossy(&text)));
+    versions.filter(|&version| version != VERSION).max()
 }
 
 fn name(path: &Path) -> String {

@@ -3,6 +3,7 @@
 //! All channels of an instance live under `emberwatch/v2/<instance>/`, in a directory and under a
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
 
+use super::channel_files::other_version;
 use super::message::{
     AgentHeader, ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest,
     TruthHeader,
@@ -139,6 +140,14 @@ impl Instance {
     pub(crate) fn elsewhere(&self) -> ChannelError {
         ChannelError::OtherPidNamespace {
             instance: self.0.clone(),
+        }
+    }
+
+    /// The error for a channel that does not exist in this version of the protocol.
+    fn none_of(&self, channel: Channel) -> ChannelError {
+        match other_version(&self.0, &channel.name()) {
+            Some(version) => ChannelError::OtherVersion { version },
+            None => self.no_server_of(channel),
         }
     }
 
@@ -338,7 +347,7 @@ impl Services<'_> {
             .builder::<Q, R>(channel)
             .open()
             .map_err(|error| match error {
-                RequestResponseOpenError::DoesNotExist => self.instance.no_server_of(channel),
+                RequestResponseOpenError::DoesNotExist => self.instance.none_of(channel),
                 other => ipc_error("open a request channel")(other),
             })?;
         if service.dynamic_config().number_of_servers() > 0 {

@@ -9,7 +9,8 @@ use super::channel_files::{
 };
 use super::directory::{SHARED_MEMORY, channel_directory, directory_error, node_config};
 use super::error::ChannelError;
-use super::turn::{SHORT_WAIT, Turn};
+use super::interrupt::check_interrupt;
+use super::turn::Turn;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::Config;
 use std::collections::HashSet;
@@ -28,7 +29,7 @@ const INTERVAL: Duration = Duration::from_millis(10);
 /// # Errors
 /// If others hold the turn for too long, or something cannot be read: its process may live, so the rest stays.
 pub fn remove_leftovers() -> Result<usize, ChannelError> {
-    let turn = Turn::take_within(SHORT_WAIT)?;
+    let turn = Turn::take_to_end()?;
     if !turn.is_alone() {
         return Ok(0);
     }
@@ -61,6 +62,7 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
             return Err(directory_error(&segment, problem.into()));
         }
         std::thread::sleep(INTERVAL);
+        check_interrupt()?;
     }
 }
 

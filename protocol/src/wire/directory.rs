@@ -185,6 +185,11 @@ mod tests {
         assert_eq!(path.metadata().expect("there").mode() & 0o777, 0o700);
         std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
         assert!(own_directory(&path).is_err());
-        std::fs::remove_dir(&path).expect("clean up");
+        let link = path.join("link");
+        std::os::unix::fs::symlink(&path, &link).expect("a link");
+        assert!(own_directory(&link).is_err(), "a link to somewhere");
+        std::fs::write(path.join("file"), "").expect("a file");
+        assert!(own_directory(&path.join("file")).is_err(), "a file");
+        std::fs::remove_dir_all(&path).expect("clean up");
     }
 }

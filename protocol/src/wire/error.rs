@@ -1,11 +1,12 @@
 //! Why a channel could not be opened or used.
 
-use iceoryx2::prelude::ipc;
+use super::message::VERSION;
+use iceoryx2::service::ipc_threadsafe;
 use std::time::Duration;
 use thiserror::Error;
 
-/// iceoryx2's inter-process flavour.
-pub type Ipc = ipc::Service;
+/// iceoryx2's inter-process flavour whose ports may move between threads.
+pub type Ipc = ipc_threadsafe::Service;
 
 /// Why a channel could not be opened or used.
 #[derive(Debug, Error)]
@@ -41,6 +42,15 @@ pub enum ChannelError {
     NoServer {
         /// Name of the instance.
         instance: String,
+    },
+    /// A server runs on the instance, but it speaks another version of the protocol.
+    #[error(
+        "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of one \
+         release"
+    )]
+    OtherVersion {
+        /// What the server speaks.
+        version: u32,
     },
     /// No agent takes decisions for the world.
     #[error(
@@ -90,6 +100,9 @@ pub enum ChannelError {
         /// How many the process may have.
         limit: String,
     },
+    /// The check of [`super::interrupt::interrupt_when`] ended a wait.
+    #[error("interrupted")]
+    Interrupted,
     /// iceoryx2 refused.
     #[error("{what}: iceoryx2 says {problem}")]
     Ipc {

@@ -4,19 +4,23 @@
 
 use super::channels::{ChannelError, Instance, Ipc, ipc_error};
 use super::cleanup::remove_leftovers;
+use super::interrupt::check_interrupt;
 use super::message::{Header, Status, VERSION};
 use super::process::WatchedProcess;
 use super::wait::{Waiter, descriptor, drain, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
-use iceoryx2::port::client::Client;
+use iceoryx2::port::client::{Client, RequestSendError};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use thiserror::Error;
 
 /// Longest sleep between two looks at the answer: bounds what a lost wake-up can cost.
 const LONGEST_SLEEP: Duration = Duration::from_millis(50);
+
+/// How long the answering side may take to release a request that was given up.
+const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Why a request got no good answer.
 #[derive(Debug, Error)]
@@ -25,9 +29,11 @@ pub enum ConnectionError {
     /// The channel could not be used.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The server ended while, or before, it was asked.
-    #[error("the server on instance {instance:?} is gone")]
+    /// The server, or the agent asked for decisions, ended while, or before, it was asked.
+    #[error("the {who} on instance {instance:?} is gone")]
     ServerGone {
+        /// "server" or "agent".
+        who: &'static str,
         /// Name of the instance.
         instance: String,
     },
@@ -63,6 +69,7 @@ pub enum ConnectionError {
 
 /// What a request and its answer need: both ends of waking, and the server's process.
 pub(super) struct Exchange {
+    pub(super) who: &'static str,
     pub(super) instance: Instance,
     pub(super) server: Notifier<Ipc>,
     pub(super) listener: Listener<Ipc>,
@@ -87,14 +94,11 @@ impl Exchange {
         timeout: Duration,
         read: impl Fn(&R, &[u8]) -> T,
     ) -> Result<T, ConnectionError> {
-        let mut request = client
-            .loan_slice_uninit(payload.len())
-            .map_err(ipc_error("send a request"))?;
-        *request.user_header_mut() = header;
-        let pending = request
-            .write_from_slice(payload)
-            .send()
-            .map_err(ipc_error("send a request"))?;
+        if self.server_process.has_ended() {
+            // A new server on the instance would take the request, but knows nothing of it.
+            return Err(self.server_gone());
+        }
+        let pending = send(client, header, payload)?;
         if pending.number_of_server_connections() == 0 {
             return Err(self.server_gone());
         }
@@ -109,7 +113,7 @@ impl Exchange {
 
     fn answer<Q: Header, R: Header, T>(
         &self,
-        pending: &PendingResponse<Ipc, [u8], Q, [u8], R>,
+        pending: &Pending<Q, R>,
         timeout: Duration,
         read: impl Fn(&R, &[u8]) -> T,
     ) -> Result<Option<T>, ConnectionError> {
@@ -120,26 +124,56 @@ impl Exchange {
             None => Ok(None),
         };
         self.waiter.wait(timeout, poll, |remaining| {
-            has_ended.set(self.sleep(remaining.min(LONGEST_SLEEP))? || !pending.is_connected());
+            let [is_woken, is_over] = self.sleep(remaining.min(LONGEST_SLEEP))?;
+            has_ended.set(is_over || !pending.is_connected());
+            if !is_woken {
+                check_interrupt()?;
+            }
             Ok(())
         })
     }
 
-    /// Sleeps until woken; returns whether the server has ended.
-    fn sleep(&self, timeout: Duration) -> Result<bool, ChannelError> {
+    /// Sleeps until woken; returns whether it was woken, and whether the server has ended.
+    fn sleep(&self, timeout: Duration) -> Result<[bool; 2], ChannelError> {
         let descriptors = [descriptor(&self.listener), self.server_process.descriptor()];
         let readable = sleep_until_readable(&descriptors, timeout)
             .map_err(ipc_error("wait for the server"))?;
         // Wake-ups that are left would end the next sleep at once.
         drain(&self.listener)?;
-        Ok(readable[1])
+        Ok([readable[0], readable[1]])
     }
 
     /// The error of a server that has ended; removes the files it left.
     pub(super) fn server_gone(&self) -> ConnectionError {
         let _ = remove_leftovers(); // Else the next program removes them.
         ConnectionError::ServerGone {
+            who: self.who,
             instance: self.instance.name().into(),
+        }
+    }
+}
+
+/// A request that waits for its answer.
+type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+
+/// Sends a request, once the one before is released.
+fn send<Q: Header, R: Header>(
+    client: &Client<Ipc, [u8], Q, [u8], R>,
+    header: Q,
+    payload: &[u8],
+) -> Result<Pending<Q, R>, ChannelError> {
+    let start = Instant::now();
+    loop {
+        let request = client.loan_slice_uninit(payload.len());
+        let mut request = request.map_err(ipc_error("send a request"))?;
+        *request.user_header_mut() = header;
+        match request.write_from_slice(payload).send() {
+            Err(RequestSendError::ExceedsMaxActiveRequests)
+                if start.elapsed() < RELEASE_TIMEOUT =>
+            {
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            sent => return sent.map_err(ipc_error("send a request")),
         }
     }
 }

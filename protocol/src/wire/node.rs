@@ -5,7 +5,7 @@ use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, pre
 use super::error::{ChannelError, Ipc};
 use super::own_nodes;
 use super::resources::{check_room_for_ports, ipc_error};
-use super::turn::{SHORT_WAIT, Turn};
+use super::turn::Turn;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::SignalHandlingMode;
 use std::fs::Permissions;
@@ -74,7 +74,7 @@ impl<T> DerefMut for Opened<T> {
 
 impl<T> Drop for Opened<T> {
     fn drop(&mut self) {
-        let _turn = Turn::take_within(SHORT_WAIT);
+        let _turn = Turn::take_to_end();
         let ports = self.ports.take();
         if self.entries.check().is_err() {
             // Other programs may have made files of the same names by now.

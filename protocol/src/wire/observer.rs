@@ -4,6 +4,7 @@ use super::channels::{
     AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Services,
     TRUTH_BUFFER, create_node, ipc_error, limited_error,
 };
+use super::interrupt::check_interrupt;
 use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use super::node::Opened;
 use super::shared_memory::fill_ports;
@@ -150,6 +151,7 @@ impl<H: Header> Observer<H> {
                 return Ok(sample);
             }
             std::thread::sleep(remaining.min(self.polling.interval(Instant::now())));
+            check_interrupt()?;
         }
     }
 

@@ -1,7 +1,9 @@
 //! The variable parts of steps and frames: from bytes to results, frames and paths, and back.
 
 use super::channels::MAX_ROBOTS;
+use super::control::ServerInfo;
 use super::message::{FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult};
+use crate::model::frame::UNOBSERVED;
 use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
 use bytemuck::AnyBitPattern;
@@ -35,6 +37,35 @@ pub struct RobotSample<'a> {
     pub frame: &'a [u8],
     /// The path that it flew, one byte a move; empty if it did not fly.
     pub path: &'a [u8],
+}
+
+impl StepParts<'_> {
+    /// Checks the values: no robot stayed that a world does not have, paths are whole, and frames hold observations.
+    pub(crate) fn check(&self, info: &ServerInfo) -> Result<(), String> {
+        let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
+        let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
+        let stayed = stayed.max().unwrap_or_default();
+        if stayed > u64::MAX >> (MAX_ROBOTS - n_robots) {
+            return Err(format!(
+                "robots that stayed: expected bits below {n_robots}, got {stayed:#x}"
+            ));
+        }
+        let mut paths = self.robots.iter().map(|robot| robot.n_moves as usize);
+        if let Some(got) = paths.find(|&n_moves| n_moves != 0 && n_moves != info.n_moves) {
+            let expected = info.n_moves;
+            return Err(format!("n_moves: expected 0 or {expected}, got {got}"));
+        }
+        // 255 becomes 0, observation o becomes o + 1: one maximum, of many values at once, checks all.
+        let values = self.frames.iter().map(|value| value.wrapping_add(1));
+        let highest = values.fold(0, u8::max);
+        if usize::from(highest) > info.n_observations {
+            let (n, got) = (info.n_observations, highest - 1);
+            return Err(format!(
+                "frame: expected observations below {n} or {UNOBSERVED}, got {got}"
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// Splits the payload of a step answer.
@@ -165,6 +196,42 @@ mod tests {
             ..reply
         };
         assert!(split_step_payload(&huge, &[]).is_err());
+    }
+
+    #[test]
+    fn values_that_cannot_be_are_refused() {
+        let info = serde_json::from_str(
+            r#"{"protocol": 2, "build": "", "pid": 1, "height": 1, "width": 3, "n_moves": 4, "n_worlds": 1, "n_robots": 2,
+            "n_observations": 3, "observations": [], "model": null, "burn_in": 0, "max_steps": 0, "max_clients": 16,
+            "coverage": "path", "publish_truth": false, "lease_millis": 1, "deadline_millis": 0, "recorded_world": null,
+            "task": null}"#,
+        )
+        .expect("what a server says of itself");
+        let problem = |stayed: u64, n_moves: u32, value: u8| {
+            let world = WorldResult {
+                hovered: stayed,
+                ..WorldResult::default()
+            };
+            let robot = RobotResult {
+                n_moves,
+                ..RobotResult::default()
+            };
+            let parts = StepParts {
+                worlds: vec![world],
+                robots: vec![RobotResult::default(), robot],
+                frames: &[255, 0, value],
+            };
+            parts.check(&info).err().unwrap_or_default()
+        };
+        for good in [problem(0, 4, 2), problem(3, 0, 255)] {
+            assert_eq!(good, "");
+        }
+        assert!(problem(4, 0, 0).contains("expected bits below 2, got 0x4"));
+        assert!(problem(0, 3, 0).contains("n_moves: expected 0 or 4, got 3"));
+        for value in [3, 254] {
+            let words = format!("expected observations below 3 or 255, got {value}");
+            assert!(problem(0, 0, value).contains(&words), "{words}");
+        }
     }
 
     #[test]

@@ -5,19 +5,21 @@
 
 use super::directory::{not_usable, own_channel_directory};
 use super::error::ChannelError;
+use super::interrupt::check_interrupt;
 use super::process::process_state;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
 use rustix::io::Errno;
 use std::cell::Cell;
 use std::os::fd::OwnedFd;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// How long to wait for others, each of which takes milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
 
 /// The same for what can also be done without a turn, or by the next program: closing and cleaning up.
-pub(crate) const SHORT_WAIT: Duration = Duration::from_secs(1);
+const SHORT_WAIT: Duration = Duration::from_secs(1);
 
 /// How long to wait before asking which process has the turn, and whether it is stopped.
 const STOPPED_WAIT: Duration = Duration::from_millis(50);
@@ -40,6 +42,10 @@ enum Held {
     Unlocked,
 }
 
+/// Whether a thread of this process has its turn, or forks: the child of a fork within a turn would inherit locks that
+/// nobody unlocks there. Of an atom and sleep, which survive a fork themselves.
+static BUSY: AtomicBool = AtomicBool::new(false);
+
 thread_local! {
     static HELD: Cell<Held> = const { Cell::new(Held::No) };
 }
@@ -48,7 +54,23 @@ thread_local! {
 #[derive(Debug)]
 pub struct Turn {
     is_outermost: bool,
-    _lock: Option<OwnedFd>,
+    lock: Option<OwnedFd>,
+}
+
+/// Waits for the turns of other threads, and keeps them waiting; call it before a fork.
+pub fn before_fork() {
+    if HELD.get() == Held::No {
+        while BUSY.swap(true, Ordering::Acquire) {
+            std::thread::sleep(INTERVAL);
+        }
+    }
+}
+
+/// Lets them go on; call it after the fork, in the parent and in the child.
+pub fn after_fork() {
+    if HELD.get() == Held::No {
+        BUSY.store(false, Ordering::Release);
+    }
 }
 
 impl Turn {
@@ -62,26 +84,34 @@ impl Turn {
 
     /// As [`Self::take`], but waits no longer than a limit.
     pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
+        Self::take_unless(limit, check_interrupt)
+    }
+
+    /// As [`Self::take`], but for a short time and uninterrupted: to close what is open, and to clean up.
+    pub(crate) fn take_to_end() -> Result<Self, ChannelError> {
+        Self::take_unless(SHORT_WAIT, || Ok(()))
+    }
+
+    fn take_unless(
+        limit: Duration,
+        check: fn() -> Result<(), ChannelError>,
+    ) -> Result<Self, ChannelError> {
         let is_outermost = HELD.get() == Held::No;
         let lock = if is_outermost {
-            wait(
-                &own_channel_directory()?.join(LOCK),
-                limit.min(LONGEST_WAIT),
-            )?
+            let path = own_channel_directory()?.join(LOCK);
+            wait(&path, limit.min(LONGEST_WAIT), check)?
         } else {
             None
         };
         if is_outermost {
+            before_fork();
             HELD.set(if lock.is_some() {
                 Held::Alone
             } else {
                 Held::Unlocked
             });
         }
-        Ok(Self {
-            is_outermost,
-            _lock: lock,
-        })
+        Ok(Self { is_outermost, lock })
     }
 
     /// Whether no other process has it.
@@ -92,14 +122,23 @@ impl Turn {
 
 impl Drop for Turn {
     fn drop(&mut self) {
+        if let Some(lock) = &self.lock {
+            // Not by closing alone: a child of a fork may have a copy.
+            let _ = flock(lock, FlockOperation::Unlock);
+        }
         if self.is_outermost {
             HELD.set(Held::No);
+            after_fork();
         }
     }
 }
 
 /// The lock; `None` if a stopped or frozen process has it.
-fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
+fn wait(
+    path: &Path,
+    limit: Duration,
+    check: fn() -> Result<(), ChannelError>,
+) -> Result<Option<OwnedFd>, ChannelError> {
     let start = Instant::now();
     let mut held_since = (None, start);
     let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
@@ -133,6 +172,7 @@ fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
             });
         }
         std::thread::sleep(INTERVAL);
+        check()?;
     }
 }
 
@@ -170,8 +210,8 @@ mod tests {
     #[test]
     fn a_turn_is_waited_for_and_its_holder_named() {
         let path = std::env::temp_dir().join(format!("emberwatch-turn-{}", std::process::id()));
-        let first = wait(&path, Duration::ZERO).expect("nobody has it");
-        let refusal = wait(&path, Duration::from_millis(1)).expect_err("it is taken");
+        let first = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
+        let refusal = wait(&path, Duration::from_millis(1), || Ok(())).expect_err("it is taken");
         let pid = format!("held by pid {}", std::process::id());
         assert!(refusal.to_string().contains(&pid), "{refusal}");
         assert!(
@@ -179,10 +219,52 @@ mod tests {
             "agents wait on"
         );
         std::fs::remove_file(&path).expect("remove it");
-        let second = wait(&path, Duration::ZERO).expect("another file of that name");
+        let second = wait(&path, Duration::ZERO, || Ok(())).expect("another file of that name");
         assert!(first.is_some() && second.is_some());
         drop(second);
-        assert!(wait(&path, Duration::ZERO).expect("free again").is_some());
+        assert!(
+            wait(&path, Duration::ZERO, || Ok(()))
+                .expect("free again")
+                .is_some()
+        );
         std::fs::remove_file(&path).expect("clean up");
+    }
+
+    #[test]
+    fn a_turn_ends_though_a_copy_of_its_file_stays_open() {
+        let turn = Turn::take().expect("a turn");
+        let copy = turn.lock.as_ref().map(|lock| lock.try_clone());
+        let copy = copy.expect("it is alone").expect("a copy, as a child has");
+        drop(turn);
+        let path = own_channel_directory().expect("it is there").join(LOCK);
+        let next = wait(&path, Duration::from_secs(5), || Ok(())).expect("it is free");
+        assert!(next.is_some());
+        drop(copy);
+    }
+
+    #[test]
+    fn a_wait_for_a_turn_is_interrupted() {
+        let path = std::env::temp_dir().join(format!("emberwatch-wait-{}", std::process::id()));
+        let held = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
+        let refusal = wait(&path, LONGEST_WAIT, || Err(ChannelError::Interrupted));
+        assert!(matches!(refusal, Err(ChannelError::Interrupted)));
+        drop(held);
+        std::fs::remove_file(&path).expect("clean up");
+    }
+
+    #[test]
+    fn a_fork_waits_for_the_turns_of_other_threads_and_they_for_it() {
+        before_fork();
+        let (sender, receiver) = std::sync::mpsc::channel();
+        std::thread::scope(|scope| {
+            scope.spawn(move || {
+                let _turn = Turn::take().expect("a turn");
+                sender.send(()).expect("the test waits");
+            });
+            let waited = receiver.recv_timeout(Duration::from_millis(50));
+            after_fork();
+            assert!(waited.is_err(), "it has a turn during the fork");
+            receiver.recv().expect("its turn comes after the fork");
+        });
     }
 }

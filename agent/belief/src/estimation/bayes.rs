@@ -3,7 +3,7 @@
 use crate::estimation::belief::Belief;
 use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::{Cell, Frame};
-use ndarray::Array2;
+use ndarray::{Array2, NdFloat};
 use thiserror::Error;
 
 /// A frame that the belief holds impossible.
@@ -16,6 +16,15 @@ pub struct ZeroEvidence {
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<f32>,
+}
+
+/// The same of a cell by its index, among cells of any number type.
+#[derive(Debug, PartialEq)]
+pub struct Impossible<T> {
+    pub index: usize,
+    pub observed: u8,
+    /// The belief about the cell, one probability per state.
+    pub belief: Vec<T>,
 }
 
 /// The distribution of what each cell shows, `[O, H, W]`, under a belief: `B' u`. `likelihood` is `P(y | x)`, `[S, O]`.
@@ -50,29 +59,50 @@ pub fn correct(
     let shape = belief.shape();
     let dim = frame.values().dim();
     assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
-    let (n_states, n_cells) = (belief.n_states(), shape.n_cells());
+    let corrected = correct_cells(belief.as_mut_slice(), likelihood, || frame.observed());
+    corrected.map_err(|impossible| ZeroEvidence {
+        cell: shape.cell(impossible.index),
+        observed: impossible.observed,
+        belief: impossible.belief,
+    })
+}
+
+/// [`correct`] for cells of any grids: `probabilities` state by state, and of the observed cells index and value.
+///
+/// # Errors
+/// The first cell where `b(y)' u` is 0 or no number; the probabilities are then as they were.
+///
+/// # Panics
+/// If a cell or a value is out of range.
+pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
+    probabilities: &mut [T],
+    likelihood: &Array2<f64>,
+    observed: impl Fn() -> I,
+) -> Result<(), Impossible<T>> {
+    let n_states = likelihood.nrows();
+    let n_cells = probabilities.len() / n_states;
     // Kept apart until the whole frame is known to be possible.
-    let mut posteriors: Vec<f32> = Vec::new();
-    for (index, observed) in frame.observed() {
-        let prior = belief.as_slice()[index..].iter().step_by(n_cells);
+    let mut posteriors: Vec<T> = Vec::new();
+    for (index, observed) in observed() {
+        let prior = probabilities[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
         // In f64, where the product of two f32 cannot underflow to zero.
         let joint = || {
             let pairs = prior.clone().zip(&likelihood);
-            pairs.map(|(&u, b)| f64::from(u) * b)
+            pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)
         };
         let evidence: f64 = joint().sum();
-        if evidence <= 0.0 {
-            return Err(ZeroEvidence {
-                cell: shape.cell(index),
+        if evidence <= 0.0 || !evidence.is_finite() {
+            return Err(Impossible {
+                index,
                 observed,
                 belief: prior.copied().collect(),
             });
         }
-        posteriors.extend(joint().map(|p| (p / evidence) as f32));
+        let posterior = joint().map(|p| T::from(p / evidence).unwrap_or_else(T::nan));
+        posteriors.extend(posterior);
     }
-    let probabilities = belief.as_mut_slice();
-    for ((index, _), posterior) in frame.observed().zip(posteriors.chunks_exact(n_states)) {
+    for ((index, _), posterior) in observed().zip(posteriors.chunks_exact(n_states)) {
         let cell = probabilities[index..].iter_mut().step_by(n_cells);
         cell.zip(posterior).for_each(|(to, &p)| *to = p);
     }

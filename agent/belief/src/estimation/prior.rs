@@ -2,11 +2,13 @@
 
 use crate::estimation::belief::Belief;
 use emberwatch_protocol::dynamics::Dynamics;
-use emberwatch_protocol::grid::{Probabilities, Shape};
+use emberwatch_protocol::grid::{Grid, Probabilities, Shape};
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::randomness::{Purpose, stream};
+use ndarray::{Array3, Axis};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How much the average over the grid weighs in a cell's prior, in worlds: a choice that hardly
 /// matters, as the first frames soon outweigh it.
@@ -33,51 +35,84 @@ impl Prior {
 
     /// The belief before the first frame; `seed` only matters to [`Prior::Simulated`].
     pub fn belief(self, model: &Model, shape: Shape, seed: u64) -> Result<Belief, ModelError> {
+        let belief = self.belief_unless(&AtomicBool::new(false), model, shape, seed)?;
+        Ok(belief.expect("invariant: nothing cancels it"))
+    }
+
+    /// The same, or `None` soon after it is cancelled: a simulation may take minutes.
+    pub fn belief_unless(
+        self,
+        cancelled: &AtomicBool,
+        model: &Model,
+        shape: Shape,
+        seed: u64,
+    ) -> Result<Option<Belief>, ModelError> {
         match self {
             Self::Simulated { n_worlds, burn_in } => {
-                let worlds = simulate(model, shape, seed, n_worlds, burn_in)?;
-                Ok(average(&worlds, model.n_states(), shape))
+                let simulation = Simulation {
+                    dynamics: Dynamics::new(model, shape)?,
+                    dim: (model.n_states(), shape.height(), shape.width()),
+                    seed,
+                    burn_in,
+                    cancelled,
+                };
+                let counts = simulation.counts(n_worlds);
+                let is_whole = !cancelled.load(Ordering::Relaxed);
+                Ok(is_whole.then(|| average(&counts, model.n_states(), shape)))
             }
-            Self::Initial => Ok(Belief::from_initial(model, shape)),
-            Self::Uniform => Ok(Belief::uniform(model.n_states(), shape)),
+            Self::Initial => Ok(Some(Belief::from_initial(model, shape))),
+            Self::Uniform => Ok(Some(Belief::uniform(model.n_states(), shape))),
         }
     }
 }
 
-/// Counts of each state in each cell over worlds simulated side by side, shape `[S, H, W]`.
-///
-/// Counts are integers, so their sum does not depend on the order in which threads add them.
-fn simulate(
-    model: &Model,
-    shape: Shape,
+/// Worlds simulated side by side.
+struct Simulation<'a> {
+    dynamics: Dynamics,
+    /// S, H and W.
+    dim: (usize, usize, usize),
     seed: u64,
-    n_worlds: usize,
+    /// Steps from the initial distribution.
     burn_in: u64,
-) -> Result<ndarray::Array3<u32>, ModelError> {
-    let dynamics = Dynamics::new(model, shape)?;
-    let (height, width) = shape.dim();
-    let none = || ndarray::Array3::zeros((model.n_states(), height, width));
-    let count = |mut counts: ndarray::Array3<u32>, world: usize| {
-        let world_seed = stream(seed, Purpose::Prior, world as u64).next_u64();
-        let mut dynamics = dynamics.clone();
+    cancelled: &'a AtomicBool,
+}
+
+impl Simulation<'_> {
+    /// Counts of each state in each cell, shape `[S, H, W]`; of fewer steps once it is cancelled.
+    ///
+    /// Counts are integers, so their sum does not depend on the order in which threads add them.
+    fn counts(&self, n_worlds: usize) -> Array3<u32> {
+        let none = || Array3::zeros(self.dim);
+        let count = |mut counts: Array3<u32>, world: usize| {
+            for ((row, col), &state) in self.world(world).indexed_iter() {
+                counts[[usize::from(state), row, col]] += 1;
+            }
+            counts
+        };
+        let counts = (0..n_worlds).into_par_iter().fold(none, count);
+        counts.reduce(none, |a, b| a + b)
+    }
+
+    /// The states of one world after burn-in.
+    fn world(&self, world: usize) -> Grid<u8> {
+        let world_seed = stream(self.seed, Purpose::Prior, world as u64).next_u64();
+        let mut dynamics = self.dynamics.clone();
         let mut states = dynamics.initial(world_seed);
-        for n in 0..burn_in {
+        for n in 0..self.burn_in {
+            if self.cancelled.load(Ordering::Relaxed) {
+                break;
+            }
             dynamics.step(world_seed, n, &mut states);
         }
-        for ((row, col), &state) in states.indexed_iter() {
-            counts[[usize::from(state), row, col]] += 1;
-        }
-        counts
-    };
-    let counts = (0..n_worlds).into_par_iter().fold(none, count);
-    Ok(counts.reduce(none, |a, b| a + b))
+        states
+    }
 }
 
 /// Relative frequencies, drawn towards those of the whole grid, as if [`POOLED_WORLDS`] more worlds
 /// had been seen that are alike everywhere: a few worlds say little about one cell, and a state not
 /// seen in a cell is still possible there.
-fn average(counts: &ndarray::Array3<u32>, n_states: usize, shape: Shape) -> Belief {
-    let in_all = |state: usize| -> u32 { counts.index_axis(ndarray::Axis(0), state).sum() };
+fn average(counts: &Array3<u32>, n_states: usize, shape: Shape) -> Belief {
+    let in_all = |state: usize| -> u32 { counts.index_axis(Axis(0), state).sum() };
     let totals: Vec<f64> = (0..n_states)
         .map(|state| f64::from(in_all(state)))
         .collect();
@@ -117,6 +152,15 @@ mod tests {
             .belief(&model, shape, 6)
             .expect("valid model");
         assert_ne!(on(1), other);
+    }
+
+    #[test]
+    fn a_simulation_that_is_cancelled_ends_without_a_belief() {
+        let shape = Shape::new(9, 12).expect("test shape");
+        let endless = simulated(3, u64::MAX);
+        let cancelled = AtomicBool::new(true);
+        let belief = endless.belief_unless(&cancelled, &Model::wildfire(), shape, 5);
+        assert_eq!(belief, Ok(None));
     }
 
     #[test]

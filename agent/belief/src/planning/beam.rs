@@ -10,7 +10,7 @@ use crate::planning::reach::Reach;
 use emberwatch_protocol::path::Move;
 use emberwatch_protocol::randomness::split_mix;
 
-/// Key of the hash values that stand for cells: the word `beam` in ASCII.
+/// Key of the hash values that stand for cells, unless told otherwise: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
 /// The default width. With the known-model filter a width of 100 earned 37.2 +- 2.2 per step on 40
@@ -23,6 +23,7 @@ pub const DEFAULT_WIDTH: usize = 50;
 #[derive(Debug)]
 pub struct BeamSearch {
     width: usize,
+    hash_key: u64,
     /// Worth of a move's cell beside that of the move before it.
     discount: f32,
     /// Worth of the next move's cell: a power of the discount.
@@ -80,6 +81,7 @@ impl BeamSearch {
         assert!(width > 0, "beam search: expected a width of at least one");
         Self {
             width,
+            hash_key: HASH_KEY,
             discount: 1.0,
             weight: 1.0,
             reach: Reach::default(),
@@ -95,15 +97,43 @@ impl BeamSearch {
         }
     }
 
+    /// Breaks ties in another way for each key.
+    pub fn set_key(&mut self, key: u64) {
+        self.hash_key = key;
+        self.cell_hashes.clear();
+    }
+
     /// Makes each move's cell worth `discount` times as much as that of the move before it; 1 at first.
     pub fn set_discount(&mut self, discount: f32) {
         self.discount = discount;
     }
 
-    /// The best path that a beam of the given width finds in the reach.
-    fn search(&mut self, width: usize, n_moves: usize) -> Plan {
+    /// [`Planner::plan`], or `None` once `stops`, which is asked before each move: a wide beam may take minutes.
+    pub fn plan_unless(
+        &mut self,
+        problem: &PlanningProblem<'_>,
+        mut stops: impl FnMut() -> bool,
+    ) -> Option<Plan> {
+        self.look_at(problem);
+        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
+        let greedy = self.search(1, problem.n_moves, &mut stops)?;
+        let plan = self.search(self.width, problem.n_moves, &mut stops)?;
+        let is_greedy = greedy.score > plan.score;
+        Some(if is_greedy { greedy } else { plan })
+    }
+
+    /// The best path that a beam of the given width finds in the reach; `None` once `stops`.
+    fn search(
+        &mut self,
+        width: usize,
+        n_moves: usize,
+        stops: &mut impl FnMut() -> bool,
+    ) -> Option<Plan> {
         self.begin(width);
         for _ in 0..n_moves {
+            if stops() {
+                return None;
+            }
             self.expand();
             self.select(width);
             self.weight *= self.discount;
@@ -111,10 +141,10 @@ impl BeamSearch {
         let rank = |state: &State| (ordered_bits(state.score), !state.hash);
         let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
         let best = best.expect("invariant: every state has successors, so no beam is empty");
-        Plan {
+        Some(Plan {
             moves: self.moves_to(best, width, n_moves),
             score: self.beam[best].score,
-        }
+        })
     }
 
     fn look_at(&mut self, problem: &PlanningProblem<'_>) {
@@ -123,7 +153,7 @@ impl BeamSearch {
         let known = self.cell_hashes.len() as u64;
         let missing = known..(n_cells as u64).max(known);
         self.cell_hashes
-            .extend(missing.map(|index| split_mix(HASH_KEY, index)));
+            .extend(missing.map(|index| split_mix(self.hash_key, index)));
     }
 
     /// Makes the start the only state of the beam.
@@ -247,15 +277,8 @@ impl BeamSearch {
 
 impl Planner for BeamSearch {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
-        self.look_at(problem);
-        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
-        let greedy = self.search(1, problem.n_moves);
-        let plan = self.search(self.width, problem.n_moves);
-        if greedy.score > plan.score {
-            greedy
-        } else {
-            plan
-        }
+        let plan = self.plan_unless(problem, || false);
+        plan.expect("invariant: nothing stops it")
     }
 }
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.client import Client, connect_with_retry
+from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     EmberwatchError,
@@ -21,13 +22,12 @@ from emberwatch.errors import (
     bad_answer,
     invalid,
 )
+from emberwatch.moves import fly
 from emberwatch.observer import Frame, Newest, Observer
-from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
 from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings
-from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
 #: Exit code of an agent whose lease was lost.
@@ -214,16 +214,10 @@ class AgentSession(Session):
         self.features = self._asked().features(decisions)
         if self.features.shape != expected:
             raise bad_answer("decisions", f"features of shape {expected}", self.features.shape)
-        header = wire.StepReply(
-            first_robot=self.settings.world,
-            n_robots=len(decisions),
-            n_worlds=len(decisions),
-            height=spec.height,
-            width=spec.width,
-        )
         results = b"".join([*map(_world, decisions), *map(_robot, decisions)])
         frames = self._seen([(made.seed, made.episode, made.step) for made in decisions])
-        return StepAnswer(header, bytearray(results + frames), spec.shape)
+        payload = np.frombuffer(bytearray(results + frames), np.uint8)
+        return StepAnswer(spec.shape, self.settings.world, len(decisions), 0, 0, payload)
 
     def _seen(self, moments: list[tuple[int, int, int]]) -> bytes:
         spec = self.spec

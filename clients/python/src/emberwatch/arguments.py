@@ -9,7 +9,7 @@ from typing import Any, SupportsIndex, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch import wire
+from emberwatch import _native, wire
 from emberwatch.errors import invalid
 
 _Value = TypeVar("_Value")
@@ -31,6 +31,14 @@ def as_integer(value: object) -> int | None:
         return None if _is_masked(value) else operator.index(cast("SupportsIndex", value))
     except Exception:  # of any kind: what a library says of an array that is elsewhere, or of many
         return None
+
+
+def as_count(value: object, subject: str, least: int, most: int) -> int:
+    """Checks an integer that is not below `least` nor above `most`."""
+    number = as_integer(value)
+    if number is not None and least <= number <= most:
+        return number
+    raise invalid(subject, f"an integer within {least} to {most}", told(value))
 
 
 def as_seeds(
@@ -110,6 +118,9 @@ def as_choice(action: object, n_choices: int) -> int:
 
 def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:
     """Checks actions, one integer below `n_choices` for each world, and makes them bytes."""
+    chosen = _native.choices(actions, n_worlds, n_choices)
+    if chosen is not None:
+        return chosen
     given = as_array(actions, "action", "an array")
     if given.shape != (n_worlds,) or given.dtype.kind not in "iu":
         got = f"{given.dtype} {given.shape}"

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_seed, told
 from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.moves import fly
 from emberwatch.observations import Observations
 from emberwatch.owner import SessionOwner
 from emberwatch.session import Session
 from emberwatch.settings import draw_seed
-from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
+from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import UNOBSERVED, RobotResult, StepAnswer, StepResult
 
 NOTHING_TO_DRAW: Final = (

@@ -27,12 +27,12 @@ from emberwatch.arguments import as_integer, as_seed, told
 from emberwatch.client import Client
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS, MeritTally
+from emberwatch.moves import fly
 from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
 from emberwatch.tasks import Task, built_in_tasks
-from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]

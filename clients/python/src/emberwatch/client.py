@@ -13,11 +13,10 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from emberwatch import wire
-from emberwatch.connection import ServerConnection
+from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
 from emberwatch.lease import Lease
 from emberwatch.paths import utf8
-from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import (
     Grant,
     LeftBelief,

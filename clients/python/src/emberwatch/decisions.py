@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch import _native
 from emberwatch.arguments import as_choice, as_list, as_seeds
-from emberwatch.connection import Connection
-from emberwatch.errors import NoServerError, bad_answer
-from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
-from emberwatch.replies import Decision, DecisionsInfo, records
+from emberwatch.connection import CLIENT, RESET_TIMEOUT, STEP_TIMEOUT, Connection, decoded
+from emberwatch.errors import bad_answer
+from emberwatch.replies import Decision, DecisionsInfo, record, records
 
 
 class Decisions(Connection):
@@ -28,16 +28,9 @@ class Decisions(Connection):
         self, instance: str = "default", world: int = 0, *, timeout: float = STEP_TIMEOUT
     ) -> None:
         """`world` is the first of its worlds."""
-        names = (f"decisions-{world}", f"wake-agent-{world}", "agent")
-        try:
-            super().__init__(instance, *names, timeout)
-        except NoServerError:
-            raise NoServerError(
-                f"no agent serves decisions for world {world} of instance {instance!r}: start one "
-                f"with `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
-            ) from None
-        with self._closed_on_error():
-            self.info: Final = self._shake_hands(DecisionsInfo)
+        super().__init__(instance, _native.Agent(instance, world, CLIENT, timeout))
+        info = decoded("answer to 'hello'", self._native.info)
+        self.info: Final = record(DecisionsInfo, info)
         #: The worlds it acts on.
         self.worlds: Final = range(world, world + self.info.n_worlds)
 

@@ -171,13 +171,12 @@ class WildfireEnv(WorldEnv):
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
                 as after Ctrl-C: reset or resume. Nothing is sent.
         """
-        moves = as_moves(action, 1, self._spec.n_moves)
         self._session.begin_step()
-        self._answer = answer = self._session.step(moves)
+        self._answer = answer = self._session.step(action)
         self._update(self._observations, answer)
         result = answer.result()
         if self.render_mode is not None:
-            self._trace(result.robot, moves.reshape(-1))
+            self._trace(result.robot, as_moves(action, 1, self._spec.n_moves).reshape(-1))
         observation, info = self._seen(answer, result)
         reward, world = paid(result, self._pays), result.world
         self._session.finish()
@@ -240,4 +239,4 @@ class WildfireVectorEnv(WorldVectorEnv):
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(actions, flown)
         part, name = self._pays
-        return self._results[part][name]
+        return self._results[part][name].copy()  # later steps write to the results

@@ -1,20 +1,17 @@
 """A lease: the right to fly some robots, and what may be done with it."""
 
 import os
-import threading
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from emberwatch import wire
-from emberwatch.arguments import as_moves, as_seeds
-from emberwatch.connection import ServerConnection
+from emberwatch.arguments import as_seeds
+from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.errors import invalid
 from emberwatch.paths import utf8
-from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
 
@@ -43,9 +40,8 @@ class Lease:
         self.worlds: Final = self._worlds_of(robots)
         #: Where these worlds stood when it was given.
         self.start: Final = start
-        #: k of each world, as far as is known here.
-        self._steps = np.zeros(len(self.worlds), np.uint64)
-        self._lock = threading.Lock()
+        #: It knows k of each world.
+        self._native = client.lease(grant.lease, robots)
         self._is_over = False
         self._note(start)
 
@@ -78,33 +74,10 @@ class Lease:
                 tells to where. With code `"episode_over"`: reset that world.
         """
         chosen = self.robots if robots is None else _part("robots", robots, self.robots)
-        moves = as_moves(paths, len(chosen), self.client.info.n_moves)
-        return self.step_moves(moves, chosen, full=full, team=team, timeout=timeout)
-
-    def step_moves(
-        self,
-        moves: NDArray[np.uint8],
-        robots: range,
-        *,
-        full: bool = False,
-        team: bool = False,
-        timeout: float,
-    ) -> StepAnswer:
-        """The same for moves that `as_moves` has checked."""
-        steps = self.steps_of(robots)
         flags = full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES
-        with self._lock:  # each thread's path is for a step of its own
-            answer = self.client.exchange(
-                wire.STEP,
-                self.number,
-                robots.start,
-                len(robots),
-                flags,
-                steps.tobytes() + moves.tobytes(),
-                timeout=timeout,
-            )
-            steps[:] = answer.worlds["step"]
-        return answer
+        place = chosen.start, len(chosen), flags
+        nanos, payload = self._native.step(paths, *place, timeout)
+        return StepAnswer(self.client.shape, *place, nanos, payload)
 
     def observe(
         self,
@@ -115,9 +88,9 @@ class Lease:
     ) -> StepAnswer:
         """The last results and frames of its robots again, or of some; steps go on from there."""
         chosen = self.robots if robots is None else _part("robots", robots, self.robots)
-        answer = self.client.observe(chosen.start, len(chosen), team=team, timeout=timeout)
-        self.steps_of(chosen)[:] = answer.worlds["step"]
-        return answer
+        place = chosen.start, len(chosen), wire.TEAM_FRAMES if team else 0
+        nanos, payload = self._native.observe(*place, timeout)
+        return StepAnswer(self.client.shape, *place, nanos, payload)
 
     def reset(
         self,
@@ -215,17 +188,14 @@ class Lease:
         n_robots = self.client.info.n_robots
         return range(robots.start // n_robots, (robots.stop - 1) // n_robots + 1)
 
-    def steps_of(self, robots: range) -> NDArray[np.uint64]:
-        """The next step k of the worlds of some robots, to read and to write."""
-        if robots is self.robots:
-            return self._steps
+    def steps_of(self, robots: range) -> list[int]:
+        """The next step k of the worlds of some robots, as far as is known here."""
         worlds = self._worlds_of(robots)
-        return self._steps[worlds.start - self.worlds.start :][: len(worlds)]
+        return self._native.steps[worlds.start - self.worlds.start :][: len(worlds)]
 
     def _note(self, worlds: tuple[WorldInfo, ...]) -> tuple[WorldInfo, ...]:
         for info in worlds:
-            if info.world in self.worlds:
-                self._steps[info.world - self.worlds.start] = info.step
+            self._native.note(info.world, info.step)
         return worlds
 
     def __enter__(self) -> Self:

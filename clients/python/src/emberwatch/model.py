@@ -5,7 +5,6 @@ observation matrix ``O`` of eq. 1. Whether a file makes sense is for the server 
 reads what the server has accepted. `emberwatch.belief` applies the parameters to a belief.
 """
 
-import tomllib
 from dataclasses import dataclass, fields
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -16,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch import _native
 from emberwatch.errors import invalid
 from emberwatch.paths import utf8
 from emberwatch.programs import check_settings
@@ -56,12 +56,10 @@ class Description:
     def from_toml(cls, text: str) -> Self:
         """Reads the text of a file that a server has accepted."""
         try:
-            return cls(**cls._fields(tomllib.loads(text)), toml=text)
-        except (AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-            kind = cls.__name__.lower()
-            raise invalid(
-                kind, "a file that `emberwatch-server --check` accepts", repr(error)
-            ) from None
+            return cls(**cls._read(text), toml=text)
+        except (TypeError, ValueError) as error:
+            expected = "a file that `emberwatch-server --check` accepts"
+            raise invalid(cls.__name__.lower(), expected, error) from None
 
     @property
     def n_states(self) -> int:
@@ -87,21 +85,9 @@ class Description:
         return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
 
     @staticmethod
-    def _fields(file: dict[str, Any]) -> dict[str, Any]:
+    def _read(text: str) -> dict[str, Any]:
         """All fields but the text."""
-        states, observations = file["states"], file["observations"]
-        matrix = np.array([state["observed_as"] for state in states], np.float64)
-        return {
-            "name": file["name"],
-            "state_names": tuple(state["name"] for state in states),
-            "state_colors": tuple(color_from_hex(state["color"]) for state in states),
-            "observation_names": tuple(observation["name"] for observation in observations),
-            "observation_colors": tuple(
-                color_from_hex(observation["color"]) for observation in observations
-            ),
-            "observation_matrix": matrix / matrix.sum(axis=1, keepdims=True),
-            "reward": np.array([state.get("reward", 0.0) for state in states], np.float64),
-        }
+        return _native.read_description(text)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -149,21 +135,8 @@ class Model(Description):
         return len(self.kernels) > 1
 
     @staticmethod
-    def _fields(file: dict[str, Any]) -> dict[str, Any]:
-        states, described = file["states"], Description._fields(file)
-        names = described["state_names"]
-        n_kernels = len(states) if any("own" in entry for entry in file["kernel"]) else 1
-        kernels = np.zeros((n_kernels, len(states), len(states), *file["kernel_size"]))
-        for entry in file["kernel"]:
-            weights = entry.get("scale", 1.0) * np.array(entry["weights"], np.float64)
-            own = names.index(entry["own"]) if n_kernels > 1 else 0
-            kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
-        initial = np.array([state["initial"] for state in states], np.float64)
-        return described | {
-            "kernels": kernels,
-            "bias": np.array([state.get("bias", 0.0) for state in states], np.float64),
-            "initial": initial / initial.sum(),
-        }
+    def _read(text: str) -> dict[str, Any]:
+        return _native.read_model(text)
 
 
 def built_in(kind: str) -> dict[str, Traversable]:

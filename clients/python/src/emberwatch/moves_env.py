@@ -3,7 +3,7 @@
 For one robot, or for many.
 """
 
-from typing import Any, Final, Literal, TypeAlias, Unpack
+from typing import Any, Literal, TypeAlias, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
-from emberwatch.flights import Flights
+from emberwatch.flights import flights_of
+from emberwatch.moves import fly
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
-from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
-
-_FIRST: Final = np.zeros(1, np.intp)
 
 MovesReward: TypeAlias = Literal[Reward, "move"]
 
@@ -106,7 +104,7 @@ class WildfireMovesEnv(WorldEnv):
         self._pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
         super().__init__(Session(settings))
-        self._flights = flights = Flights(self._spec, 1, pays=reward == "move")
+        self._flights = flights = flights_of(self._spec, 1, pays=reward == "move")
         self._observations = Observations(
             observation, self._spec, 1, flights, window, first=self._robot or 0
         )
@@ -144,8 +142,8 @@ class WildfireMovesEnv(WorldEnv):
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """A move that does not complete its path."""
         assert self._answer is not None
-        reward = float(self._flights.move(_FIRST, move)[0])
-        self._observations.visit(_FIRST)
+        reward = float(self._flights.move(ONE_ROW, move)[0])
+        self._observations.visit(ONE_ROW)
         observation, info = self._seen(self._answer)
         return observation, reward, False, False, info
 
@@ -175,7 +173,7 @@ class WildfireMovesEnv(WorldEnv):
         if self.render_mode == "human":
             self._draw()
         # Copies: each move of a path returns the frame again.
-        cells = self._flights.robots.copy()
+        cells = self._flights.robots
         seen = self._observations.all(answer.frames.copy(), cells, self._seen_teams)
         return of_row(seen, 0), info
 
@@ -216,7 +214,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
         session = vector_session(settings, num_envs)
         n_rows = session.n_rows
-        self._flights = flights = Flights(session.spec, n_rows, pays=reward == "move")
+        self._flights = flights = flights_of(session.spec, n_rows, pays=reward == "move")
         self._parts = Observations(observation, session.spec, n_rows, flights, window)
         super().__init__(
             session,
@@ -244,17 +242,15 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
 
     def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
         """One move that completes no path."""
-        indices = np.flatnonzero(moved)
-        rewards = np.zeros(self.num_envs)
-        rewards[indices] = self._flights.move(indices, actions)
-        self._parts.visit(indices)
+        rewards = self._flights.move(moved, actions)
+        self._parts.visit(moved)
         return rewards
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
         self._flights.begin(begun, super()._robots(), self._truths)
 
     def _robots(self) -> NDArray[np.int64]:
-        return self._flights.robots.copy()
+        return self._flights.robots
 
     def _shown(self) -> NDArray[np.uint8]:
         return self._frames.copy()  # each move of a path returns the frames again

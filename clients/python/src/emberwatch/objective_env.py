@@ -179,7 +179,7 @@ class WildfireObjectiveVectorEnv(AgentSessionOwner, WorldVectorEnv):
         if self.render_mode is not None:
             for index in np.flatnonzero(flown).tolist():
                 self._paths[index] = self._agent.paths[index]
-        return self._results["world"]["reward"]
+        return self._results["world"]["reward"].copy()
 
 
 def _arguments(

@@ -8,9 +8,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch import wire
+from emberwatch._native import Flights
 from emberwatch.belief import Filters
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.flights import Flights
 from emberwatch.last_seen import LastSeen
 from emberwatch.prior import prior_of
 from emberwatch.settings import WorldSpec
@@ -102,9 +102,10 @@ class Observations:
             self._filters.update(frames, moved)
         self._show(moved)
 
-    def visit(self, indices: NDArray[np.intp]) -> None:
+    def visit(self, moved: NDArray[np.bool_]) -> None:
         """Some robots have made a move."""
-        if self._flights is not None:
+        if self._flights is not None and self._windows:
+            indices = np.flatnonzero(moved)
             rows, cols = self._flights.robots[indices].T
             for windows in self._windows.values():
                 windows.visit(indices, rows, cols)
@@ -152,8 +153,8 @@ class Observations:
         if name in self._windows:
             return self._windows[name].around(self._flights)
         if name == "visited":
-            return self._flights.visited[..., np.newaxis].copy()
-        return self._flights.n_made.copy()
+            return self._flights.visited[..., np.newaxis]
+        return self._flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Where the other robots of each row's world are; `robots` are all of the worlds."""

@@ -1,68 +1,34 @@
 """What can be known about a world before its first frame: a filter's first belief."""
 
 import functools
-import tempfile
-from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch import programs
-from emberwatch.arguments import as_array
+from emberwatch import _native
+from emberwatch.arguments import as_array, as_count
 from emberwatch.belief import initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError, invalid
+from emberwatch.errors import invalid
 from emberwatch.model import Model
-from emberwatch.resources import SHARED_MEMORY
 
 PriorKind = Literal["simulated", "initial", "uniform"]
 """A prior by name, see `wrappers.BeliefObservation`."""
-
-#: 64 worlds of 512 x 512 cells take minutes.
-_SIMULATION_TIMEOUT: Final = 1800.0
 
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
     """How often each cell of 64 simulated worlds is in each state after the burn-in.
 
-    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. Shape
-    (S, H, W); the same array again for the same arguments, so it cannot be written to.
+    Their seeds do not depend on any environment's. Shape (S, H, W); the same array again for the
+    same arguments, so it cannot be written to. The agents' beliefs begin with it, too, and it is
+    kept for later processes where they keep theirs, in ``~/.cache/emberwatch``.
     """
-    name = "emberwatch-agent"
-    with _folder() as directory:
-        file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
-        try:
-            file.write_text(model.toml, "utf-8")
-        except OSError as error:
-            raise EmberwatchError(f"write {file}: {error.strerror}", "program") from None
-        flags = {"model": file, "height": height, "width": width, "burn-in": burn_in, "out": out}
-        arguments = ["prior", *(f"--{flag}={value}" for flag, value in flags.items())]
-        programs.run(name, arguments, _SIMULATION_TIMEOUT)
-        try:
-            with out.open("rb") as stream:
-                prior: NDArray[np.floating] = np.lib.format.read_array(stream)
-        except (OSError, ValueError) as error:
-            problem = f"{name} prior: expected an .npy file: {error}"
-            raise EmberwatchError(problem, "program") from error
-    expected = (model.n_states, height, width)
-    if prior.shape != expected:
-        problem = f"{name} prior: expected shape {expected}, got {prior.shape}"
-        raise EmberwatchError(problem, "program")
+    height, width = as_count(height, "height", 1, 4096), as_count(width, "width", 1, 4096)
+    burn_in = as_count(burn_in, "burn_in", 0, 2**64 - 1)
+    prior = _native.simulated_prior(model.toml, height, width, burn_in)
     prior.flags.writeable = False
     return prior
-
-
-def _folder() -> tempfile.TemporaryDirectory[str]:
-    """A temporary folder; in shared memory, which must be writable anyhow, if there is no other."""
-    prefix = "emberwatch-prior-"
-    try:
-        return tempfile.TemporaryDirectory(prefix=prefix)
-    except OSError:
-        try:
-            return tempfile.TemporaryDirectory(prefix=prefix, dir=SHARED_MEMORY)
-        except OSError as error:
-            raise EmberwatchError(f"make a temporary folder: {error.strerror}", "program") from None
 
 
 def prior_of(

@@ -80,36 +80,25 @@ def unused_instance() -> str:
 
 def check_settings(flags: Sequence[str]) -> dict[str, Any]:
     """What a server would run with, given these flags; a refusal is in the server's words."""
-    done = _run("emberwatch-server", ["--check", *flags], _START_TIMEOUT)
-    if done.returncode != 0:
-        raise InvalidArgumentError(_cleaned(done.stderr))
-    return tomllib.loads(done.stdout)
-
-
-def run(name: str, arguments: Sequence[str], timeout: float) -> None:
-    """Runs a program to its end; a failure is an error in its own words."""
-    done = _run(name, arguments, timeout)
-    if done.returncode != 0:
-        words = _cleaned(done.stderr[-1000:])
-        raise EmberwatchError(f"{name} ended with code {done.returncode}: {words}", "program")
-
-
-def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.CompletedProcess[str]:
-    command = [str(find(name)), *arguments]
+    command = [str(find("emberwatch-server")), "--check", *flags]
     try:
-        return subprocess.run(
+        done = subprocess.run(
             command,
             env=os.environ | {"RUST_LOG": "warn"},
             capture_output=True,
             encoding="utf-8",
             errors="replace",
             stdin=subprocess.DEVNULL,
-            timeout=timeout,
+            timeout=_START_TIMEOUT,
         )
     except OSError as error:
         raise _not_started(command, error) from None
     except subprocess.TimeoutExpired:
-        raise EmberwatchError(f"{name} did not end within {timeout} s", "program") from None
+        problem = f"emberwatch-server --check did not end within {_START_TIMEOUT} s"
+        raise EmberwatchError(problem, "program") from None
+    if done.returncode != 0:
+        raise InvalidArgumentError(_cleaned(done.stderr))
+    return tomllib.loads(done.stdout)
 
 
 def _not_started(command: Sequence[str], error: OSError) -> EmberwatchError:

@@ -66,7 +66,7 @@ class ServerInfo:
     @property
     def shape(self) -> Shape:
         """What the answers of this server depend on."""
-        return Shape(self.n_robots, self.n_moves, self.n_observations)
+        return Shape(self.n_robots, self.height, self.width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,10 +14,11 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.client import Client, connect
+from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
     LeaseLostError,
@@ -27,7 +28,6 @@ from emberwatch.errors import (
 )
 from emberwatch.lease import Lease
 from emberwatch.observer import Newest, Truth, TruthReader
-from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.wire import StepAnswer, WorldResult
@@ -157,20 +157,20 @@ class Session:
                 raise
         return self._begin(indices, seeds)
 
-    def step(self, moves: NDArray[np.uint8], rows: range | None = None) -> StepAnswer:
-        """Flies checked paths with all robots, or with those of some consecutive worlds.
+    def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
+        """Flies paths with all robots, or with those of some consecutive worlds.
 
         Slow teammates are waited for, without end while the server lives. A path that came too
         late for them is given up, and the answer is how the world stands.
         """
         lease = self._opened()
-        robots = lease.robots if rows is None else lease.robots[rows.start : rows.stop]
+        robots = None if rows is None else lease.robots[rows.start : rows.stop]
         self.n_skipped = 0
         # Sooner would take back the path with which the deadline began.
         timeout = self.settings.timeout + lease.client.info.deadline_millis / 1000
         while True:
             try:
-                answer = lease.step_moves(moves, robots, timeout=timeout)
+                answer = lease.step(paths, robots=robots, timeout=timeout)
                 self._has_moved = True
                 return answer
             except (LeaseLostError, ServerGoneError) as error:
@@ -181,7 +181,7 @@ class Session:
                 if error.code != "timeout" and not is_late:
                     self._refused(error)
                     raise
-            before = int(lease.steps_of(robots)[0])
+            before = lease.steps_of(robots or lease.robots)[0]
             answer = self._look(lease, robots)
             n_moved = int(answer.worlds["step"][0]) - before
             if n_moved > 0:
@@ -373,7 +373,7 @@ class Session:
     def _observe(self) -> StepAnswer:
         return self._opened().observe(timeout=self.settings.timeout)
 
-    def _look(self, lease: Lease, robots: range) -> StepAnswer:
+    def _look(self, lease: Lease, robots: range | None) -> StepAnswer:
         """Where the worlds stand after a step that has no answer."""
         try:
             return lease.observe(robots=robots, timeout=self.settings.timeout)

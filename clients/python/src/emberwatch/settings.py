@@ -11,10 +11,10 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
+from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import local, utf8
-from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
 from emberwatch.tasks import Task
@@ -178,7 +178,7 @@ class WorldSpec:
 
     @property
     def shape(self) -> Shape:
-        return Shape(self.n_robots, self.n_moves, self.n_observations)
+        return Shape(self.n_robots, self.height, self.width)
 
 
 def draw_seed(generator: np.random.Generator) -> int:

@@ -26,11 +26,12 @@ from emberwatch.base import (
     wants_to_resume,
 )
 from emberwatch.errors import invalid
+from emberwatch.moves import fly
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.owner import SessionOwner
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
-from emberwatch.view import View, fly
+from emberwatch.view import View
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
@@ -72,6 +73,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
+        #: What infos tell of the results, once it was asked for.
+        self._numbers: dict[str, NDArray[np.int64]] | None = None
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
         # Robots that completed a path in this step.
@@ -126,8 +129,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             EmberwatchError: As `WildfireEnv.step`.
         """
         chosen = self._check_actions(actions)
-        over = self._over
-        if over.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+        over, has_ended = self._over, bool(self._over.any())
+        if has_ended and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise gymnasium.error.ResetNeeded(
                 f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                 "options={'reset_mask': ...}"
@@ -137,7 +140,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._exchanged = np.zeros_like(flown)
         rewards = self._fly(chosen, flown)
         self._elapsed += flown
-        if over.any():
+        if has_ended:
+            rewards = np.where(flown, rewards, 0.0)
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         outcome = self._outcome(flown, rewards)
         self._session.finish()
@@ -224,6 +228,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         chosen = slice(run.start, run.stop)
         answer = self._session.step(paths[chosen], run)
         self._frames[chosen], self._results[chosen] = answer.frames, answer.results
+        self._numbers = None
         if self._truths is not None:
             self._truths[chosen] = self._session.truth(answer)
 
@@ -252,15 +257,14 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             self._paths[row] = None
 
     def _take(self, answer: StepAnswer) -> None:
-        self._frames, self._results = answer.frames, answer.results
+        self._frames, self._results, self._numbers = answer.frames, answer.results, None
         if self._session.settings.truth:
             self._truths = self._session.truth(answer)
 
     def _outcome(
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """What `step` returns; rows that began an episode in this step earned nothing."""
-        rewards = np.where(flown, rewards, 0.0)
+        """What `step` returns."""
         worlds = self._results["world"]
         terminations = self._exchanged & (worlds["terminated"] != 0)
         truncations = self._exchanged & (worlds["truncated"] != 0)
@@ -292,13 +296,22 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of some rows, zero for the others, as Gymnasium stacks them."""
         infos: dict[str, Any] = {}
-        for name, part in (REVEALED if self._reveals else REPORTED).items():
-            infos[name] = np.where(mask, self._results[part][name], 0).astype(np.int64)
+        for name, numbers in self._told().items():
+            infos[name] = numbers * mask
             infos[f"_{name}"] = mask.copy()
         if self._truths is not None and self._reveals:
             infos["truth"] = np.where(mask[:, np.newaxis, np.newaxis], self._truths, np.uint8(0))
             infos["_truth"] = mask.copy()
         return infos
+
+    def _told(self) -> dict[str, NDArray[np.int64]]:
+        """The numbers of the results that are told to learners."""
+        if self._numbers is None:
+            fields = REVEALED if self._reveals else REPORTED
+            self._numbers = {
+                name: self._results[part][name].astype(np.int64) for name, part in fields.items()
+            }
+        return self._numbers
 
     def _seen(self) -> Any:
         if self.render_mode == "human":

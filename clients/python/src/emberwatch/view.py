@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
-from emberwatch.replies import ServerInfo
 from emberwatch.settings import WorldSpec
 
 #: The render modes of every environment here.
@@ -16,9 +15,6 @@ RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 
 #: Pictures a second of a film, and at most in a window.
 RENDER_FPS: Final = 10
-
-#: Row and column that each move adds.
-DIRECTIONS: Final = np.array(((-1, 0), (1, 0), (0, -1), (0, 1)), np.int64)
 
 
 class View:
@@ -55,16 +51,3 @@ class View:
         if self._screen is not None:
             self._screen.close()
             self._screen = None
-
-
-def fly(start: ArrayLike, moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.int64]:
-    """The cells of a path after each move, `(T, 2)`: a move off the grid stays in place.
-
-    Or those of n paths, `(n, T, 2)`, where `start` is `(n, 2)` and `moves` `(n, T)`.
-    """
-    given, cell = np.asarray(moves), np.asarray(start, np.int64)
-    cells = np.empty((*given.shape, 2), np.int64)
-    for move in range(given.shape[-1]):
-        cell = (cell + DIRECTIONS[given[..., move]]).clip(0, (grid.height - 1, grid.width - 1))
-        cells[..., move, :] = cell
-    return cells

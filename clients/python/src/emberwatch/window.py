@@ -6,8 +6,8 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from emberwatch._native import Flights
 from emberwatch.belief import Filters, entropy
-from emberwatch.flights import Flights
 from emberwatch.model import Model
 from emberwatch.settings import WorldSpec
 

@@ -1,17 +1,10 @@
-"""The wire, as PROTOCOL.md describes it: headers, codes, payloads. No I/O.
+"""Names and types of the wire, as PROTOCOL.md describes it: codes, limits, results, answers."""
 
-Each header is a `ctypes.Structure`, as iceoryx2 wants it, whose fields follow the tables of
-PROTOCOL.md section 3; a test compares the two.
-"""
-
-import ctypes
 import struct
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from emberwatch.errors import bad_answer
 
 #: The protocol version that this package speaks.
 VERSION: Final = 2
@@ -41,84 +34,6 @@ FRAME_BUFFER: Final = 64
 TRUTH_BUFFER: Final = 128
 AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
-
-_STEP_REQUEST: Final = "IIQQIIIIQQ"
-_CONTROL_REQUEST: Final = "IIQQQ"
-
-#: The two request headers as bytes, field by field.
-STEP_REQUEST: Final = struct.Struct("=" + _STEP_REQUEST)
-CONTROL_REQUEST: Final = struct.Struct("=" + _CONTROL_REQUEST)
-
-
-class Header(ctypes.Structure):
-    """A user header. Subclasses list their fields; the type name carries the version."""
-
-    @classmethod
-    def type_name(cls) -> str:
-        """The name by which iceoryx2 compares types of two processes."""
-        return f"emberwatch.v2.{cls.__name__}"
-
-
-def _fields(format: str, names: str) -> list[tuple[str, Any]]:
-    """Fields by `struct`'s letters."""
-    kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
-    return [(name, kinds[letter]) for name, letter in zip(names.split(), format, strict=True)]
-
-
-class StepRequest(Header):
-    """In front of the step k of each world, and of a step then `n_robots` paths."""
-
-    _fields_ = _fields(
-        _STEP_REQUEST,
-        "version operation lease sequence first_robot n_robots n_moves flags listener_low "
-        "listener_high",
-    )
-
-
-class StepReply(Header):
-    """In front of `n_worlds` results, `n_robots` results, and the frames."""
-
-    _fields_ = _fields(
-        "IIQIIIIIIQQ",
-        "version status sequence first_robot n_robots n_worlds flags height width "
-        "simulation_nanos detail",
-    )
-
-
-class ControlRequest(Header):
-    """In front of one JSON object."""
-
-    _fields_ = _fields(_CONTROL_REQUEST, "version reserved sequence listener_low listener_high")
-
-
-class ControlReply(Header):
-    """In front of one JSON object."""
-
-    _fields_ = _fields("IIQ", "version status sequence")
-
-
-class FrameHeader(Header):
-    """In front of what a world's robots saw and flew."""
-
-    _fields_ = [
-        *_fields("IIQIIII", "version world sequence first_robot n_robots height width"),
-        ("result", ctypes.c_ubyte * 64),
-    ]
-
-
-class TruthHeader(Header):
-    """In front of published hidden states."""
-
-    _fields_ = _fields("IIQQQQII", "version world sequence episode step seed height width")
-
-
-class AgentHeader(Header):
-    """In front of an agent's belief and what it wants."""
-
-    _fields_ = _fields(
-        "IIQQQQIIIIII",
-        "version world sequence episode step seed height width n_states pid first_robot n_robots",
-    )
 
 
 class WorldResult(NamedTuple):
@@ -204,12 +119,12 @@ RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
 
 
 class Shape(NamedTuple):
-    """What the length and the values of an answer depend on, as `hello` tells it."""
+    """What the meaning of an answer depends on, as `hello` tells it."""
 
     #: Robots of a world, R.
     n_robots: int
-    n_moves: int
-    n_observations: int
+    height: int
+    width: int
 
     def n_worlds(self, first_robot: int, n_robots: int) -> int:
         """How many worlds some consecutive robots are in."""
@@ -223,48 +138,39 @@ class StepAnswer:
     Attributes:
         first_robot: The number of the first robot; robot r of world w has number w R + r.
         simulation_nanos: How long the server worked on it, nanoseconds.
-        worlds: A `WorldResult` per world, `(n_worlds,)` of `WORLD_DTYPE`.
-        robots: A `RobotResult` per robot, `(n_robots,)` of `ROBOT_DTYPE`.
         frames: What each robot saw, `(n_robots, H, W)`: an observation, or 255 where nothing was
             seen. If team frames were asked for: what all robots of each world saw,
             `(n_worlds, H, W)`. A copy of your own; write to it as you like.
     """
 
-    __slots__ = (
-        "_payload",
-        "_shape",
-        "first_robot",
-        "frames",
-        "robots",
-        "simulation_nanos",
-        "worlds",
-    )
+    __slots__ = ("_head", "_payload", "_shape", "first_robot", "frames", "simulation_nanos")
 
-    def __init__(self, reply: StepReply, payload: bytearray, shape: Shape) -> None:
-        n_worlds, n_robots, n_cells = reply.n_worlds, reply.n_robots, reply.height * reply.width
-        if not n_robots * n_cells or n_worlds != shape.n_worlds(reply.first_robot, n_robots):
-            got = f"{n_robots} in {n_worlds} of {reply.height} x {reply.width} cells"
-            raise bad_answer("answer to step", "robots and their worlds", got)
-        n_frames = n_worlds if reply.flags & TEAM_FRAMES else n_robots
-        head = n_worlds * WORLD.size + n_robots * ROBOT.size
-        expected = head + n_frames * n_cells
-        if len(payload) != expected:
-            raise bad_answer("answer to step", f"{expected} bytes", len(payload))
-        self._payload, self._shape = payload, shape
-        self.first_robot: int = reply.first_robot
-        self.simulation_nanos: int = reply.simulation_nanos
-        self.worlds: NDArray[np.void] = np.frombuffer(payload, WORLD_DTYPE, n_worlds)
-        self.robots: NDArray[np.void] = np.frombuffer(
-            payload, ROBOT_DTYPE, n_robots, n_worlds * WORLD.size
-        )
-        stayed = max(self.worlds["hovered"].tolist() + self.worlds["late"].tolist())
-        check_stayed(stayed, shape.n_robots)
-        n_moves = set(self.robots["n_moves"].tolist())
-        if not n_moves <= {0, shape.n_moves}:
-            raise bad_answer("n_moves", f"0 or {shape.n_moves}", n_moves)
-        frames = np.frombuffer(payload, np.uint8, offset=head)
-        check_frame(frames, shape.n_observations)
-        self.frames = frames.reshape(n_frames, reply.height, reply.width)
+    def __init__(
+        self,
+        shape: Shape,
+        first_robot: int,
+        n_robots: int,
+        flags: int,
+        simulation_nanos: int,
+        payload: NDArray[np.uint8],
+    ) -> None:
+        """Takes a payload as it is: results of the worlds, results of the robots, frames."""
+        n_worlds = shape.n_worlds(first_robot, n_robots)
+        n_frames = n_worlds if flags & TEAM_FRAMES else n_robots
+        self._shape, self._payload, self._head = shape, payload, n_worlds * WORLD.size
+        self.first_robot, self.simulation_nanos = first_robot, simulation_nanos
+        frames = payload[self._head + n_robots * ROBOT.size :]
+        self.frames = frames.reshape(n_frames, shape.height, shape.width)
+
+    @property
+    def worlds(self) -> NDArray[np.void]:
+        """A `WorldResult` per world, `(n_worlds,)` of `WORLD_DTYPE`."""
+        return self._payload[: self._head].view(WORLD_DTYPE)
+
+    @property
+    def robots(self) -> NDArray[np.void]:
+        """A `RobotResult` per robot, `(n_robots,)` of `ROBOT_DTYPE`."""
+        return self._payload[self._head : -self.frames.size].view(ROBOT_DTYPE)
 
     def __repr__(self) -> str:
         others = len(self.robots) - 1
@@ -290,39 +196,9 @@ class StepAnswer:
 
     def result(self, index: int = 0) -> StepResult:
         """The results of one robot and its world; `index` counts from the first."""
-        world = self._shape.n_worlds(self.first_robot, index + 1) - 1
-        offset = len(self.worlds) * WORLD.size + index * ROBOT.size
+        world = self._shape.n_worlds(self.first_robot, index + 1) - 1 if index else 0
+        payload, offset = self._payload.data, self._head + index * ROBOT.size
         return StepResult(
-            WorldResult(*WORLD.unpack_from(self._payload, world * WORLD.size)),
-            RobotResult(*ROBOT.unpack_from(self._payload, offset)),
+            WorldResult._make(WORLD.unpack_from(payload, world * WORLD.size)),
+            RobotResult._make(ROBOT.unpack_from(payload, offset)),
         )
-
-
-def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
-    """Refuses frames whole that hold anything but observations and 255."""
-    # 255 wraps to 0, observation o becomes o + 1: one addition and one maximum check all.
-    highest = int((values + np.uint8(1)).max(initial=0))
-    if highest > n_observations:
-        raise bad_answer("frame", f"observations below {n_observations} or 255", highest - 1)
-
-
-def check_stayed(stayed: int, n_robots: int) -> None:
-    """Refuses bits of robots that a world does not have."""
-    if stayed >> n_robots:
-        raise bad_answer("robots that stayed", f"bits below {n_robots}", f"{stayed:#x}")
-
-
-def check_asked(reply: StepReply, expected: tuple[int, int, int, int, int]) -> None:
-    """Refuses an answer to another question: first robot, number, flags, height, width."""
-    got = (reply.first_robot, reply.n_robots, reply.flags, reply.height, reply.width)
-    if got != expected:
-        what = f"first robot, robots, flags, height, width {expected}"
-        raise bad_answer("answer to step", what, got)
-
-
-def check_answer(what: str, reply: Any, sequence: int) -> None:
-    """Refuses an answer of another version or to another request."""
-    if reply.version != VERSION:
-        raise bad_answer(what, f"version {VERSION}", reply.version)
-    if reply.sequence != sequence:
-        raise bad_answer(what, f"sequence number {sequence}", reply.sequence)

@@ -47,7 +47,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     ## Priors
     - ``"simulated"``: how often each cell of 64 simulated worlds is in each state after the
-      burn-in. Needs the program ``emberwatch-agent`` and some seconds, once per process and model.
+      burn-in. The first time it takes some seconds; ``~/.cache/emberwatch`` keeps it.
     - ``"initial"``: the model's initial distribution, right for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
     - An array of shape (S, H, W), each cell's sum one.

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from emberwatch.belief import Filter
 from emberwatch.errors import EmberwatchError
+from emberwatch.moves import fly
 from emberwatch.observer import Frame, Truth
 from emberwatch.recording import Record
 from emberwatch.replies import ServerInfo
-from emberwatch.view import fly
 
 # After a longer gap the belief begins again: a fire depends on the last 5,500 steps or so.
 _MOST_LOST = 10_000

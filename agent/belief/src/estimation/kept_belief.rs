@@ -1,9 +1,13 @@
-//! First beliefs of earlier runs, kept in the user's cache folder: a file each, of the key, the probabilities and a
-//! checksum. Where anything is wrong with a file or the folder, the belief is simulated again.
+//! Simulated first beliefs of earlier runs, kept in the user's cache folder: a file each, of the key, the probabilities
+//! and a checksum. Where anything is wrong with a file or the folder, the belief is simulated again.
 
-use crate::file::{Readers, replace_file};
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_protocol::grid::Probabilities;
+use crate::estimation::belief::Belief;
+use crate::estimation::prior::Prior;
+use emberwatch_protocol::grid::{Probabilities, Shape};
+use emberwatch_protocol::model::Model;
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -15,7 +19,8 @@ const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
 
-/// Where the belief of a key is kept.
+/// Where a prior is kept.
+#[derive(Debug)]
 pub struct KeptBelief {
     path: PathBuf,
     /// All that the belief depends on, as text.
@@ -26,7 +31,11 @@ pub struct KeptBelief {
 
 impl KeptBelief {
     /// `None` if there is no cache folder, or the belief is too large for it.
-    pub fn new(key: String, dim: (usize, usize, usize)) -> Option<Self> {
+    pub fn new(prior: Prior, model: &Model, shape: Shape, seed: u64) -> Option<Self> {
+        let version = env!("CARGO_PKG_VERSION");
+        let file = toml::to_string(model.file()).expect("invariant: model files serialise");
+        let key = format!("emberwatch {version}: {prior:?}, {shape}, seed {seed}\n{file}\n");
+        let dim = (model.n_states(), shape.height(), shape.width());
         let name = format!("{:08x}.belief", crc32fast::hash(key.as_bytes()));
         let path = cache_folder()?.join("emberwatch/beliefs").join(name);
         (n_value_bytes(dim) <= MAX_BYTES).then_some(Self { path, key, dim })
@@ -51,19 +60,19 @@ impl KeptBelief {
     }
 
     /// Keeps the belief for later runs; the oldest go where there are too many.
-    pub fn write(&self, belief: &Belief) {
+    ///
+    /// # Errors
+    /// If the system does not let it write there.
+    pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
         let mut bytes = self.key.clone().into_bytes();
         let values = belief.probabilities().iter();
         bytes.extend(values.flat_map(|value| value.to_le_bytes()));
         bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
         let folder = self.path.parent().unwrap_or(Path::new("/"));
-        let written = std::fs::create_dir_all(folder)
-            .map_err(anyhow::Error::from)
-            .and_then(|()| replace_file(&self.path, &bytes, Readers::Owner));
-        match written {
-            Ok(()) => remove_oldest(folder, MAX_FILES),
-            Err(error) => tracing::debug!("the first belief is not kept: {error:#}"),
-        }
+        std::fs::create_dir_all(folder)?;
+        replace(&self.path, &bytes)?;
+        remove_oldest(folder, MAX_FILES);
+        Ok(())
     }
 
     fn n_bytes(&self) -> usize {
@@ -83,6 +92,26 @@ fn cache_folder() -> Option<PathBuf> {
     folder("XDG_CACHE_HOME")
         .filter(is_absolute)
         .or_else(|| of_home().filter(is_absolute))
+}
+
+/// Writes a file of the user alone beside the path and renames it; a checksum in it finds what a crash leaves.
+fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let beside = path.with_extension(std::process::id().to_string());
+    // What an earlier process of this number left may have other readers.
+    let _ = std::fs::remove_file(&beside);
+    let opened = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(&beside);
+    let written = opened
+        .and_then(|mut file| file.write_all(bytes))
+        .and_then(|()| std::fs::rename(&beside, path));
+    if written.is_err() {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&beside);
+    }
+    written
 }
 
 fn remove_oldest(folder: &Path, most: usize) {
@@ -109,9 +138,14 @@ mod tests {
 
     #[test]
     fn a_belief_of_the_most_bytes_is_kept_and_none_above() {
-        let is_kept = |dim| KeptBelief::new("a key".into(), dim).is_some();
+        // It has four states.
+        let model = Model::built_in("road-ice").expect("built in");
+        let is_kept = |width| {
+            let shape = Shape::new(512, width).expect("test shape");
+            KeptBelief::new(Prior::Initial, &model, shape, 0).is_some()
+        };
         assert!(cache_folder().is_some(), "expected HOME");
-        assert_eq!([(4, 512, 512), (4, 512, 513)].map(is_kept), [true, false]);
+        assert_eq!([512, 513].map(is_kept), [true, false]);
     }
 
     #[test]

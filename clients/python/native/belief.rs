@@ -1,0 +1,209 @@
+//! Beliefs in double precision: Bayes' rule, `Phi`, and the first belief. Their shape is `[S, n, H, W]`: the
+//! states of n worlds.
+
+use crate::detached::detached;
+use crate::model::{model_of, shape_of};
+use crate::refusal::{failed, invalid};
+use emberwatch_belief::estimation::bayes::correct_cells;
+use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_protocol::model::{Model, ModelError};
+use emberwatch_protocol::{Shape, UNOBSERVED, transition};
+use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
+use numpy::{
+    IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
+};
+use pyo3::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// How often a long computation looks for Ctrl-C.
+const LOOK: Duration = Duration::from_millis(2);
+
+/// The operator `Phi` of one model on one grid, with its work space.
+#[pyclass(module = "emberwatch._native")]
+pub struct Transition {
+    /// The model file's text.
+    model: String,
+    shape: Shape,
+    /// Or the error that `apply` raises: that eq. 3 could divide by zero.
+    operator: Result<transition::Transition<f64>, ModelError>,
+    belief: Array3<f64>,
+    predictor: Array3<f64>,
+}
+
+#[pymethods]
+impl Transition {
+    #[new]
+    fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
+        let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
+        let none = Array3::zeros((parameters.n_states(), height, width));
+        Ok(Self {
+            operator: transition::Transition::new(&parameters, shape),
+            belief: none.clone(),
+            predictor: none,
+            model,
+            shape,
+        })
+    }
+
+    /// `Phi` of beliefs, a new array of their shape.
+    fn apply<'py>(
+        &mut self,
+        py: Python<'py>,
+        beliefs: &Bound<'py, PyArray4<f64>>,
+    ) -> PyResult<Bound<'py, PyArray4<f64>>> {
+        let operator = self
+            .operator
+            .as_mut()
+            .map_err(|error| vanishing(py, error))?;
+        let beliefs = beliefs.try_readonly();
+        let expected = "an array that no other thread corrects";
+        let beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, "one in use"))?;
+        let beliefs = beliefs.as_array();
+        let (n_states, height, width) = self.belief.dim();
+        let (_, n_worlds, _, _) = beliefs.dim();
+        if beliefs.dim() != (n_states, n_worlds, height, width) {
+            let expected = format!("shape ({n_states}, n, {height}, {width})");
+            return Err(invalid(
+                py,
+                "belief",
+                expected,
+                format!("{:?}", beliefs.dim()),
+            ));
+        }
+        let mut out = Array4::zeros(beliefs.dim());
+        let (belief, predictor) = (&mut self.belief, &mut self.predictor);
+        detached(py, beliefs.len(), || {
+            let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
+            for (world, mut next) in worlds {
+                belief.assign(&world);
+                operator.apply(belief, predictor);
+                next.assign(predictor);
+            }
+        });
+        Ok(out.into_pyarray(py))
+    }
+
+    /// What copies and pickles are made from.
+    fn __getnewargs__(&self) -> (&str, usize, usize) {
+        (&self.model, self.shape.height(), self.shape.width())
+    }
+}
+
+fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
+    match error {
+        ModelError::ZeroWeight { cell, .. } => {
+            let subject = format!("model: transition weights of cell {cell}");
+            let got = "weights that can all be 0";
+            invalid(
+                py,
+                subject,
+                "a positive sum whatever its neighbourhood",
+                got,
+            )
+        }
+        other => invalid(py, "model", "weights that keep their precision", other),
+    }
+}
+
+/// Bayes' rule (eq. 5) in place on the cells that frames `[n, H, W]` show; `likelihood` is `P(y | x)`, `[S, O]`.
+#[pyfunction]
+pub fn correct<'py>(
+    py: Python<'py>,
+    beliefs: &Bound<'py, PyArray4<f64>>,
+    likelihood: PyReadonlyArray2<'py, f64>,
+    frames: PyReadonlyArray3<'py, u8>,
+) -> PyResult<()> {
+    let beliefs = beliefs.try_readwrite();
+    let expected = "an array to write to, which no other thread uses";
+    let got = "one that is read-only or in use";
+    let mut beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, got))?;
+    let (likelihood, frames) = (likelihood.as_array(), frames.as_array());
+    let (n_worlds, height, width) = frames.dim();
+    let expected = (likelihood.nrows(), n_worlds, height, width);
+    let got = beliefs.as_array().dim();
+    if got != expected || got.0 == 0 {
+        let (expected, got) = (format!("shape {expected:?}"), format!("{got:?}"));
+        return Err(invalid(py, "belief", expected, got));
+    }
+    let likelihood = likelihood.to_owned();
+    let values = detached(py, frames.len(), || shown(frames));
+    let cell = |index: usize| {
+        let (row, col) = (index / width % height, index % width);
+        format!("frame: cell ({row}, {col})")
+    };
+    let n_observations = likelihood.ncols();
+    if let Some((index, value)) = values.iter().find(|it| usize::from(it.1) >= n_observations) {
+        let expected = format!("a value below {n_observations}, or {UNOBSERVED}");
+        return Err(invalid(py, cell(*index), expected, value));
+    }
+    let probabilities = beliefs.as_slice_mut()?;
+    let corrected = detached(py, frames.len(), || {
+        correct_cells(probabilities, &likelihood, || values.iter().copied())
+    });
+    corrected.map_err(|impossible| {
+        let (subject, belief) = (cell(impossible.index), impossible.belief);
+        let expected = format!("expected an observation that the belief {belief:?} allows");
+        let problem = format!("{subject}: {expected}, got {}", impossible.observed);
+        failed(py, &problem, "impossible_frame")
+    })
+}
+
+/// Index and value of the observed cells.
+fn shown(frames: ArrayView3<'_, u8>) -> Vec<(usize, u8)> {
+    let values = frames.iter().copied().enumerate();
+    values.filter(|&(_, value)| value != UNOBSERVED).collect()
+}
+
+/// How often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.
+#[pyfunction]
+pub fn simulated_prior<'py>(
+    py: Python<'py>,
+    model: &str,
+    height: usize,
+    width: usize,
+    burn_in: u64,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
+    let n_worlds = Prior::N_WORLDS;
+    let prior = Prior::Simulated { n_worlds, burn_in };
+    let kept = KeptBelief::new(prior, &model, shape, 0);
+    let belief = match kept.as_ref().and_then(KeptBelief::read) {
+        Some(belief) => belief,
+        None => {
+            let belief = simulated(py, prior, &model, shape)?;
+            // Else it is simulated again.
+            let _ = kept.map(|kept| kept.write(&belief));
+            belief
+        }
+    };
+    Ok(belief.probabilities().to_pyarray(py))
+}
+
+/// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
+fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let cancelled = AtomicBool::new(false);
+    let pool = rayon::ThreadPoolBuilder::new().build();
+    let pool = pool.map_err(|error| failed(py, &format!("start threads: {error}"), "program"))?;
+    let simulated = std::thread::scope(|scope| {
+        let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
+        let worker = scope.spawn(work);
+        while !worker.is_finished() {
+            py.detach(|| std::thread::sleep(LOOK));
+            if let Err(interrupt) = py.check_signals() {
+                cancelled.store(true, Ordering::Relaxed);
+                return Err(interrupt);
+            }
+        }
+        Ok(worker.join())
+    })?;
+    match simulated {
+        Ok(Ok(Some(belief))) => Ok(belief),
+        Ok(Err(error)) => Err(vanishing(py, &error)),
+        Ok(Ok(None)) | Err(_) => Err(failed(
+            py,
+            "the first belief could not be simulated",
+            "program",
+        )),
+    }
+}

@@ -1,0 +1,150 @@
+//! Connections: to a server, and to an agent that serves decisions.
+
+use crate::errors::{raise, raise_of_channel};
+use crate::owned::Owned;
+use emberwatch_protocol::Decider;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::connection::{Connection, ConnectionError};
+use emberwatch_protocol::message::{StepReply, StepRequest};
+use numpy::PyArray1;
+use pyo3::prelude::*;
+use std::time::Duration;
+
+/// How long the server worked on a step, and what it answered: results of the worlds, of the robots, frames.
+pub type Answer<'py> = (u64, Bound<'py, PyArray1<u8>>);
+
+/// A connection to a server. Threads may share it: they take turns.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Server {
+    pub wire: Owned<Connection>,
+    /// What the server said of itself, as JSON.
+    #[pyo3(get)]
+    info: String,
+    pub team: u32,
+    pub n_moves: usize,
+}
+
+/// A connection to an agent that serves decisions.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Agent {
+    wire: Owned<Decider>,
+    /// What the agent said of itself, as JSON.
+    #[pyo3(get)]
+    info: String,
+}
+
+#[pymethods]
+impl Server {
+    #[new]
+    fn new(py: Python<'_>, instance: &str, client: &str, seconds: f64) -> PyResult<Self> {
+        let name = checked(py, instance)?;
+        let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
+        let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
+        let info = wire.info();
+        Ok(Self {
+            info: serde_json::to_string(info).expect("invariant: replies serialise"),
+            team: info.n_robots.max(1),
+            n_moves: info.n_moves,
+            wire: Owned::new(instance, wire),
+        })
+    }
+
+    /// Sends JSON text, `what` in errors; returns that of the answer.
+    fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
+        let answer = self
+            .wire
+            .with(py, |wire| wire.control_text(text, duration(seconds)))?;
+        decoded(answer).map_err(|error| raise(py, error, what, seconds))
+    }
+
+    /// Sends a request on `step` as it is.
+    #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        operation: u32,
+        lease: u64,
+        first_robot: u32,
+        n_robots: u32,
+        n_moves: u32,
+        flags: u32,
+        body: &[u8],
+        seconds: f64,
+    ) -> PyResult<Answer<'py>> {
+        let request = StepRequest {
+            operation,
+            lease,
+            first_robot,
+            n_robots,
+            n_moves,
+            flags,
+            ..StepRequest::default()
+        };
+        let step = |wire: &mut Connection| wire.step_payload(request, body, duration(seconds));
+        let answer = self.wire.with(py, step)?;
+        answered(py, answer, seconds)
+    }
+
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.wire.close(py)
+    }
+}
+
+#[pymethods]
+impl Agent {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        instance: &str,
+        world: u32,
+        client: &str,
+        seconds: f64,
+    ) -> PyResult<Self> {
+        let name = checked(py, instance)?;
+        let wire = py.detach(|| Decider::open(&name, world, client, duration(seconds)));
+        let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
+        Ok(Self {
+            info: serde_json::to_string(wire.info()).expect("invariant: replies serialise"),
+            wire: Owned::new(instance, wire),
+        })
+    }
+
+    /// Sends JSON text, `what` in errors; returns that of the answer.
+    fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
+        let answer = self
+            .wire
+            .with(py, |wire| wire.ask(text, duration(seconds)))?;
+        decoded(answer).map_err(|error| raise(py, error, what, seconds))
+    }
+
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.wire.close(py)
+    }
+}
+
+/// What Python gets of an answer.
+pub fn answered(
+    py: Python<'_>,
+    answer: Result<(StepReply, Vec<u8>), ConnectionError>,
+    seconds: f64,
+) -> PyResult<Answer<'_>> {
+    let (reply, payload) = answer.map_err(|error| raise(py, error, "a step", seconds))?;
+    Ok((reply.simulation_nanos, PyArray1::from_vec(py, payload)))
+}
+
+/// Checks an instance's name.
+pub fn checked(py: Python<'_>, instance: &str) -> PyResult<Instance> {
+    Instance::new(instance).map_err(|error| raise_of_channel(py, error))
+}
+
+/// A timeout; "not a number" has passed at once.
+pub fn duration(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.clamp(0.0, 1e9)).unwrap_or_default()
+}
+
+fn decoded(answer: Result<Vec<u8>, ConnectionError>) -> Result<String, ConnectionError> {
+    String::from_utf8(answer?).map_err(|error| ConnectionError::Garbled {
+        what: "a control request",
+        problem: format!("expected JSON, got {error}"),
+    })
+}

@@ -1,0 +1,83 @@
+//! From errors of the wire to those of Python, which `emberwatch/errors.py` defines; and Ctrl-C.
+
+use emberwatch_protocol::channels::ChannelError;
+use emberwatch_protocol::connection::ConnectionError;
+use pyo3::call::PyCallArgs;
+use pyo3::exceptions::PyKeyboardInterrupt;
+use pyo3::prelude::*;
+use std::cell::RefCell;
+
+thread_local! {
+    /// What a signal's handler raised during a wait of this thread.
+    static RAISED: RefCell<Option<PyErr>> = const { RefCell::new(None) };
+}
+
+/// Runs Python's signal handlers; returns whether one raised.
+pub fn interrupted() -> bool {
+    // Python runs them on its main thread only, and others may be kept waiting for the interpreter.
+    let is_main = rustix::thread::gettid() == rustix::process::getpid();
+    is_main
+        && Python::attach(|py| match py.check_signals() {
+            Ok(()) => false,
+            Err(error) => {
+                RAISED.set(Some(error));
+                true
+            }
+        })
+}
+
+/// An error of the class of this name in `emberwatch/errors.py`, or made by its function.
+pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) -> PyErr {
+    let module = py.import("emberwatch.errors");
+    let made = module.and_then(|module| module.getattr(name)?.call1(arguments));
+    made.map_or_else(|error| error, PyErr::from_value)
+}
+
+/// The error of a request, `what`, that was waited for so many seconds.
+pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
+    match problem {
+        ConnectionError::Channel(problem) => raise_of_channel(py, problem),
+        ConnectionError::ServerGone { who, instance } => {
+            let text = format!("the {who} on instance '{instance}' is gone");
+            error(py, "ServerGoneError", (text,))
+        }
+        ConnectionError::Timeout { instance, .. } => {
+            let within = format!("instance '{instance}' within {seconds:?} s");
+            let text = format!("no answer to {what} from {within}");
+            error(py, "RequestTimeoutError", (text,))
+        }
+        ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        } => error(py, "refusal", (status as u32, detail, message)),
+        other => error(py, "EmberwatchError", (other.to_string(), "bad_answer")),
+    }
+}
+
+/// The error of a channel that could not be opened or used.
+pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
+    let text = problem.to_string();
+    match problem {
+        ChannelError::Interrupted => RAISED
+            .take()
+            .unwrap_or_else(|| PyKeyboardInterrupt::new_err(())),
+        ChannelError::InstanceName(name) => {
+            let expected = "1 to 64 characters out of A-Z a-z 0-9 - _";
+            error(py, "invalid", ("instance", expected, format!("'{name}'")))
+        }
+        ChannelError::NoServer { instance } => {
+            let remedy = format!("start one with `emberwatch-server --instance {instance}`");
+            let text = format!("no server on instance '{instance}': {remedy}");
+            error(py, "NoServerError", (text,))
+        }
+        ChannelError::NoAgent { .. } => error(py, "NoServerError", (text,)),
+        ChannelError::OtherVersion { version } => {
+            error(py, "EmberwatchError", (text, "version_mismatch", version))
+        }
+        ChannelError::OtherPidNamespace { .. } => {
+            error(py, "EmberwatchError", (text, "pid_namespace"))
+        }
+        _ => error(py, "EmberwatchError", (text, "channel")),
+    }
+}

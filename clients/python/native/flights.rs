@@ -1,0 +1,217 @@
+//! Paths flown move by move by many robots, in rows: where they are, what they have visited.
+
+use crate::detached::detached;
+use crate::model::shape_of;
+use crate::refusal::invalid;
+use emberwatch_protocol::path::{MAX_MOVES, Move};
+use emberwatch_protocol::{Cell, Shape};
+use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
+use numpy::{
+    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArray3,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyType;
+
+type Arguments = (usize, usize, usize, usize, Option<Vec<f64>>);
+
+/// The present path of each robot, as far as it is flown.
+#[pyclass(module = "emberwatch._native")]
+pub struct Flights {
+    shape: Shape,
+    n_moves: usize,
+    /// What each hidden state pays when its cell is first visited; `None`: nothing.
+    reward: Option<Vec<f64>>,
+    cells: Vec<Cell>,
+    n_made: Vec<usize>,
+    visited: Vec<u8>,
+    states: Vec<u8>,
+    moves: Vec<u8>,
+    paid: Vec<f64>,
+}
+
+#[pymethods]
+impl Flights {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        n_rows: usize,
+        height: usize,
+        width: usize,
+        n_moves: usize,
+        reward: Option<Vec<f64>>,
+    ) -> PyResult<Self> {
+        let shape = shape_of(py, height, width)?;
+        if !(1..=MAX_MOVES).contains(&n_moves) {
+            let expected = format!("an integer within 1 to {MAX_MOVES}");
+            return Err(invalid(py, "n_moves", expected, n_moves));
+        }
+        Ok(Self {
+            shape,
+            n_moves,
+            reward,
+            cells: vec![Cell { row: 0, col: 0 }; n_rows],
+            n_made: vec![0; n_rows],
+            visited: vec![0; n_rows * shape.n_cells()],
+            states: vec![0; n_rows * shape.n_cells()],
+            moves: vec![0; n_rows * n_moves],
+            paid: vec![0.0; n_rows],
+        })
+    }
+
+    /// A copy has no paths.
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, Arguments) {
+        let this = slf.borrow();
+        let (height, width) = this.shape.dim();
+        let reward = this.reward.clone();
+        let arguments = (this.cells.len(), height, width, this.n_moves, reward);
+        (slf.get_type(), arguments)
+    }
+
+    /// Row and column of each robot.
+    #[getter]
+    fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i64>>> {
+        let cells = self.cells.iter();
+        let flat = cells.flat_map(|cell| [cell.row as i64, cell.col as i64]);
+        PyArray1::from_iter(py, flat).reshape([self.cells.len(), 2])
+    }
+
+    /// Number of moves made.
+    #[getter]
+    fn n_made<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
+        PyArray1::from_iter(py, self.n_made.iter().map(|&n| n as i64))
+    }
+
+    /// 255 in the cells visited, else 0.
+    #[getter]
+    fn visited<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        let (height, width) = self.shape.dim();
+        let visited = detached(py, self.visited.len(), || self.visited.clone());
+        PyArray1::from_vec(py, visited).reshape([self.cells.len(), height, width])
+    }
+
+    /// What the moves have been paid.
+    #[getter]
+    fn paid<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, &self.paid)
+    }
+
+    /// Begins some paths; `robots` and hidden `states` are those of all rows.
+    fn begin(
+        &mut self,
+        py: Python<'_>,
+        begun: PyReadonlyArray1<'_, bool>,
+        robots: PyReadonlyArray2<'_, i64>,
+        states: Option<PyReadonlyArray3<'_, u8>>,
+    ) -> PyResult<()> {
+        let (begun, robots) = (begun.as_array(), robots.as_array());
+        let (height, width) = self.shape.dim();
+        let states = states.as_ref().map(|states| states.as_array());
+        let dim = (self.cells.len(), height, width);
+        if let Some(got) = states.map(|it| it.dim()).filter(|&got| got != dim) {
+            let (expected, got) = (format!("shape {dim:?}"), format!("{got:?}"));
+            return Err(invalid(py, "states", expected, got));
+        }
+        if begun.len() != self.cells.len() || robots.dim() != (self.cells.len(), 2) {
+            return Err(PyValueError::new_err("begin: expected one of each row"));
+        }
+        for row in (0..begun.len()).filter(|&row| begun[row]) {
+            let cell = [robots[[row, 0]], robots[[row, 1]]].map(|at| usize::try_from(at).ok());
+            let cell = match cell {
+                [Some(row), Some(col)] if row < height && col < width => Cell { row, col },
+                _ => return Err(PyValueError::new_err("begin: expected robots on the grid")),
+            };
+            self.cells[row] = cell;
+            self.n_made[row] = 0;
+            self.paid[row] = 0.0;
+        }
+        detached(py, self.visited.len(), || self.enter(begun, states));
+        Ok(())
+    }
+
+    /// Of which rows the next move is the last of its path.
+    fn completes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
+        PyArray1::from_iter(py, self.n_made.iter().map(|n| n + 1 == self.n_moves))
+    }
+
+    /// The paths that these moves would complete.
+    fn paths<'py>(
+        &self,
+        py: Python<'py>,
+        actions: PyReadonlyArray1<'_, u8>,
+    ) -> PyResult<Bound<'py, PyArray2<u8>>> {
+        let actions = actions.as_array();
+        if actions.len() != self.cells.len() {
+            return Err(PyValueError::new_err("paths: expected one of each row"));
+        }
+        let mut paths = self.moves.clone();
+        let last = paths
+            .iter_mut()
+            .skip(self.n_moves - 1)
+            .step_by(self.n_moves);
+        last.zip(actions).for_each(|(last, &action)| *last = action);
+        PyArray1::from_vec(py, paths).reshape([self.cells.len(), self.n_moves])
+    }
+
+    /// The moves made by one robot.
+    fn made<'py>(&self, py: Python<'py>, row: usize) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let n_rows = self.cells.len();
+        let expected = || invalid(py, "row", format!("one below {n_rows}"), row);
+        let n_made = *self.n_made.get(row).ok_or_else(expected)?;
+        let made = &self.moves[row * self.n_moves..][..n_made];
+        Ok(PyArray1::from_slice(py, made))
+    }
+
+    /// One move of the rows `moved`, below 4; returns what it pays each row.
+    fn r#move<'py>(
+        &mut self,
+        py: Python<'py>,
+        moved: PyReadonlyArray1<'_, bool>,
+        actions: PyReadonlyArray1<'_, u8>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (moved, actions) = (moved.as_array(), actions.as_array());
+        if moved.len() != self.cells.len() || actions.len() != self.cells.len() {
+            return Err(PyValueError::new_err("move: expected one of each row"));
+        }
+        let is_over = |(&moves, &n_made): (&bool, &usize)| moves && n_made >= self.n_moves;
+        if moved.iter().zip(&self.n_made).any(is_over) {
+            return Err(PyValueError::new_err("move: expected a path that goes on"));
+        }
+        let rows = moved.iter().zip(actions).enumerate();
+        let paid =
+            rows.map(|(row, (&moves, &action))| if moves { self.fly(row, action) } else { 0.0 });
+        let paid: Vec<f64> = paid.collect();
+        Ok(PyArray1::from_vec(py, paid))
+    }
+}
+
+impl Flights {
+    /// Forgets what was visited, and keeps the hidden states, of the rows `begun`.
+    fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
+        let n_cells = self.shape.n_cells();
+        for row in (0..begun.len()).filter(|&row| begun[row]) {
+            let cells = row * n_cells..(row + 1) * n_cells;
+            self.visited[cells.clone()].fill(0);
+            if let Some(states) = states {
+                let own = states.index_axis_move(Axis(0), row);
+                let kept = self.states[cells].iter_mut();
+                kept.zip(own).for_each(|(kept, &state)| *kept = state);
+            }
+        }
+    }
+
+    fn fly(&mut self, row: usize, action: u8) -> f64 {
+        self.moves[row * self.n_moves + self.n_made[row]] = action;
+        self.n_made[row] += 1;
+        let cell = Move::from_low_bits(action.into()).apply(self.cells[row], self.shape);
+        self.cells[row] = cell;
+        let at = row * self.shape.n_cells() + self.shape.index(cell);
+        let is_new = std::mem::replace(&mut self.visited[at], 255) == 0;
+        let reward = self.reward.as_ref().filter(|_| is_new);
+        let paid = reward.and_then(|reward| reward.get(usize::from(self.states[at])));
+        let paid = paid.copied().unwrap_or_default();
+        self.paid[row] += paid;
+        paid
+    }
+}

@@ -1,0 +1,147 @@
+//! The figures of merit of some worlds' runs.
+
+use crate::model::shape_of;
+use crate::refusal::invalid;
+use emberwatch_belief::merit::{self, Found};
+use emberwatch_protocol::path::Flight;
+use emberwatch_protocol::{Cell, Shape};
+use numpy::ndarray::{ArrayView1, ArrayView2, ArrayView3, Axis};
+use numpy::{PyReadonlyArray1, PyReadonlyArray3};
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+
+/// The fields of Python's `Merit`.
+type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
+
+/// The figures of some worlds while they go on, together.
+#[pyclass(module = "emberwatch._native")]
+pub struct MeritTally {
+    shape: Shape,
+    worlds: Vec<merit::MeritTally>,
+}
+
+#[pymethods]
+impl MeritTally {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        n_worlds: usize,
+        height: usize,
+        width: usize,
+        target: u8,
+        recent_steps: u32,
+    ) -> PyResult<Self> {
+        let shape = shape_of(py, height, width)?;
+        let tally = merit::MeritTally::new(shape, target, recent_steps);
+        Ok(Self {
+            shape,
+            worlds: vec![tally; n_worlds],
+        })
+    }
+
+    /// One step of all worlds; see `MeritTally.update` of Python.
+    fn update(
+        &mut self,
+        py: Python<'_>,
+        visited: PyReadonlyArray3<'_, bool>,
+        robots: PyReadonlyArray3<'_, i64>,
+        n_hits: PyReadonlyArray1<'_, u32>,
+        n_burning: PyReadonlyArray1<'_, u32>,
+        states: Option<PyReadonlyArray3<'_, u8>>,
+    ) -> PyResult<()> {
+        let (visited, robots) = (visited.as_array(), robots.as_array());
+        let (n_hits, n_burning) = (n_hits.as_array(), n_burning.as_array());
+        let states = states.as_ref().map(|states| states.as_array());
+        self.check(py, visited, robots, [n_hits, n_burning], states)?;
+        for (world, tally) in self.worlds.iter_mut().enumerate() {
+            let visited = visited.index_axis(Axis(0), world);
+            let robots = robots.index_axis(Axis(0), world);
+            let found = Found {
+                n_hits: n_hits[world],
+                n_burning: n_burning[world],
+            };
+            let states = states.map(|states| states.index_axis_move(Axis(0), world));
+            let states = states.map(|states| states.as_standard_layout().into_owned());
+            tally.update(&flights(visited, robots), found, states.as_ref());
+        }
+        Ok(())
+    }
+
+    /// The figures of one world's steps so far.
+    fn merit(&self, world: usize) -> PyResult<Figures> {
+        let tally = self.worlds.get(world);
+        let tally = tally.ok_or_else(|| PyIndexError::new_err("no such world"))?;
+        let got = tally.merit();
+        Ok((
+            got.steps_to_detection,
+            got.burning_cells_at_detection,
+            got.burning_seen_share,
+            got.front_distance,
+            got.grid_seen_share,
+        ))
+    }
+}
+
+impl MeritTally {
+    /// Refuses arrays that do not fit each other, and robots off the grid.
+    fn check(
+        &self,
+        py: Python<'_>,
+        visited: ArrayView3<'_, bool>,
+        robots: ArrayView3<'_, i64>,
+        counts: [ArrayView1<'_, u32>; 2],
+        states: Option<ArrayView3<'_, u8>>,
+    ) -> PyResult<()> {
+        let (height, width) = self.shape.dim();
+        let grids = (self.worlds.len(), height, width);
+        let fits = |name, got: (usize, usize, usize)| {
+            if got == grids {
+                return Ok(());
+            }
+            let (expected, got) = (format!("shape {grids:?}"), format!("{got:?}"));
+            Err(invalid(py, name, expected, got))
+        };
+        fits("visited", visited.dim())?;
+        fits("states", states.map_or(grids, |states| states.dim()))?;
+        if counts.iter().any(|counts| counts.len() != grids.0) {
+            let expected = format!("one of each of {} worlds", grids.0);
+            return Err(invalid(py, "n_hits, n_burning", expected, "others"));
+        }
+        let (n_worlds, n_robots, n_axes) = robots.dim();
+        if n_worlds != grids.0 || n_robots == 0 || n_axes != 2 {
+            let expected = format!("shape ({}, R, 2)", grids.0);
+            return Err(invalid(
+                py,
+                "robots",
+                expected,
+                format!("{:?}", robots.dim()),
+            ));
+        }
+        let is_on_grid = |cell: ArrayView1<'_, i64>| {
+            (0..height as i64).contains(&cell[0]) && (0..width as i64).contains(&cell[1])
+        };
+        match robots.rows().into_iter().find(|cell| !is_on_grid(*cell)) {
+            None => Ok(()),
+            Some(cell) => Err(invalid(
+                py,
+                "robots",
+                format!("cells of a {} grid", self.shape),
+                cell,
+            )),
+        }
+    }
+}
+
+/// Where each robot ended; the first has visited all cells, which count for all of them together.
+fn flights(visited: ArrayView2<'_, bool>, robots: ArrayView2<'_, i64>) -> Vec<Flight> {
+    let cells = visited.iter().enumerate().filter(|(_, visited)| **visited);
+    let mut all: Vec<usize> = cells.map(|(index, _)| index).collect();
+    let end = |robot: ArrayView1<'_, i64>| Flight {
+        visited: std::mem::take(&mut all),
+        end: Cell {
+            row: robot[0] as usize,
+            col: robot[1] as usize,
+        },
+    };
+    robots.rows().into_iter().map(end).collect()
+}

@@ -1,0 +1,55 @@
+//! Moves that a caller hands in: arrays of integers, which become bytes.
+
+use emberwatch_protocol::path::check_moves;
+use numpy::{Element, PyArray1, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
+use pyo3::PyTypeInfo;
+use pyo3::prelude::*;
+
+/// Checks paths of `n_moves` moves for `n_robots` robots. Others than plain arrays of usual integers, and wrong ones,
+/// go to `emberwatch/arguments.py`, which says what is wrong.
+pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyResult<Vec<u8>> {
+    let expected = (n_robots, n_moves);
+    let fast = read::<i64>(given, expected, |value| {
+        u8::try_from(value).unwrap_or(u8::MAX)
+    });
+    let fast = fast.or_else(|| read::<u8>(given, expected, |value| value));
+    if let Some(moves) = fast.filter(|moves| check_moves(moves).is_ok()) {
+        return Ok(moves);
+    }
+    let module = given.py().import("emberwatch.arguments")?;
+    let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
+    Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
+}
+
+/// Integers below `n_choices`, one for each row, as bytes; `None` if they are no plain array of that.
+#[pyfunction]
+pub fn choices<'py>(
+    given: &Bound<'py, PyAny>,
+    n_rows: usize,
+    n_choices: u8,
+) -> Option<Bound<'py, PyArray1<u8>>> {
+    let is_plain = given
+        .cast::<PyUntypedArray>()
+        .is_ok_and(|it| it.ndim() == 1);
+    let byte = |value| u8::try_from(value).unwrap_or(u8::MAX);
+    let chosen = is_plain.then(|| read::<i64>(given, (1, n_rows), byte));
+    let chosen = chosen?.filter(|chosen| chosen.iter().all(|&choice| choice < n_choices))?;
+    Some(PyArray1::from_vec(given.py(), chosen))
+}
+
+fn read<T: Element + Copy>(
+    given: &Bound<'_, PyAny>,
+    (n_robots, n_moves): (usize, usize),
+    byte: impl Fn(T) -> u8,
+) -> Option<Vec<u8>> {
+    // Not of a subclass, which may mask values.
+    let is_plain = given.get_type().is(PyUntypedArray::type_object(given.py()));
+    let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
+    let array = array?.ok()?;
+    let shape = array.shape();
+    let fits = shape == [n_robots, n_moves] || n_robots == 1 && shape == [n_moves];
+    fits.then(|| match array.as_slice() {
+        Ok(moves) => moves.iter().map(|&value| byte(value)).collect(),
+        Err(_) => array.as_array().iter().map(|&value| byte(value)).collect(),
+    })
+}

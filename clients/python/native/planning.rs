@@ -1,0 +1,88 @@
+//! Beam search in many worlds.
+
+use crate::errors::{interrupted, raise_of_channel};
+use crate::model::shape_of;
+use crate::refusal::invalid;
+use emberwatch_belief::planning::objective::CellValues;
+use emberwatch_belief::planning::{BeamSearch, PlanningProblem};
+use emberwatch_protocol::channels::ChannelError;
+use emberwatch_protocol::path::{MAX_MOVES, path_to_bytes};
+use emberwatch_protocol::{Cell, Shape};
+use numpy::ndarray::{Array2, ArrayView1};
+use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use pyo3::prelude::*;
+use std::time::{Duration, Instant};
+
+/// Widest beam.
+const MAX_WIDTH: usize = 1 << 16;
+
+/// Most memory of a beam, bytes.
+const MAX_BYTES: usize = 1 << 32;
+
+/// How often a search looks for Ctrl-C.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// A path for each world: `values` are finite, `[n, H, W]`, `robots` cells of the grid, `[n, 2]`; `keys`, `[n]`, break
+/// ties.
+#[pyfunction]
+pub fn beam_search<'py>(
+    py: Python<'py>,
+    values: PyReadonlyArray3<'py, f32>,
+    robots: PyReadonlyArray2<'py, i64>,
+    keys: PyReadonlyArray1<'py, u64>,
+    n_moves: usize,
+    width: usize,
+) -> PyResult<Bound<'py, PyArray2<u8>>> {
+    let (values, robots, keys) = (values.as_array(), robots.as_array(), keys.as_array());
+    let (n_worlds, height, n_cols) = values.dim();
+    check(py, shape_of(py, height, n_cols)?, n_moves, width)?;
+    let mut paths = Array2::zeros((n_worlds, n_moves));
+    // More states than there are beginnings of paths are never kept.
+    let n_paths = 4_usize.saturating_pow(n_moves as u32);
+    let mut search = BeamSearch::new(width.min(n_paths));
+    let mut looked = Instant::now();
+    let mut stops = || {
+        let looks = looked.elapsed() >= LOOK;
+        if looks {
+            looked = Instant::now();
+        }
+        looks && interrupted()
+    };
+    let worlds = values.outer_iter().zip(robots.outer_iter()).zip(keys);
+    for (((values, robot), &key), mut path) in worlds.zip(paths.outer_iter_mut()) {
+        search.set_key(key);
+        let values = CellValues::new(values.to_owned(), 0.0);
+        let start = Cell {
+            row: robot[0] as usize,
+            col: robot[1] as usize,
+        };
+        let problem = PlanningProblem {
+            start,
+            n_moves,
+            values: &values,
+            seed: 0,
+            step: 0,
+        };
+        let plan = py.detach(|| search.plan_unless(&problem, &mut stops));
+        let plan = plan.ok_or_else(|| raise_of_channel(py, ChannelError::Interrupted))?;
+        path.assign(&ArrayView1::from(&path_to_bytes(&plan.moves)));
+    }
+    Ok(paths.into_pyarray(py))
+}
+
+/// Refuses what takes more memory than there may be.
+fn check(py: Python<'_>, shape: Shape, n_moves: usize, width: usize) -> PyResult<()> {
+    let within = |most: usize| format!("an integer within 1 to {most}");
+    if !(1..=MAX_MOVES).contains(&n_moves) {
+        return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
+    }
+    let reach = |side: usize| side.min(2 * n_moves + 1);
+    let n_cells = reach(shape.height()) * reach(shape.width());
+    // Two sets of cells, and where the state after each move came from.
+    let state_bytes = n_cells.div_ceil(64) * 16 + n_moves * 8;
+    let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
+    if !(1..=widest).contains(&width) {
+        return Err(invalid(py, "width", within(widest), width));
+    }
+    Ok(())
+}

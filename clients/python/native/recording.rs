@@ -1,0 +1,82 @@
+//! Reads recordings, record by record.
+
+use crate::errors::error;
+use crate::refusal::invalid;
+use crate::samples::{frame, truth};
+use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError};
+use pyo3::prelude::*;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+
+/// What is known of a record: nanoseconds, its kind, and JSON or the fields of a sample.
+type Item<'py> = (u64, &'static str, Bound<'py, PyAny>);
+
+/// An open recording.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Recording {
+    name: String,
+    reader: Mutex<Reader<BufReader<File>>>,
+}
+
+#[pymethods]
+impl Recording {
+    #[new]
+    fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
+        let name = path.display().to_string();
+        // Opening a FIFO waits for its writer, and no signal ends that.
+        if !py.detach(|| std::fs::metadata(&path))?.is_file() {
+            return Err(invalid(py, "recording", "a regular file", name));
+        }
+        let reader = py.detach(|| Reader::new(BufReader::new(File::open(path)?)));
+        let reader = reader.map_err(|problem| raise(py, &name, problem))?;
+        Ok(Self {
+            name,
+            reader: Mutex::new(reader),
+        })
+    }
+
+    /// The next record; `None` at the end.
+    fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<Item<'py>>> {
+        let record = py.detach(|| {
+            let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
+            reader.next()
+        });
+        let record = record.transpose();
+        let record = record.map_err(|problem| raise(py, &self.name, problem))?;
+        record.map(|record| item(py, record)).transpose()
+    }
+}
+
+fn item(py: Python<'_>, record: Record) -> PyResult<Item<'_>> {
+    let n_lost = record.n_lost.into();
+    let invariant = "invariant: the reader checks samples";
+    let (kind, value) = match record.event {
+        Event::Server(info) => {
+            let info = serde_json::to_string(&info).expect("invariant: replies serialise");
+            ("server", info.into_pyobject(py)?.into_any())
+        }
+        Event::Frame(sample) => {
+            let fields = frame(py, &sample, n_lost).expect(invariant);
+            ("frame", fields.into_pyobject(py)?.into_any())
+        }
+        Event::Truth(sample) => {
+            let fields = truth(py, &sample, n_lost).expect(invariant);
+            ("truth", fields.into_pyobject(py)?.into_any())
+        }
+    };
+    Ok((record.nanos, kind, value))
+}
+
+/// The error of a file that is no recording, or ends with a `problem`: then its code is "cut" or "damaged".
+fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
+    let text = format!("{name}: {problem}");
+    let code = match problem {
+        RecordingError::Io(error) => return error.into(),
+        RecordingError::Cut { .. } => "cut",
+        RecordingError::Damaged { .. } => "damaged",
+        _ => "recording",
+    };
+    error(py, "EmberwatchError", (text, code))
+}

@@ -1,0 +1,220 @@
+"""The part of the package that is written in Rust.
+
+Waits leave the interpreter to other threads; Ctrl-C ends them. What is open belongs to the process
+that made it: in a forked child, using it is an error with code `"forked"`.
+"""
+
+from os import PathLike
+from typing import Any, Literal, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_Doubles = NDArray[np.float64]
+
+class Server:
+    """A connection to a server. Threads may share it: they take turns."""
+
+    def __init__(self, instance: str, client: str, seconds: float) -> None:
+        """Opens it; `client` names this program in the server's log."""
+
+    @property
+    def info(self) -> str:
+        """What the server said of itself, as JSON."""
+
+    def control(self, text: bytes, what: str, seconds: float) -> str:
+        """Sends JSON, `what` in errors; returns the JSON of the answer."""
+
+    def step(
+        self,
+        operation: int,
+        lease: int,
+        first_robot: int,
+        n_robots: int,
+        n_moves: int,
+        flags: int,
+        body: bytes,
+        seconds: float,
+    ) -> tuple[int, NDArray[np.uint8]]:
+        """Sends a request on `step` as it is.
+
+        Returns:
+            How long the server worked on it, nanoseconds, and the answer's payload.
+        """
+
+    def close(self) -> None:
+        """Closes it. May be called again."""
+
+class Agent:
+    """A connection to the agent whose first world is `world`, which serves decisions."""
+
+    def __init__(self, instance: str, world: int, client: str, seconds: float) -> None: ...
+    @property
+    def info(self) -> str:
+        """What the agent said of itself, as JSON."""
+
+    def control(self, text: bytes, what: str, seconds: float) -> str:
+        """As `Server.control`."""
+
+    def close(self) -> None:
+        """Closes it. May be called again."""
+
+class Flights:
+    """The present path of each robot, as far as it is flown. Rows are robots.
+
+    With `reward`, each cell pays when it is first visited, what its hidden state pays. A copy or
+    pickle is as new.
+    """
+
+    def __init__(
+        self, n_rows: int, height: int, width: int, n_moves: int, reward: list[float] | None
+    ) -> None: ...
+    @property
+    def robots(self) -> NDArray[np.int64]:
+        """Row and column of each robot; a new array, as the others."""
+
+    @property
+    def n_made(self) -> NDArray[np.int64]:
+        """Number of moves made."""
+
+    @property
+    def visited(self) -> NDArray[np.uint8]:
+        """255 in the cells visited, else 0."""
+
+    @property
+    def paid(self) -> NDArray[np.float64]:
+        """What the moves have been paid."""
+
+    def begin(
+        self,
+        begun: NDArray[np.bool_],
+        robots: NDArray[np.int64],
+        states: NDArray[np.uint8] | None,
+    ) -> None:
+        """Begins some paths; `robots` and hidden `states` are those of all rows."""
+
+    def completes(self) -> NDArray[np.bool_]:
+        """Of which rows the next move is the last of its path."""
+
+    def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The paths that these actions would complete, `(n_rows, T)`."""
+
+    def made(self, row: int) -> NDArray[np.uint8]:
+        """The moves made by one robot."""
+
+    def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """One move of some robots; returns what it pays each row."""
+
+class Lease:
+    """The right to fly consecutive robots, and the step k of each of their worlds."""
+
+    def __init__(self, server: Server, number: int, first_robot: int, n_robots: int) -> None: ...
+    def step(
+        self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
+    ) -> tuple[int, NDArray[np.uint8]]:
+        """Flies a path with each robot, for the next step of its world."""
+
+    def observe(
+        self, first_robot: int, n_robots: int, flags: int, seconds: float
+    ) -> tuple[int, NDArray[np.uint8]]:
+        """The last results and frames again; steps go on from there."""
+
+    def note(self, world: int, step: int) -> None:
+        """From here on a world is at this step."""
+
+    @property
+    def steps(self) -> list[int]:
+        """The step of each world."""
+
+class Frames:
+    """Reads `Frame`s, of one world or of all."""
+
+    def __init__(self, instance: str, world: int | None = None) -> None: ...
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """The fields of the next sample; None if none comes in time."""
+
+    def close(self) -> None:
+        """Closes it. May be called again."""
+
+class Truths:
+    """Reads `Truth`s, of one world or of all."""
+
+    def __init__(self, instance: str, world: int | None = None) -> None: ...
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """The fields of the next sample; None if none comes in time."""
+
+    def close(self) -> None:
+        """Closes it. May be called again."""
+
+class Outlooks:
+    """Reads `Outlook`s, of one world or of all."""
+
+    def __init__(self, instance: str, world: int | None = None) -> None: ...
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """The fields of the next sample; None if none comes in time."""
+
+    def close(self) -> None:
+        """Closes it. May be called again."""
+
+class Recording:
+    """Reads a recording."""
+
+    def __init__(self, path: str | bytes | PathLike[str]) -> None:
+        """Raises an error with code "cut" or "damaged" where all before is whole."""
+
+    def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
+        """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
+
+def read_model(text: str) -> dict[str, Any]:
+    """The fields of `Model` but `toml`; raises `ValueError` for what is no model file."""
+
+def read_description(text: str) -> dict[str, Any]:
+    """The same of `Description`."""
+
+@final
+class Transition:
+    """``Phi`` for a model file's text on one grid; it keeps work space."""
+
+    def __new__(cls, model: str, height: int, width: int) -> Transition: ...
+    def apply(self, beliefs: _Doubles) -> _Doubles:
+        """Of `(S, n, H, W)`, a new array."""
+
+    def __getnewargs__(self) -> tuple[str, int, int]: ...
+
+def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
+    """Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
+
+def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
+    """How often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
+
+def beam_search(
+    values: NDArray[np.float32],
+    robots: NDArray[np.int64],
+    keys: NDArray[np.uint64],
+    n_moves: int,
+    width: int,
+) -> NDArray[np.uint8]:
+    """A path for each world: `(n, H, W)`, `(n, 2)` and `(n,)` give `(n, n_moves)`."""
+
+@final
+class MeritTally:
+    """The figures of merit of some worlds while they go on."""
+
+    def __new__(
+        cls, n_worlds: int, height: int, width: int, target: int, recent_steps: int
+    ) -> MeritTally: ...
+    def update(
+        self,
+        visited: NDArray[np.bool_],
+        robots: NDArray[np.int64],
+        n_hits: NDArray[np.uint32],
+        n_burning: NDArray[np.uint32],
+        states: NDArray[np.uint8] | None,
+    ) -> None:
+        """One step: `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
+
+    def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
+        """The fields of `Merit`."""
+
+def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
+    """Integers below `n_choices`, as bytes; None if it is no plain array of one for each row."""

@@ -1,0 +1,72 @@
+"""A model's mathematics in NumPy as the paper has it: what the tests compare the filter with."""
+
+import tomllib
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Parameters(NamedTuple):
+    """What a model file says."""
+
+    #: ``w[own, to, from, row, col]``; one kernel, or one by the cell's own state.
+    kernels: Array
+    bias: Array
+    #: ``P(observed value | state)``, a row for each state.
+    observed: Array
+    initial: Array
+
+
+def parameters(text: str) -> Parameters:
+    """Reads a model file."""
+    file: dict[str, Any] = tomllib.loads(text)
+    states, entries = file["states"], file["kernel"]
+    names = [state["name"] for state in states]
+    n_kernels = len(names) if any("own" in entry for entry in entries) else 1
+    kernels = np.zeros((n_kernels, len(names), len(names), *file["kernel_size"]))
+    for entry in entries:
+        own = names.index(entry["own"]) if "own" in entry else 0
+        weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
+        kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
+    observed = np.array([state["observed_as"] for state in states], float)
+    initial = np.array([state["initial"] for state in states], float)
+    return Parameters(
+        kernels,
+        np.array([state.get("bias", 0.0) for state in states]),
+        observed / observed.sum(axis=1, keepdims=True),
+        initial / initial.sum(),
+    )
+
+
+def phi(model: Parameters, belief: Array) -> Array:
+    """Eqs. 2-4; where the kernel is by the cell's own state, the mean over its belief."""
+    if len(model.kernels) == 1:
+        return _phi_of(model.kernels[0], model.bias, belief)
+    parts = (_phi_of(w, model.bias, belief, own) for own, w in enumerate(model.kernels))
+    return np.sum([belief[own] * part for own, part in enumerate(parts)], axis=0)
+
+
+def _phi_of(kernel: Array, bias: Array, belief: Array, own: int | None = None) -> Array:
+    n_states, height, width = belief.shape
+    above, left = kernel.shape[2] // 2, kernel.shape[3] // 2
+    padded = np.pad(belief, ((0, 0), (above, above), (left, left)))
+    weights = np.tile(bias[:, np.newaxis, np.newaxis], (1, height, width))
+    for row, col in np.ndindex(kernel.shape[2:]):
+        neighbour = padded[:, row : row + height, col : col + width]
+        if own is not None and (row, col) == (above, left):
+            neighbour = np.zeros_like(belief)
+            neighbour[own] = 1.0
+        weights += np.einsum("mn,nij->mij", kernel[:, :, row, col], neighbour)
+    return weights / weights.sum(axis=0)
+
+
+def bayes(model: Parameters, belief: Array, frame: NDArray[np.uint8]) -> Array:
+    """Eq. 5 in the cells that were observed; 255 stands for none."""
+    posterior = belief.copy()
+    for row, col in np.argwhere(frame != 255):
+        joint = model.observed[:, frame[row, col]] * belief[:, row, col]
+        posterior[:, row, col] = joint / joint.sum()
+    return posterior

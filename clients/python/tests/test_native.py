@@ -1,0 +1,203 @@
+"""What the Rust part is handed: refusals instead of panics, Ctrl-C, and threads beside it."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from failures import fails, refuses
+from processes import LONG, asleep, eventually, script, server
+
+from emberwatch import _native, errors, recording
+from emberwatch.belief import Transition, initial_prior
+from emberwatch.model import Model
+from emberwatch.planning import beam_search
+from emberwatch.prior import simulated_prior
+
+WILDFIRE = Model.wildfire()
+SEARCH: dict[str, Any] = {"values": np.zeros((1, 2, 2)), "robots": np.zeros((1, 2), int)}
+
+#: One world whose search takes minutes, and a Ctrl-C in the middle.
+WIDE = """
+import signal
+import numpy as np
+from emberwatch.planning import beam_search
+values = np.random.default_rng(1).random((1, 9, 9))
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+signal.setitimer(signal.ITIMER_REAL, 0.5)
+beam_search(values, np.zeros((1, 2), int), 4096, rng=np.random.default_rng(1), width=65536)
+"""
+
+
+@pytest.mark.parametrize("n_moves", [4097, 10**18, 10**19, 10**30])
+def test_a_path_has_at_most_4096_moves(n_moves: int) -> None:
+    expected = f"n_moves: expected an integer within 1 to 4096, got {n_moves}"
+    with refuses(expected):
+        beam_search(**SEARCH, n_moves=n_moves, rng=np.random.default_rng(1))
+    if n_moves < 2**64:
+        values, robots = SEARCH["values"].astype(np.float32), SEARCH["robots"]
+        with refuses(expected):
+            _native.beam_search(values, robots, np.zeros(1, np.uint64), n_moves, 1)
+
+
+@pytest.mark.parametrize("width", [65537, 10**30])
+def test_a_beam_has_at_most_65536_paths(width: int) -> None:
+    with refuses(f"width: expected an integer within 1 to 65536, got {width}"):
+        beam_search(**SEARCH, n_moves=1, width=width, rng=np.random.default_rng(1))
+
+
+def test_a_beam_that_needs_too_much_memory_is_refused() -> None:
+    large = {"values": np.zeros((1, 4096, 4096)), "robots": np.zeros((1, 2), int)}
+    with refuses("width: expected an integer within 1 to 1016, got 65536"):
+        beam_search(**large, n_moves=4096, width=65536, rng=np.random.default_rng(1))
+
+
+def test_a_grid_that_is_too_large_is_refused() -> None:
+    values, robots = np.zeros((1, 1, 5000)), np.zeros((1, 2), int)
+    with refuses("grid: expected height and width within 1 to 4096, got 1 x 5000"):
+        beam_search(values, robots, 1, rng=np.random.default_rng(1))
+
+
+def test_ctrl_c_ends_the_search_in_one_world() -> None:
+    code, _, error = script(WIDE).end()
+    assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
+
+
+def test_what_is_no_regular_file_is_no_recording(tmp_path: Path) -> None:
+    os.mkfifo(fifo := tmp_path / "fifo")
+    for path in (fifo, tmp_path):
+        with fails("recording", match=f"expected a regular file, got {path}"):
+            next(recording.read(path))
+
+
+def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    started.stop()
+    steps = threading.Thread(target=lambda: lease.step([3] * 6, timeout=LONG))
+    steps.start()
+    asleep(steps)
+
+    def interrupt() -> None:
+        asleep()
+        os.kill(os.getpid(), signal.SIGINT)
+        asleep()
+        started.wake_up()  # Else nothing ends a close that is not interrupted.
+
+    thread = threading.Thread(target=interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        thread.start()
+        client.close()
+    thread.join()
+    steps.join()
+    assert client.status().pid == started.program.pid
+    client.close()
+    with fails("closed"):
+        client.status()
+
+
+def test_phi_of_single_precision_is_that_of_double() -> None:
+    prior = simulated_prior(WILDFIRE, height=5, width=7, burn_in=40)
+    assert prior.dtype == np.float32
+    transition = Transition(WILDFIRE, height=5, width=7)
+    assert (transition.apply(prior) == transition.apply(prior.astype(np.float64))).all()
+
+
+def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
+    likelihood, frames = WILDFIRE.observation_matrix, np.zeros((1, 2, 2), np.uint8)
+    beliefs = np.full((3, 1, 2, 2), 1 / 3)
+    with refuses(r"belief: expected shape \(0, 1, 2, 2\)"):
+        _native.correct(beliefs[:0], likelihood[:0], frames)
+    frozen = beliefs.copy()
+    frozen.flags.writeable = False
+    with refuses("belief: expected an array to write to"):
+        _native.correct(frozen, likelihood, frames)
+    beliefs[0, 0, 1, 0] = np.nan
+    with fails("impossible_frame", match=r"cell \(1, 0\): .* the belief \[NaN"):
+        _native.correct(beliefs, likelihood, frames)
+    assert beliefs[0, 0, 0, 0] == 1 / 3
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        ({"height": 0}, "height: expected an integer within 1 to 4096, got 0"),
+        ({"width": 10**30}, "width: expected an integer within 1 to 4096, got 10"),
+        ({"burn_in": -3}, "burn_in: expected an integer within 0 to .*, got -3"),
+        ({"burn_in": 2**64}, "burn_in: expected an integer within 0 to"),
+    ],
+    ids=str,
+)
+def test_a_prior_of_no_world_is_refused(wrong: dict[str, int], expected: str) -> None:
+    right = {"height": 2, "width": 2, "burn_in": 0}
+    with refuses(expected):
+        simulated_prior(WILDFIRE, **right | wrong)
+
+
+@pytest.mark.parametrize("height", [0, 4097])
+def test_phi_of_no_grid_is_refused(height: int) -> None:
+    with refuses(f"grid: expected height and width within 1 to 4096, got {height} x 3"):
+        Transition(WILDFIRE, height=height, width=3)
+
+
+def test_other_threads_run_beside_work_on_large_grids() -> None:
+    prior = initial_prior(WILDFIRE, height=600, width=600)
+    beliefs, frames = np.repeat(prior[:, np.newaxis], 2, axis=1), np.zeros((2, 600, 600), np.uint8)
+    phi = _native.Transition(WILDFIRE.toml, 600, 600)
+    meets(lambda: phi.apply(beliefs), RuntimeError, "borrowed")
+    correct = partial(_native.correct, beliefs, WILDFIRE.observation_matrix, frames)
+    meets(correct, errors.InvalidArgumentError, "in use")
+
+
+def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None:
+    """Two threads do the same work, until one is refused while the other is in the midst of it."""
+    refused = threading.Event()
+
+    def is_refused() -> bool:
+        try:
+            work()
+        except kind as error:
+            assert words in str(error)
+            refused.set()
+        return refused.is_set()
+
+    thread = threading.Thread(target=lambda: eventually(is_refused))
+    thread.start()
+    assert eventually(is_refused)
+    thread.join()
+
+
+def test_flights_refuse_rows_and_states_of_others() -> None:
+    def flights(n_moves: int = 4) -> _native.Flights:
+        return _native.Flights(2, 3, 5, n_moves, [1.0])
+
+    for n_moves in (0, 4097):
+        with refuses(f"n_moves: expected an integer within 1 to 4096, got {n_moves}"):
+            flights(n_moves)
+    with refuses("grid: expected height and width"):
+        _native.Flights(2, 0, 5, 4, None)
+    with refuses("row: expected one below 2, got 2"):
+        flights().made(2)
+    with pytest.raises(ValueError, match="paths: expected one of each row"):
+        flights().paths(np.zeros(1, np.uint8))
+    begun, robots = np.ones(2, np.bool_), np.zeros((2, 2), np.int64)
+    for shape in ((1, 3, 5), (2, 3, 4)):
+        with refuses(r"states: expected shape \(2, 3, 5\), got"):
+            flights().begin(begun, robots, np.zeros(shape, np.uint8))
+
+
+def test_a_lease_flies_no_robots_of_others() -> None:
+    started = server(worlds=4)
+    lease = started.connect().acquire(1, 2)
+    for first, n_robots in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
+        with refuses("step: expected robots of worlds 1..3"):
+            lease._native.step(np.zeros((n_robots, 6), np.uint8), first, n_robots, 0, 5.0)
+    assert lease.step([[3] * 6] * 2).result().world.step == 1
+    with pytest.raises(errors.EmberwatchError):
+        lease.step([3] * 6, robots=range(0, 1))

@@ -1,0 +1,73 @@
+"""Simulated priors: the agent program's, kept, and no trouble to signals and forks."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from processes import script
+
+from emberwatch.model import Model
+from emberwatch.prior import simulated_prior
+from emberwatch.programs import find
+
+MODEL = Model.wildfire()
+WORLD: dict[str, Any] = {"height": 5, "width": 7, "burn_in": 40}
+
+#: Takes hours.
+ENDLESS = """
+from emberwatch.model import Model
+from emberwatch.prior import simulated_prior
+print("begun", flush=True)
+simulated_prior(Model.wildfire(), height=64, width=64, burn_in=1 << 40)
+"""
+
+
+def test_it_is_that_of_the_agents(tmp_path: Path) -> None:
+    file = tmp_path / "prior.npy"
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in WORLD.items()]
+    command = [find("emberwatch-agent"), "prior", "--model=wildfire", *flags, f"--out={file}"]
+    subprocess.run(command, check=True, capture_output=True)
+    found, expected = simulated_prior(MODEL, **WORLD), np.load(file)
+    assert found.dtype == expected.dtype == np.float32
+    assert np.array_equal(found, expected)
+
+
+def test_it_is_simulated_once() -> None:
+    first = simulated_prior(MODEL, **WORLD)
+    assert simulated_prior(Model.wildfire(), **WORLD) is first
+    with pytest.raises(ValueError, match="read-only"):
+        first[:] = 0
+
+
+def test_later_processes_read_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    simulated_prior.cache_clear()
+    first = simulated_prior(MODEL, **WORLD)
+    (file,) = (tmp_path / "emberwatch/beliefs").iterdir()
+    written = file.stat()
+    simulated_prior.cache_clear()
+    assert np.array_equal(simulated_prior(MODEL, **WORLD), first)
+    assert file.stat().st_mtime_ns == written.st_mtime_ns
+    assert written.st_mode & 0o777 == 0o600
+
+
+def test_control_c_ends_it() -> None:
+    process = script(ENDLESS)
+    assert process.line() == "begun"
+    process.signal(signal.SIGINT)
+    code, _, error = process.end()
+    assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
+
+
+def test_a_forked_child_can_simulate() -> None:
+    simulated_prior(MODEL, **WORLD | {"burn_in": 41})
+    child = os.fork()
+    if not child:
+        signal.alarm(60)
+        found = simulated_prior(MODEL, **WORLD | {"burn_in": 42})
+        os._exit(found.shape != (3, 5, 7))
+    assert os.waitpid(child, 0)[1] == 0

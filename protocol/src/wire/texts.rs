@@ -1,0 +1,147 @@
+//! A client's side of a channel of JSON text: `control`, or the decisions of a world.
+
+use super::channel_files::lives_elsewhere;
+use super::channels::{
+    Channel, ChannelError, ControlService, Instance, Ipc, Services, ipc_error, limited_error,
+    server_node,
+};
+use super::control::Request;
+use super::exchange::{ConnectionError, Exchange, check_answer, check_status, garbled};
+use super::message::{ControlReply, ControlRequest, VERSION};
+use super::process::{WatchedProcess, node_pid, pid_namespace};
+use super::resources::check_room_for_ports;
+use super::wait::Waiter;
+use iceoryx2::node::Node;
+use iceoryx2::port::client::Client;
+use iceoryx2::prelude::AllocationStrategy;
+use serde::Deserialize;
+use std::time::Duration;
+
+/// Length that requests may have before their segment grows, bytes.
+const SLICE: usize = 4096;
+
+const WHAT: &str = "a control request";
+
+/// The port for texts, and what all requests of its connection need.
+pub(super) struct TextPort {
+    client: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    sequence: u64,
+    pub(super) exchange: Exchange,
+}
+
+/// What every refusal says, and every hello.
+#[derive(Deserialize, Default)]
+struct Common {
+    #[serde(default)]
+    detail: u64,
+    message: Option<String>,
+    pid_namespace: Option<u64>,
+}
+
+impl TextPort {
+    /// Makes the port of a service whose server listens on `wake`; it keeps the node, which dies with it.
+    pub(super) fn create(
+        node: Node<Ipc>,
+        instance: &Instance,
+        service: &ControlService,
+        wake: Channel,
+    ) -> Result<Self, ChannelError> {
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let server_process = server_process(service, instance)?;
+        let notifier = services.wake(wake)?.notifier_builder().create();
+        let server = notifier.map_err(ipc_error("create a notifier"))?;
+        let listener = services.listener(Channel::WakeClient)?;
+        let client = service.client_builder().initial_max_slice_len(SLICE);
+        let client = client
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .create()
+            .map_err(limited_error("create a control client", "16 clients"))?;
+        let who = if wake == Channel::WakeServer {
+            "server"
+        } else {
+            "agent"
+        };
+        Ok(Self {
+            client,
+            sequence: 0,
+            exchange: Exchange {
+                who,
+                instance: instance.clone(),
+                server,
+                listener,
+                server_process,
+                waiter: Waiter::default(),
+                node,
+            },
+        })
+    }
+
+    /// Shakes hands; returns what the other side says of itself. `client` names this program in its log.
+    pub(super) fn shake_hands(
+        &mut self,
+        client: &str,
+        timeout: Duration,
+    ) -> Result<Vec<u8>, ConnectionError> {
+        let hello = Request::Hello {
+            protocol: VERSION,
+            client: client.into(),
+        };
+        let hello = serde_json::to_vec(&hello).expect("invariant: requests serialise");
+        let answer = self.ask(&hello, timeout)?;
+        // In another PID namespace, the server's process id names another process or none.
+        let said: Common = serde_json::from_slice(&answer).map_err(|it| garbled("hello", it))?;
+        if said
+            .pid_namespace
+            .is_some_and(|it| pid_namespace() != Some(it))
+        {
+            return Err(self.exchange.instance.elsewhere().into());
+        }
+        Ok(answer)
+    }
+
+    /// Sends a text and returns the text of its answer.
+    pub(super) fn ask(
+        &mut self,
+        text: &[u8],
+        timeout: Duration,
+    ) -> Result<Vec<u8>, ConnectionError> {
+        if text.len() > SLICE {
+            check_room_for_ports(text.len())?; // It will be in a new file.
+        }
+        self.sequence += 1;
+        let (listener_low, listener_high) = self.exchange.listener_id();
+        let header = ControlRequest {
+            version: VERSION,
+            reserved: 0,
+            sequence: self.sequence,
+            listener_low,
+            listener_high,
+        };
+        let copy = |reply: &ControlReply, answer: &[u8]| (*reply, answer.to_vec());
+        let (client, exchange) = (&self.client, &self.exchange);
+        let (reply, answer) = exchange.request(client, header, text, WHAT, timeout, copy)?;
+        check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
+        if reply.status != 0 {
+            let said: Common = serde_json::from_slice(&answer).unwrap_or_default();
+            check_status(WHAT, reply.status, said.detail, said.message)?;
+        }
+        Ok(answer)
+    }
+}
+
+/// The process of a service's server.
+fn server_process(
+    service: &ControlService,
+    instance: &Instance,
+) -> Result<WatchedProcess, ChannelError> {
+    let node = server_node(service).ok_or_else(|| instance.no_server())?;
+    let process = WatchedProcess::open(node_pid(node)).ok();
+    match process.filter(|process| !process.has_ended()) {
+        Some(process) => Ok(process),
+        None if lives_elsewhere(node) => Err(instance.elsewhere()),
+        None => Err(instance.no_server()),
+    }
+}
