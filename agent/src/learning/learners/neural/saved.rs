@@ -3,10 +3,10 @@
 use super::behaviour::Behaviour;
 use super::replay::Replay;
 use crate::estimation::NeuralEstimator;
-use crate::learning::belief::SavedModel;
 use crate::learning::checkpoint::{Contents, check, check_belief, check_counts};
 use crate::learning::learners::base::{Place, place};
 use crate::learning::learners::filter::fit::LearnedModel;
+use crate::learning::learners::filter::model::SavedModel;
 use crate::learning::reward::RewardEstimate;
 use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
