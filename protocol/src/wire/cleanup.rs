@@ -7,7 +7,9 @@
 use super::channel_files::{
     ChannelFiles, Used, any, entries, is_in_the_making, is_writable, metadata, nodes,
 };
-use super::directory::{SHARED_MEMORY, channel_directory, directory_error, node_config};
+use super::directory::{
+    SHARED_MEMORY, channel_directory, directory_error, node_config, not_usable,
+};
 use super::error::ChannelError;
 use super::interrupt::check_interrupt;
 use super::turn::Turn;
@@ -34,7 +36,7 @@ pub fn remove_leftovers() -> Result<usize, ChannelError> {
         return Ok(0);
     }
     let removed = ChannelFiles::of_user().remove_leftovers(&node_config()?);
-    removed.map_err(|error| directory_error(&channel_directory(), error.to_string()))
+    removed.map_err(|error| not_usable(&channel_directory(), error))
 }
 
 /// Removes what dead processes left, and waits for what processes without turns are making: iceoryx2 waits without
@@ -53,7 +55,7 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
     loop {
         remove();
         let unfinished = files.unfinished_segment();
-        let wrong = |error: Error| directory_error(SHARED_MEMORY.as_ref(), error.to_string());
+        let wrong = |error: Error| not_usable(SHARED_MEMORY.as_ref(), error);
         let Some(segment) = unfinished.map_err(wrong)? else {
             return Ok(());
         };

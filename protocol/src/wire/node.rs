@@ -1,7 +1,7 @@
 //! The iceoryx2 node of a process.
 
 use super::cleanup::make_way;
-use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, prefix};
+use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, not_usable, prefix};
 use super::error::{ChannelError, Ipc};
 use super::own_nodes;
 use super::resources::{check_room_for_ports, ipc_error};
@@ -85,8 +85,7 @@ impl<T> Drop for Opened<T> {
 
 /// Checks that shared memory of this prefix belongs to this user, and closes it to all others.
 fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelError> {
-    let entries =
-        std::fs::read_dir(folder).map_err(|error| directory_error(folder, error.to_string()))?;
+    let entries = std::fs::read_dir(folder).map_err(|error| not_usable(folder, error))?;
     for entry in entries.flatten() {
         let name = entry.file_name();
         if !name.as_encoded_bytes().starts_with(prefix.as_bytes()) {

@@ -112,7 +112,7 @@ pub fn limited_error<E: Debug>(
 }
 
 /// Checks that descriptors are left for the ports of a connection.
-fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
+pub(super) fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
     free_descriptors().map_err(|_| ChannelError::NoDescriptors {
         what,
         needed: PORT_DESCRIPTORS,
