@@ -112,12 +112,18 @@ pub fn limited_error<E: Debug>(
 }
 
 /// Checks that descriptors are left for the ports of a connection.
-pub(super) fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
-    free_descriptors().map_err(|_| ChannelError::NoDescriptors {
+fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
+    free_descriptors().map_err(|_| no_descriptors(what))
+}
+
+/// The error of a process that may open no more files.
+pub(super) fn no_descriptors(what: &'static str) -> ChannelError {
+    let limit = getrlimit(Resource::Nofile).current;
+    ChannelError::NoDescriptors {
         what,
         needed: PORT_DESCRIPTORS,
-        limit: (getrlimit(Resource::Nofile).current).map_or("the system".into(), |n| n.to_string()),
-    })
+        limit: limit.map_or("the system".into(), |n| n.to_string()),
+    }
 }
 
 /// Opens as many descriptors as the ports of a connection take, and closes them again.
