@@ -44,7 +44,7 @@ impl Entries {
         let folder = directory.join(format!("nodes/{id}"));
         let monitor = directory.join(format!("nodes/{}{id}.node_monitor", prefix()));
         let mut paths = vec![monitor];
-        let wrong = |error: std::io::Error| directory_error(&folder, error.to_string());
+        let wrong = |error: std::io::Error| not_usable(&folder, error);
         for entry in std::fs::read_dir(&folder).map_err(wrong)? {
             let path = entry.map_err(wrong)?.path();
             if path.extension() == Some("service_tag".as_ref()) {
@@ -160,7 +160,7 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
         _ => {}
     }
     let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
-    let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
+    let found = std::fs::symlink_metadata(bare).map_err(|error| not_usable(path, error))?;
     let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
     if !mine || found.mode() & 0o022 != 0 {
         return Err(wrong(

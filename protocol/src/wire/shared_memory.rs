@@ -2,7 +2,7 @@
 //! process with SIGBUS. So programs give memory to what they may write to, before they do.
 
 use super::channel_files::ChannelFiles;
-use super::directory::directory_error;
+use super::directory::{directory_error, not_usable};
 use super::error::{ChannelError, Ipc};
 use super::resources::{REMEDY, SHARED_MEMORY, check_free, in_words, no_room};
 use iceoryx2::node::Node;
@@ -31,7 +31,7 @@ pub struct MessageMemory {
 /// If there is not enough.
 pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelError> {
     let files = ChannelFiles::of_user();
-    let wrong = |error: std::io::Error| directory_error(&files.root, error.to_string());
+    let wrong = |error: std::io::Error| not_usable(&files.root, error);
     let used = files
         .used(&HashSet::from([node.id().value()]))
         .map_err(wrong)?;
@@ -56,8 +56,7 @@ impl MessageMemory {
     /// If its file is not there.
     pub fn of(port: u128, n_messages: usize, message_bytes: usize) -> Result<Self, ChannelError> {
         let files = ChannelFiles::of_user();
-        let wrong =
-            |error: std::io::Error| directory_error(SHARED_MEMORY.as_ref(), error.to_string());
+        let wrong = |error: std::io::Error| not_usable(SHARED_MEMORY.as_ref(), error);
         // iceoryx2 numbers the files of memory that may grow.
         let ends = [format!("_{port}.data"), format!("_{port}__0.data")];
         let is_of_port = |path: &PathBuf| {
@@ -72,9 +71,7 @@ impl MessageMemory {
         let path =
             path.ok_or_else(|| wrong(std::io::Error::other(format!("no memory of port {port}"))))?;
         let file = open(&path)?;
-        let found = file
-            .metadata()
-            .map_err(|error| directory_error(&path, error.to_string()))?;
+        let found = file.metadata().map_err(|error| not_usable(&path, error))?;
         Ok(Self {
             n_bytes: found.len(),
             path,
@@ -107,15 +104,13 @@ impl MessageMemory {
 
 fn fill_whole(path: &Path) -> Result<(), ChannelError> {
     let file = open(path)?;
-    let found = file
-        .metadata()
-        .map_err(|error| directory_error(path, error.to_string()))?;
+    let found = file.metadata().map_err(|error| not_usable(path, error))?;
     fill(path, &file, found.len())
 }
 
 fn open(path: &Path) -> Result<File, ChannelError> {
     let opened = File::options().write(true).open(path);
-    opened.map_err(|error| directory_error(path, error.to_string()))
+    opened.map_err(|error| not_usable(path, error))
 }
 
 /// Gives memory to the first bytes of a file; what is in them stays.
