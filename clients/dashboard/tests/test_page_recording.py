@@ -1,9 +1,13 @@
 """A recording: it plays, waits, goes fast, ends, and begins again."""
 
+import struct
 import zlib
 
-from emberwatch.recording import FILE_HEADER, RECORD_HEADER
 from running import FAST, eventually
+
+# Of a recording, and of each of its records (PROTOCOL.md).
+FILE_HEADER = struct.Struct("=8sII")
+RECORD_HEADER = struct.Struct("=QIIII")
 
 
 def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
