@@ -138,12 +138,12 @@ fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64
                 col: (col + right).wrapping_sub(cols / 2),
             };
             let is_centre = near == Cell { row, col };
-            weights[to] += match shape.contains(near) {
-                true if is_centre && dimensions.sees_own_state => {
-                    weight * f64::from(u8::from(from == own))
-                }
-                true => weight * belief[from * n_cells + shape.index(near)],
-                false => 0.0,
+            weights[to] += if !shape.contains(near) {
+                0.0
+            } else if is_centre && dimensions.sees_own_state {
+                weight * f64::from(u8::from(from == own))
+            } else {
+                weight * belief[from * n_cells + shape.index(near)]
             };
         }
         let share = if dimensions.sees_own_state {

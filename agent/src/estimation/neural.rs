@@ -16,6 +16,8 @@ pub struct NeuralEstimator {
     network: NeuralBelief,
     /// Whose belief the network corrects.
     filter: Option<Box<dyn Estimator>>,
+    /// What that predicts, `[O, H, W]`.
+    base: Option<Probabilities>,
     sightings: Sightings,
     /// What frames of the present step will show; after a frame, what it showed at visited cells.
     belief: Belief,
@@ -33,10 +35,12 @@ impl NeuralEstimator {
         shape: Shape,
     ) -> Result<Self, NetworkError> {
         let sightings = Sightings::new(shape);
+        let base = filter.as_deref().and_then(predicted_observations);
         Ok(Self {
-            belief: predicted(network, filter.as_deref(), &sightings)?,
+            belief: predicted(network, base.as_ref(), &sightings)?,
             network: network.clone(),
             filter,
+            base,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
             failure: None,
@@ -63,8 +67,9 @@ impl Estimator for NeuralEstimator {
         self.sightings.pass();
         if let Some(filter) = &mut self.filter {
             filter.predict();
+            self.base = predicted_observations(&**filter);
         }
-        match predicted(&self.network, self.filter.as_deref(), &self.sightings) {
+        match predicted(&self.network, self.base.as_ref(), &self.sightings) {
             Ok(belief) => self.belief = belief,
             Err(failure) => self.failure = Some(failure),
         }
@@ -78,8 +83,8 @@ impl Estimator for NeuralEstimator {
         Some(Cow::Borrowed(&self.likelihood))
     }
 
-    fn base(&self) -> Option<&dyn Estimator> {
-        self.filter.as_deref()
+    fn base(&self) -> Option<&Probabilities> {
+        self.base.as_ref()
     }
 
     fn handover(&self) -> Option<&dyn Handover> {
@@ -97,13 +102,13 @@ impl Handover for NeuralEstimator {
         let numbers = numbers.iter().flat_map(|(_, _, numbers)| numbers);
         let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
         let checksum = crc32fast::hash(&bytes);
-        let filter = self.base().and_then(|it| it.handover());
+        let filter = self.filter.as_ref().and_then(|it| it.handover());
         let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
         format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
     }
 
     fn to_bytes(&self) -> Vec<u8> {
-        let filter = self.base().and_then(|it| it.handover());
+        let filter = self.filter.as_ref().and_then(|it| it.handover());
         let filter = filter.map_or(Vec::new(), Handover::to_bytes);
         [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
@@ -127,6 +132,7 @@ impl Handover for NeuralEstimator {
         if !filter.map_or(rest.is_empty(), |filter| filter.restore(rest)) {
             return false;
         }
+        self.base = self.filter.as_deref().and_then(predicted_observations);
         (self.belief, self.sightings, self.failure) = (belief, sightings, None);
         true
     }
@@ -134,17 +140,16 @@ impl Handover for NeuralEstimator {
 
 fn predicted(
     network: &NeuralBelief,
-    filter: Option<&dyn Estimator>,
+    base: Option<&Probabilities>,
     sightings: &Sightings,
 ) -> Result<Belief, NetworkError> {
-    let base = filter.and_then(predicted_observations);
-    let probabilities = network.predict(sightings, base.as_ref())?;
+    let probabilities = network.predict(sightings, base)?;
     let belief = Belief::from_probabilities(probabilities);
     Ok(belief.expect("invariant: a softmax is on the simplex"))
 }
 
 /// What an estimator whose belief is about X_{k+1} expects frames to show, `[O, H, W]`.
-pub fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
+fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
     let likelihood = estimator.likelihood()?;
     Some(observations(estimator.belief(), &likelihood))
 }

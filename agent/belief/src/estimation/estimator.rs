@@ -2,6 +2,7 @@
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
+use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::{Frame, Grid};
 use ndarray::Array2;
 use std::borrow::Cow;
@@ -29,8 +30,8 @@ pub trait Estimator: Send {
         None
     }
 
-    /// The estimator whose belief it begins with in each step, if it corrects another's.
-    fn base(&self) -> Option<&dyn Estimator> {
+    /// Of one that corrects a filter: what that filter predicts the next frame to show in each cell, `[O, H, W]`.
+    fn base(&self) -> Option<&Probabilities> {
         None
     }
 

@@ -11,10 +11,8 @@ pub use self::saved::{NeuralModel, SavedNeural, new_network};
 
 use self::behaviour::Behaviour;
 use self::replay::Replay;
-use self::saved::SavedRun;
+use self::saved::{SavedRun, estimator};
 use crate::config::AgentConfig;
-use crate::estimation::NeuralEstimator;
-use crate::estimation::neural::predicted_observations;
 use crate::learning::checkpoint::{Contents, check};
 use crate::learning::learners::base::{Learner, Worlds, without_truth};
 use crate::learning::learners::filter::fit::LearnedModel;
@@ -28,7 +26,6 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Target;
 use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::grid::Probabilities;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use emberwatch_protocol::{Move, path};
 use std::borrow::Cow;
@@ -111,9 +108,8 @@ impl NeuralLearner {
 
     /// A robot before it takes in what its world shows.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
-        let shape = self.worlds.shape;
-        let filter = self.filter.as_ref().map(|it| it.estimator(true, shape));
-        let estimator = NeuralEstimator::new(&self.network, filter, shape)?;
+        let filter = self.filter.as_deref();
+        let estimator = estimator(&self.network, filter, self.worlds.shape)?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, config) = (self.policy(), &self.config);
         let estimator = Box::new(estimator);
@@ -126,9 +122,8 @@ impl NeuralLearner {
     fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
         let mut rollout = self.rollout_at(observation)?;
         self.replay.begin(robot, self.worlds.shape);
-        let base = predicted_base(&rollout);
-        self.replay
-            .push(robot, &rollout.observation().frame, base.as_ref());
+        let base = rollout.agent.estimator().base();
+        self.replay.push(robot, &rollout.observation().frame, base);
         rollout.correct()?;
         rollout.agent.predict();
         Ok(Run {
@@ -164,15 +159,6 @@ impl NeuralLearner {
         (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
         Ok(())
     }
-}
-
-/// What the filter that an agent's network corrects expects of its next frame.
-fn predicted_base(rollout: &Rollout) -> Option<Probabilities> {
-    rollout
-        .agent
-        .estimator()
-        .base()
-        .and_then(predicted_observations)
 }
 
 impl Run {
@@ -261,19 +247,18 @@ impl Learner for NeuralLearner {
     }
 
     fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
-        let bases = self.runs.iter().map(|run| predicted_base(&run.rollout));
-        let bases: Vec<_> = bases.collect();
         let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let turns = see_all(rollouts, without_truth(observations))?.into_iter();
+        let turns = see_all(rollouts, without_truth(observations))?;
         let mut tick = Tick::default();
         let runs = self.worlds.numbers.clone().zip(&self.runs);
-        for ((robot, run), (turn, base)) in runs.zip(turns.zip(bases)) {
+        for ((robot, run), turn) in runs.zip(turns) {
             let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
             let reward = observation.robot.reward;
             let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &run.path);
             self.reward
                 .add(&met(belief, flight.visited.iter().copied()), reward);
-            self.replay.push(robot, &observation.frame, base.as_ref());
+            let base = run.rollout.agent.estimator().base();
+            self.replay.push(robot, &observation.frame, base);
             tick.reward += reward;
             tick.score += turn.score.unwrap_or_default();
         }

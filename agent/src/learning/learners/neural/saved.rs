@@ -86,9 +86,18 @@ impl NeuralModel {
 
     /// Before the first frame.
     pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator, NetworkError> {
-        let filter = self.filter.as_ref().map(|it| it.estimator(true, shape));
-        NeuralEstimator::new(&self.network, filter, shape)
+        estimator(&self.network, self.filter.as_deref(), shape)
     }
+}
+
+/// Before the first frame; a filter that the network corrects reaches the neighbours of visited cells.
+pub(super) fn estimator(
+    network: &NeuralBelief,
+    filter: Option<&LearnedModel>,
+    shape: Shape,
+) -> Result<NeuralEstimator, NetworkError> {
+    let filter = filter.map(|it| it.estimator(true, shape));
+    NeuralEstimator::new(network, filter, shape)
 }
 
 /// A network whose parameters are still to be read; refuses numbers of observations that no world has.
