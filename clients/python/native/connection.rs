@@ -1,22 +1,28 @@
-//! Connections: to a server, and to an agent that serves decisions.
+//! Connections: to a server or to embedded worlds, and to an agent that serves decisions.
 
+use crate::backend::{Backend, embedded};
 use crate::errors::{raise, raise_of_channel};
 use crate::owned::Owned;
+use crate::samples::{Truth, truth_of};
 use emberwatch_protocol::Decider;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::{Connection, ConnectionError};
-use emberwatch_protocol::message::{StepReply, StepRequest};
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::{StepReply, StepRequest, WorldResult};
+use emberwatch_server::embedded::INSTANCE;
+use emberwatch_server::world::Episode;
 use numpy::PyArray1;
+use numpy::ndarray::Array2;
 use pyo3::prelude::*;
 use std::time::Duration;
 
 /// How long the server worked on a step, and what it answered: results of the worlds, of the robots, frames.
 pub type Answer<'py> = (u64, Bound<'py, PyArray1<u8>>);
 
-/// A connection to a server. Threads may share it: they take turns.
+/// A connection to a server, or worlds in this process. Threads may share it: they take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Server {
-    pub wire: Owned<Connection>,
+    pub backend: Owned<Backend>,
     /// What the server said of itself, as JSON.
     #[pyo3(get)]
     info: String,
@@ -40,20 +46,46 @@ impl Server {
         let name = checked(py, instance)?;
         let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
         let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
-        let info = wire.info();
-        Ok(Self {
-            info: serde_json::to_string(info).expect("invariant: replies serialise"),
-            team: info.n_robots.max(1),
-            n_moves: info.n_moves,
-            wire: Owned::new(instance, wire),
-        })
+        Ok(Self::of(instance, Backend::Server(wire)))
+    }
+
+    /// Worlds in this process, with the flags of `emberwatch-server`.
+    #[staticmethod]
+    #[pyo3(name = "embedded")]
+    fn new_embedded(py: Python<'_>, flags: Vec<String>) -> PyResult<Self> {
+        let worlds = Backend::Embedded(Box::new(embedded(py, flags)?));
+        Ok(Self::of(INSTANCE, worlds))
+    }
+
+    /// Hidden states of consecutive embedded worlds, as the fields of `Truth`; `None` of a server's.
+    fn truths<'py>(
+        &self,
+        py: Python<'py>,
+        first_world: usize,
+        n_worlds: usize,
+    ) -> PyResult<Option<Vec<Truth<'py>>>> {
+        let worlds = first_world..first_world.saturating_add(n_worlds);
+        let copied = self.backend.with(py, |backend| match backend {
+            Backend::Server(_) => None,
+            Backend::Embedded(own) => {
+                let present = worlds.map_while(|world| Some((world, own.episode(world)?)));
+                Some(present.map(copied).collect())
+            }
+        })?;
+        let copied: Option<Vec<_>> = copied;
+        Ok(copied.map(|copied| {
+            let truths = copied.into_iter();
+            truths
+                .map(|(world, result, states)| truth_of(py, world, &result, states))
+                .collect()
+        }))
     }
 
     /// Sends JSON text, `what` in errors; returns that of the answer.
     fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
         let answer = self
-            .wire
-            .with(py, |wire| wire.control_text(text, duration(seconds)))?;
+            .backend
+            .with(py, |backend| backend.control_text(text, duration(seconds)))?;
         decoded(answer).map_err(|error| raise(py, error, what, seconds))
     }
 
@@ -80,14 +112,31 @@ impl Server {
             flags,
             ..StepRequest::default()
         };
-        let step = |wire: &mut Connection| wire.step_payload(request, body, duration(seconds));
-        let answer = self.wire.with(py, step)?;
+        let step = |to: &mut Backend| to.step_payload(request, body, duration(seconds));
+        let answer = self.backend.with(py, step)?;
         answered(py, answer, seconds)
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.wire.close(py)
+        self.backend.close(py)
     }
+}
+
+impl Server {
+    fn of(instance: &str, backend: Backend) -> Self {
+        let info: ServerInfo = backend.info();
+        Self {
+            info: serde_json::to_string(&info).expect("invariant: replies serialise"),
+            team: info.n_robots.max(1),
+            n_moves: info.n_moves,
+            backend: Owned::new(instance, backend),
+        }
+    }
+}
+
+/// A world's present, without the interpreter.
+fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
+    (world, *episode.result(), episode.states().to_owned())
 }
 
 #[pymethods]

@@ -1,9 +1,10 @@
 //! A lease: the right to fly consecutive robots, and the step k for which each world's next path is.
 
+use crate::backend::Backend;
 use crate::connection::{Answer, Server, answered, duration};
 use crate::moves;
 use crate::refusal::invalid;
-use emberwatch_protocol::connection::{Connection, ConnectionError, worlds_of};
+use emberwatch_protocol::connection::{ConnectionError, worlds_of};
 use emberwatch_protocol::message::{Operation, StepReply, StepRequest, WorldResult};
 use emberwatch_protocol::payload::{WORLD_BYTES, write_step_body};
 use pyo3::prelude::*;
@@ -116,16 +117,16 @@ impl Lease {
     ) -> PyResult<Answer<'py>> {
         let server = self.server.get();
         // Within the connection's turn: each thread's path is for a step of its own.
-        let answer = server.wire.with(py, |wire| {
+        let answer = server.backend.with(py, |backend| {
             let worlds = worlds_of(request.first_robot, request.n_robots, server.team);
-            self.exchange(wire, &worlds, request, moves, seconds)
+            self.exchange(backend, &worlds, request, moves, seconds)
         })?;
         answered(py, answer, seconds)
     }
 
     fn exchange(
         &self,
-        wire: &mut Connection,
+        backend: &mut Backend,
         worlds: &Range<u32>,
         request: StepRequest,
         moves: &[u8],
@@ -138,7 +139,7 @@ impl Lease {
             let steps: Vec<u64> = worlds.clone().map(of).collect();
             write_step_body(&steps, moves, &mut body);
         }
-        let (reply, payload) = wire.step_payload(request, &body, duration(seconds))?;
+        let (reply, payload) = backend.step_payload(request, &body, duration(seconds))?;
         for (world, result) in worlds.clone().zip(payload.chunks_exact(WORLD_BYTES)) {
             let result: WorldResult = bytemuck::pod_read_unaligned(result);
             self.note(world, result.step);

@@ -1,5 +1,6 @@
 //! What Python calls of Rust: the module `emberwatch._native`, whose types are in `_native.pyi`.
 
+mod backend;
 mod belief;
 mod connection;
 mod detached;
@@ -54,6 +55,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<recording::Recording>()?;
     module.add_class::<belief::Transition>()?;
     module.add_class::<merit::MeritTally>()?;
+    module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;

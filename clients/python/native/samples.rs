@@ -6,6 +6,7 @@ use emberwatch_protocol::message::{
 };
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::payload::split_frame_payload;
+use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 
@@ -136,6 +137,23 @@ pub fn truth<'py>(
         states: states.map_err(|error| error.to_string())?,
         n_lost,
     })
+}
+
+/// The hidden states of an embedded world.
+pub fn truth_of<'py>(
+    py: Python<'py>,
+    world: usize,
+    result: &WorldResult,
+    states: Array2<u8>,
+) -> Truth<'py> {
+    Truth {
+        world: world as u32,
+        episode: result.episode,
+        step: result.step,
+        seed: result.seed,
+        states: PyArray2::from_owned_array(py, states),
+        n_lost: 0,
+    }
 }
 
 pub fn outlook<'py>(

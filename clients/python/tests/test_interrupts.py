@@ -1,10 +1,11 @@
 """Ctrl-C, and signal handlers that raise, at every moment of a call of an environment."""
 
+import gc
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from types import FrameType
 from typing import Any
 
@@ -106,6 +107,13 @@ def action(env: Any, seed: int) -> Any:
     if agents:
         return {agent: space.sample() for agent, space in agents.items()}
     return env.action_space.sample()
+
+
+@pytest.fixture(autouse=True)
+def no_garbage() -> Generator[None]:
+    """Collects what interrupts left in errors with tracebacks, before another test is blamed."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(params=KINDS)

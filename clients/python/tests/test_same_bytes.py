@@ -139,9 +139,10 @@ def members() -> Outcomes:
         yield at_once(*(functools.partial(env.step, path) for env, path in calls))
 
 
-def lease() -> Outcomes:
+def lease(backend: str = "server") -> Outcomes:
     """The plain client's answers: all robots of three worlds, or one world after the other."""
-    client = server(worlds=3, robots=2, coverage="client", history=5, **FLAGS).connect()
+    flags = {"worlds": 3, "robots": 2, "coverage": "client", "history": 5, **FLAGS}
+    client = server(**flags).connect() if backend == "server" else emberwatch.embed(**flags)
     lease = client.acquire(0, 6)
     lease.reset([1, 2, 3])
     for step, paths in enumerate(actions(4, 6, T)):
@@ -165,23 +166,26 @@ def recorded(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
         yield from vector(name, AutoresetMode.NEXT_STEP, high, *shape, **keywords)
 
 
-def cases() -> dict[str, Callable[[], Outcomes]]:
-    """All of them by name."""
-    path = {"observation": PARTS, "truth": True}
-    moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True}
+def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
+    """All of them by name, those of an agent or of several processes at a server."""
+    path = {"observation": PARTS, "truth": True, **backend}
+    moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True, **backend}
     team_moves = {"observation": MOVES_PARTS, "reward": "marginal", "max_episode_steps": 300}
+    team_moves |= backend
     found: dict[str, Callable[[], Outcomes]] = {
-        "wildfire": functools.partial(single, WILDFIRE, 4, T, render_mode="rgb_array"),
+        "wildfire": functools.partial(single, WILDFIRE, 4, T, render_mode="rgb_array", **backend),
         "wildfire, all parts": functools.partial(single, WILDFIRE, 4, T, **path),
-        "moves": functools.partial(single, MOVES, 4),
+        "moves": functools.partial(single, MOVES, 4, **backend),
         "moves, all parts": functools.partial(single, MOVES, 4, **moves),
         "objective": functools.partial(single, OBJECTIVE, 8),
-        "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True),
+        "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True, **backend),
         "team, moves": functools.partial(team, "move", 4, **team_moves),
         "members": members,
-        "lease": lease,
-        "recorded, paths": functools.partial(recorded, WILDFIRE, 4, T, observation=PARTS[:4]),
-        "recorded, moves": functools.partial(recorded, MOVES, 4, reward="move"),
+        "lease": functools.partial(lease, **backend),
+        "recorded, paths": functools.partial(
+            recorded, WILDFIRE, 4, T, observation=PARTS[:4], **backend
+        ),
+        "recorded, moves": functools.partial(recorded, MOVES, 4, reward="move", **backend),
     }
     for mode in AutoresetMode:
         of_paths = functools.partial(vector, WILDFIRE, mode, 4, T, robots=2, reward="marginal")
@@ -192,6 +196,17 @@ def cases() -> dict[str, Callable[[], Outcomes]]:
             f"objective, {mode.name}": functools.partial(vector, OBJECTIVE, mode, 8, truth=True),
         }
     return found
+
+
+EMBEDDED = cases(backend="embedded")
+
+#: Those of several processes.
+AT_A_SERVER = {"members", *(name for name in EMBEDDED if name.startswith("objective"))}
+
+
+@pytest.mark.parametrize("case", [it for it in EMBEDDED if it not in AT_A_SERVER])
+def test_embedded_worlds_return_the_recorded_bytes(case: str) -> None:
+    assert digests(EMBEDDED[case]()) == json.loads(FILE.read_text())[case]
 
 
 @pytest.mark.parametrize("case", cases())

@@ -2,7 +2,7 @@
 
 use super::state::Server;
 use crate::simulator::PendingFile;
-use crate::snapshot::{Done, FileError, Job};
+use crate::snapshot::Job;
 use crate::world::Episode;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
@@ -34,7 +34,7 @@ impl Server {
         }
         self.simulator.cancel_file(now, &pending);
         let message = "too many files at a time: try again later".into();
-        self.send_reply(&request, &bad_file(message));
+        self.send_reply(&request, &Reply::error(Status::BadFile, 0, message));
     }
 
     pub(super) fn take_resets(&mut self, now: Instant) {
@@ -76,26 +76,10 @@ impl Server {
             let Some((request, pending)) = self.pending_files.remove(&number) else {
                 continue; // Its client gave up.
             };
-            let reply = self.file_reply(now, &pending, outcome);
+            let reply = self.simulator.file_reply(now, &pending, outcome);
             self.send_reply(&request, &reply);
             if let (PendingFile::Restored { worlds, .. }, Status::Ok) = (pending, reply.status()) {
                 self.publish(worlds);
-            }
-        }
-    }
-
-    fn file_reply(
-        &mut self,
-        now: Instant,
-        pending: &PendingFile,
-        outcome: Result<Done, FileError>,
-    ) -> Reply {
-        match outcome {
-            Ok(Done::Loaded(episodes)) => self.simulator.finish_restore(now, pending, episodes),
-            Ok(Done::Saved { path, n_bytes }) => self.simulator.saved(pending, &path, n_bytes),
-            Err(error) => {
-                self.simulator.cancel_file(now, pending);
-                bad_file(error.to_string())
             }
         }
     }
@@ -125,8 +109,4 @@ impl Server {
             is_awaited
         });
     }
-}
-
-fn bad_file(message: String) -> Reply {
-    Reply::error(Status::BadFile, 0, message)
 }

@@ -203,7 +203,7 @@ fn announce(checked: &Checked) {
 fn simulator(checked: Checked) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
     let pool = threads(checked.config.threads)?;
-    let (mut simulator, mut resets) = Simulator::new(checked, pool, token_source())?;
+    let (mut simulator, mut resets) = Simulator::new(checked, pool.into(), token_source())?;
     if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
         tracing::info!(file = %path.display(), "restored");
         let worlds = worlds.into_iter().enumerate();
@@ -220,7 +220,7 @@ fn threads(n_threads: usize) -> Result<ThreadPool> {
 }
 
 /// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.
-fn token_source() -> Box<dyn FnMut() -> u64> {
+fn token_source() -> Box<dyn FnMut() -> u64 + Send> {
     let entropy = RandomState::new();
     let mut key = [0; 32];
     for (index, bytes) in key.chunks_mut(8).enumerate() {

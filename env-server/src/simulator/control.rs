@@ -234,7 +234,8 @@ impl Simulator {
         }
     }
 
-    fn info(&self) -> ServerInfo {
+    /// What a server says of itself.
+    pub fn info(&self) -> ServerInfo {
         let (config, file) = (&self.checked.config, self.checked.model.file());
         let recorded = &self.checked.recorded;
         ServerInfo {

@@ -4,7 +4,7 @@ use super::beliefs::BeliefPart;
 use super::lease::{ClientId, Refusal};
 use super::outcome::{Outcome, PendingFile, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot};
-use crate::snapshot::{Job, NewEpisode, SnapshotError, SnapshotWorld, encode};
+use crate::snapshot::{Done, FileError, Job, NewEpisode, SnapshotError, SnapshotWorld, encode};
 use crate::world::Episode;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -54,8 +54,25 @@ impl Simulator {
         }
     }
 
+    /// The answer to a request that waited for a file.
+    pub fn file_reply(
+        &mut self,
+        now: Instant,
+        pending: &PendingFile,
+        outcome: Result<Done, FileError>,
+    ) -> Reply {
+        match outcome {
+            Ok(Done::Loaded(episodes)) => self.finish_restore(now, pending, episodes),
+            Ok(Done::Saved { path, n_bytes }) => saved(pending, &path, n_bytes),
+            Err(error) => {
+                self.cancel_file(now, pending);
+                Reply::error(Status::BadFile, 0, error.to_string())
+            }
+        }
+    }
+
     /// Replaces the worlds of a client that waits for a file.
-    pub fn finish_restore(
+    fn finish_restore(
         &mut self,
         now: Instant,
         pending: &PendingFile,
@@ -93,18 +110,6 @@ impl Simulator {
     pub fn cancel_file(&mut self, now: Instant, pending: &PendingFile) {
         if let PendingFile::Restored { lease, .. } = pending {
             self.leases.end_wait(now, *lease);
-        }
-    }
-
-    /// The answer to a snapshot that was written, with the worlds as they were then.
-    pub fn saved(&self, pending: &PendingFile, path: &Path, n_bytes: usize) -> Reply {
-        let PendingFile::Saved(worlds) = pending else {
-            return malformed("expected worlds that were saved");
-        };
-        Reply::Snapshot {
-            path: path.display().to_string(),
-            n_bytes: n_bytes as u64,
-            worlds: worlds.clone(),
         }
     }
 
@@ -252,4 +257,16 @@ fn absolute(path: String) -> Result<PathBuf, Reply> {
     Err(malformed(&format!(
         "path: expected an absolute one, got {path:?}"
     )))
+}
+
+/// The answer to a snapshot that was written, with the worlds as they were then.
+fn saved(pending: &PendingFile, path: &Path, n_bytes: usize) -> Reply {
+    let PendingFile::Saved(worlds) = pending else {
+        return malformed("expected worlds that were saved");
+    };
+    Reply::Snapshot {
+        path: path.display().to_string(),
+        n_bytes: n_bytes as u64,
+        worlds: worlds.clone(),
+    }
 }

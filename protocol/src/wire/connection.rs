@@ -6,7 +6,7 @@ use super::channels::{
     Channel, Entries, Instance, Ipc, Services, StepService, create_node, limited_error,
 };
 use super::control::{Reply, Request, ServerInfo};
-use super::exchange::{check_answer, check_status, garbled};
+use super::exchange::{check_answer, garbled};
 use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
 use super::node::Opened;
 use super::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
@@ -19,7 +19,7 @@ use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-pub use super::exchange::ConnectionError;
+pub use super::exchange::{ConnectionError, check_status};
 
 /// The answer to a step: results and frames of consecutive robots, and results of their worlds.
 #[derive(Debug, Clone, PartialEq)]

@@ -178,8 +178,11 @@ fn send<Q: Header, R: Header>(
     }
 }
 
-/// Checks that a status is `Ok`; `message` is the message of the refusal, if it has one.
-pub(super) fn check_status(
+/// Checks that the status of an answer to `what` is `Ok`; `message` is that of the refusal, if it has one.
+///
+/// # Errors
+/// [`ConnectionError::Refused`], or [`ConnectionError::Garbled`] for a status that is unknown.
+pub fn check_status(
     what: &'static str,
     code: u32,
     detail: u64,

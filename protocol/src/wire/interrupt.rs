@@ -11,8 +11,11 @@ pub fn interrupt_when(check: fn() -> bool) {
     CHECK.get_or_init(|| check);
 }
 
-/// Ends a wait that is to be interrupted.
-pub(super) fn check_interrupt() -> Result<(), ChannelError> {
+/// For waits of one's own, which should ask so often.
+///
+/// # Errors
+/// [`ChannelError::Interrupted`], if the wait is to end.
+pub fn check_interrupt() -> Result<(), ChannelError> {
     match CHECK.get() {
         Some(check) if check() => Err(ChannelError::Interrupted),
         _ => Ok(()),

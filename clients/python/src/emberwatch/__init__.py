@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from emberwatch import recording
-from emberwatch.client import Client, connect
+from emberwatch.client import Client, connect, embed
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv, WildfireVectorEnv
 from emberwatch.errors import EmberwatchError
@@ -64,6 +64,7 @@ __all__ = [
     "WorldInfo",
     "WorldResult",
     "connect",
+    "embed",
     "observe",
     "parallel_env",
     "recording",

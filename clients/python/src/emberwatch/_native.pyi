@@ -4,6 +4,7 @@ Waits leave the interpreter to other threads; Ctrl-C ends them. What is open bel
 that made it: in a forked child, using it is an error with code `"forked"`.
 """
 
+from collections.abc import Sequence
 from os import PathLike
 from typing import Any, Literal, final
 
@@ -12,11 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 _Doubles = NDArray[np.float64]
 
+def check_settings(flags: Sequence[str]) -> str:
+    """What a server would run with, given these flags, as TOML."""
+
 class Server:
-    """A connection to a server. Threads may share it: they take turns."""
+    """A connection to a server, or worlds in this process. Threads may share it, in turns."""
 
     def __init__(self, instance: str, client: str, seconds: float) -> None:
         """Opens it; `client` names this program in the server's log."""
+
+    @staticmethod
+    def embedded(flags: Sequence[str]) -> Server:
+        """Worlds in this process, with the flags of `emberwatch-server`."""
+
+    def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
+        """The hidden states of embedded worlds, as the fields of `Truth`; None of a server's."""
 
     @property
     def info(self) -> str:

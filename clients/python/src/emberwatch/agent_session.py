@@ -76,6 +76,8 @@ class AgentSession(Session):
             raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
             raise _no_team()
+        if settings.is_embedded:
+            raise invalid("backend", "'server', which the agent attaches to", repr("embedded"))
         super().__init__(settings, n_worlds)
         if self.spec.n_robots > 1:
             raise _no_team()

@@ -1,7 +1,8 @@
 """What callers hand in: seeds, choices, moves, each checked before anything is sent."""
 
 import operator
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 from os import PathLike, fspath
 from typing import Any, SupportsIndex, TypeVar, cast
@@ -13,6 +14,11 @@ from emberwatch import _native, wire
 from emberwatch.errors import invalid
 
 _Value = TypeVar("_Value")
+
+
+def check_settings(flags: Sequence[str]) -> dict[str, Any]:
+    """What a server would run with, given these flags; a refusal is in its words."""
+    return tomllib.loads(_native.check_settings(flags))
 
 
 def as_seed(seed: object) -> int:

@@ -9,10 +9,10 @@ import os
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final, TypeVar
 
-from emberwatch import wire
+from emberwatch import _native, wire
 from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
 from emberwatch.lease import Lease
@@ -38,7 +38,10 @@ _RETRY: Final = 0.2
 
 
 class Client(ServerConnection):
-    """A connection to one server. Make it with `connect`; close it, or use it in a `with`."""
+    """A connection to one server, made with `connect`, or to worlds in this process, with `embed`.
+
+    Close it, or use it in a `with`.
+    """
 
     def acquire(
         self,
@@ -168,6 +171,31 @@ def connect(
             `"channel"`, also when there are too many clients.
     """
     return connect_with_retry(wait, lambda: Client(instance, timeout=timeout))
+
+
+def embed(**settings: str | float | bool | os.PathLike[str]) -> Client:
+    """Worlds inside this process, with all that a `Client` can do, and without a server.
+
+    Nobody else can watch them or fly in them, and they end with the client. Wherever a server's
+    results would depend on seeds and actions alone, theirs are the same bytes.
+
+    Args:
+        settings: Those of `emberwatch-server --help`, with underscores, such as `worlds=4`,
+            `task="small"`, `seed=7`; not `instance`, nor the server's own snapshots.
+
+    Raises:
+        InvalidArgumentError: If a setting is unknown or wrong.
+    """
+    given = {name.replace("_", "-"): value for name, value in settings.items()}
+    return embed_flags(
+        f"--{name}={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in given.items()
+    )
+
+
+def embed_flags(flags: Iterable[str]) -> Client:
+    """As `embed`, with the flags of a server."""
+    return Client("embedded", embedded=_native.Server.embedded(list(flags)))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

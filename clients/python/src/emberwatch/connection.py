@@ -55,8 +55,15 @@ class Connection(Closable):
 class ServerConnection(Connection):
     """A connection to a server, which also steps worlds."""
 
-    def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
-        super().__init__(instance, _native.Server(instance, CLIENT, timeout))
+    def __init__(
+        self,
+        instance: str = "default",
+        *,
+        timeout: float = STEP_TIMEOUT,
+        embedded: _native.Server | None = None,
+    ) -> None:
+        """Connects; `embedded` are worlds in this process, in the place of a server."""
+        super().__init__(instance, embedded or _native.Server(instance, CLIENT, timeout))
         self.info: Final = record(ServerInfo, decoded("answer to 'hello'", self._native.info))
         self.shape: Final = self.info.shape
 
@@ -91,6 +98,10 @@ class ServerConnection(Connection):
         place = first_robot, n_robots
         nanos, payload = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)
         return StepAnswer(self.shape, *place, flags, nanos, payload)
+
+    def truths(self, worlds: range) -> list[dict[str, Any]]:
+        """The hidden states of embedded worlds, as the fields of `Truth`."""
+        return self._native.truths(worlds.start, len(worlds))
 
     def lease(self, number: int, robots: range) -> _native.Lease:
         """Steps robots under a lease of this number."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_moves
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
-from emberwatch.observations import Observations, Parts, of_row
+from emberwatch.observations import Observations, Parts
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
@@ -97,7 +97,9 @@ class WildfireEnv(WorldEnv):
     All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`:
 
     * `observation`: parts of the observation; `("frame", "robot")` by default.
-    * `instance`: attach to this running server; None: a private one.
+    * `instance`: attach to this running server; None: worlds of its own.
+    * `backend`: where these are, at a private `"server"` (the default) or `"embedded"` in this
+      process, where nobody else can watch them or fly in them; the same bytes either way.
     * `world`: which of its worlds (0).
     * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
     * `reward`: `"share"`, `"team"` or `"marginal"`.
@@ -190,7 +192,7 @@ class WildfireEnv(WorldEnv):
             self._draw()
         cells = np.array([result.robot.cell], np.int64)
         teams = self._teams(self._observations, answer)
-        return of_row(self._observations.all(frames, cells, teams), 0), info
+        return self._observations.one(frames, cells, teams), info
 
 
 class WildfireVectorEnv(WorldVectorEnv):

@@ -36,6 +36,7 @@ class Lease:
         self.ttl: Final = grant.ttl_millis / 1000
         #: The numbers of the robots it covers.
         self.robots: Final = robots
+        self._all = robots.start, len(robots)
         #: The worlds that these robots are in.
         self.worlds: Final = self._worlds_of(robots)
         #: Where these worlds stood when it was given.
@@ -73,9 +74,7 @@ class Lease:
             EmberwatchError: With code `"late"`: the world has moved on without this path, `observe`
                 tells to where. With code `"episode_over"`: reset that world.
         """
-        chosen = self.robots if robots is None else _part("robots", robots, self.robots)
-        flags = full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES
-        place = chosen.start, len(chosen), flags
+        place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
         nanos, payload = self._native.step(paths, *place, timeout)
         return StepAnswer(self.client.shape, *place, nanos, payload)
 
@@ -87,8 +86,7 @@ class Lease:
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
         """The last results and frames of its robots again, or of some; steps go on from there."""
-        chosen = self.robots if robots is None else _part("robots", robots, self.robots)
-        place = chosen.start, len(chosen), wire.TEAM_FRAMES if team else 0
+        place = self._place(robots, team * wire.TEAM_FRAMES)
         nanos, payload = self._native.observe(*place, timeout)
         return StepAnswer(self.client.shape, *place, nanos, payload)
 
@@ -183,6 +181,13 @@ class Lease:
     def _ask(self, operation: str, timeout: float, **keys: Any) -> dict[str, Any]:
         request = {"op": operation, "lease": self.number, **keys}
         return self.client.control(request, timeout=timeout)
+
+    def _place(self, robots: range | None, flags: int) -> tuple[int, int, int]:
+        """The first of some robots or of all, how many, and flags."""
+        if robots is None:
+            return *self._all, flags
+        chosen = _part("robots", robots, self.robots)
+        return chosen.start, len(chosen), flags
 
     def _worlds_of(self, robots: range) -> range:
         n_robots = self.client.info.n_robots

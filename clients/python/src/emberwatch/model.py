@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import _native
+from emberwatch.arguments import check_settings
 from emberwatch.errors import invalid
 from emberwatch.paths import utf8
-from emberwatch.programs import check_settings
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""

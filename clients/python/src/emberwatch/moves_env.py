@@ -15,7 +15,7 @@ from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.flights import flights_of
 from emberwatch.moves import fly
-from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
+from emberwatch.observations import WINDOW, MovesParts, Observations
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
@@ -174,8 +174,7 @@ class WildfireMovesEnv(WorldEnv):
             self._draw()
         # Copies: each move of a path returns the frame again.
         cells = self._flights.robots
-        seen = self._observations.all(answer.frames.copy(), cells, self._seen_teams)
-        return of_row(seen, 0), info
+        return self._observations.one(answer.frames.copy(), cells, self._seen_teams), info
 
     def _draw(self) -> Any:
         made, path = self._flights.made(0), self._path

@@ -126,6 +126,17 @@ class Observations:
         parts = {name: self._part(name, frames, robots, teams) for name in self._names}
         return parts[self._names[0]] if self._is_plain else parts
 
+    def one(
+        self,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None = None,
+    ) -> Any:
+        """The observation of the only row; arguments as of `all`."""
+        if self._is_plain:
+            return self._part(self._names[0], frames, robots, teams)[0]
+        return {name: self._part(name, frames, robots, teams)[0] for name in self._names}
+
     def _part(
         self,
         name: str,

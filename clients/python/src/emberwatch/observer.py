@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emberwatch import _native
 from emberwatch.connection import Closable
-from emberwatch.errors import RequestTimeoutError, invalid
+from emberwatch.errors import EmberwatchError, RequestTimeoutError, invalid
 from emberwatch.wire import RobotResult, WorldResult
 
 #: How long to wait for samples of given steps before they are first asked for again, seconds.
@@ -217,6 +217,26 @@ class Newest(Generic[_Step]):
     def _moment(self, world: int) -> tuple[int, int, int] | None:
         sample = self._samples.get(world)
         return None if sample is None else sample.moment
+
+
+class Present(Closable):
+    """The hidden states of embedded worlds, as `Newest` has those of a server."""
+
+    def __init__(self, read: Callable[[range], list[dict[str, Any]]]) -> None:
+        self._read = read
+
+    def at(
+        self, moments: Sequence[tuple[int, int, int]], _timeout: float, first: int = 0
+    ) -> list[Truth]:
+        """As `Newest.at`."""
+        truths = [Truth(**fields) for fields in self._read(range(first, first + len(moments)))]
+        got = [truth.moment for truth in truths]
+        if got != list(moments):
+            raise EmberwatchError(f"truth: expected worlds at {moments}, got {got}", "late")
+        return truths
+
+    def close(self) -> None:
+        pass
 
 
 def observe(

@@ -6,6 +6,7 @@ from typing import Any
 from gymnasium.envs.registration import EnvSpec
 
 from emberwatch.arguments import as_json
+from emberwatch.lease import Lease
 from emberwatch.model import Model
 from emberwatch.session import Session
 from emberwatch.settings import WorldSpec
@@ -52,6 +53,14 @@ class SessionOwner:
     def instance(self) -> str:
         """The server's instance name, once the environment has been reset."""
         return self._session.instance
+
+    @property
+    def lease(self) -> Lease:
+        """Under which it flies, once it has been reset: for snapshots and forks of its worlds.
+
+        After `lease.restore` or `lease.fork` go on with ``reset(options={"resume": True})``.
+        """
+        return self._session.lease
 
     @property
     def is_open(self) -> bool:

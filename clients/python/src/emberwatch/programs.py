@@ -13,7 +13,6 @@ import sysconfig
 import tempfile
 import threading
 import time
-import tomllib
 import weakref
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
@@ -78,29 +77,6 @@ def unused_instance() -> str:
     return f"python-{os.getpid()}-{next(_numbers)}-{secrets.token_hex(8)}"
 
 
-def check_settings(flags: Sequence[str]) -> dict[str, Any]:
-    """What a server would run with, given these flags; a refusal is in the server's words."""
-    command = [str(find("emberwatch-server")), "--check", *flags]
-    try:
-        done = subprocess.run(
-            command,
-            env=os.environ | {"RUST_LOG": "warn"},
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            stdin=subprocess.DEVNULL,
-            timeout=_START_TIMEOUT,
-        )
-    except OSError as error:
-        raise _not_started(command, error) from None
-    except subprocess.TimeoutExpired:
-        problem = f"emberwatch-server --check did not end within {_START_TIMEOUT} s"
-        raise EmberwatchError(problem, "program") from None
-    if done.returncode != 0:
-        raise InvalidArgumentError(_cleaned(done.stderr))
-    return tomllib.loads(done.stdout)
-
-
 def _not_started(command: Sequence[str], error: OSError) -> EmberwatchError:
     return EmberwatchError(f"start {command[0]}: {error.strerror}", "program")
 
@@ -146,11 +122,11 @@ class Program:
         command = [str(find(name)), *arguments, "--exit-with", str(os.getpid())]
         self._name = name
         self._owner = os.getpid()
-        # For the error if it ends at once. A file, unlike a pipe, never fills up and blocks it.
-        self._output = _nameless_file()
         stop = None
         try:
             with _ctrl_c_later():
+                # For the error if it ends at once. A file, unlike a pipe, never fills up.
+                self._output = _nameless_file()
                 self._process = self._start(command)
                 # For programs that nobody stops, such as that of a forgotten environment.
                 stop = weakref.finalize(self, _stop, self._process, self._output, self._owner)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.client import Client, connect
+from emberwatch.client import Client, connect, embed_flags
 from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
@@ -27,7 +27,7 @@ from emberwatch.errors import (
     invalid,
 )
 from emberwatch.lease import Lease
-from emberwatch.observer import Newest, Truth, TruthReader
+from emberwatch.observer import Newest, Present, Truth, TruthReader
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.wire import StepAnswer, WorldResult
@@ -70,7 +70,7 @@ class Session:
         self._client: Client | None = None
         self._lease: Lease | None = None
         self._program: Program | None = None
-        self._truth: Newest[Truth] | None = None
+        self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
         #: Why there is no next step, such as one that did not finish: worlds may have moved unseen.
         self._unfinished: tuple[str, str] | None = _CLOSED
@@ -89,7 +89,7 @@ class Session:
         n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
         self.n_worlds: Final = n_worlds
         self._worlds: Final = range(settings.world, settings.world + n_worlds)
-        if settings.truth and n_worlds > wire.TRUTH_BUFFER:
+        if settings.truth and not settings.is_embedded and n_worlds > wire.TRUTH_BUFFER:
             raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", n_worlds)
         described = self.spec.described
         if described is not None and not described.reward.any():
@@ -101,7 +101,14 @@ class Session:
 
     @property
     def instance(self) -> str:
+        if self.settings.is_embedded:
+            raise invalid("instance", "backend='server'", "embedded worlds, which have none")
         return self._opened().client.instance
+
+    @property
+    def lease(self) -> Lease:
+        """Under which it flies."""
+        return self._opened()
 
     @property
     def is_open(self) -> bool:
@@ -213,11 +220,12 @@ class Session:
         return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
     def launch(self, seed: int) -> Client:
-        """Starts the private server, with this seed for world 0; `close` stops it."""
+        """Begins worlds of its own, with this seed for world 0; `close` ends them."""
+        flags = [f"--seed={seed}", *self.settings.server_flags(self.n_worlds)]
+        if self.settings.is_embedded:
+            return embed_flags(flags)
         instance = unused_instance()
-        flags = [f"--instance={instance}", f"--seed={seed}"]
-        flags += self.settings.server_flags(self.n_worlds)
-        self._program = Program("emberwatch-server", flags)
+        self._program = Program("emberwatch-server", [f"--instance={instance}", *flags])
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:
@@ -261,7 +269,9 @@ class Session:
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
-            if settings.truth:
+            if settings.truth and settings.is_embedded:
+                self._truth = Present(client.truths)
+            elif settings.truth:
                 self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
             self._hold(client)  # the last, as it is open from then on
             self._is_torn, self._has_moved = False, True

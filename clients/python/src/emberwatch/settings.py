@@ -11,11 +11,11 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
+from emberwatch.arguments import check_settings
 from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import local, utf8
-from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
 from emberwatch.tasks import Task
 from emberwatch.wire import Shape
@@ -23,12 +23,17 @@ from emberwatch.wire import Shape
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
 
+#: Where the worlds are: at a server, or in this process.
+SERVER: Final = "server"
+EMBEDDED: Final = "embedded"
+
 _Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
     """The keywords, as type checkers see them; `Settings` has the defaults."""
 
+    backend: str
     instance: str | None
     world: int
     robot: int | None
@@ -53,6 +58,7 @@ class WorldArguments(TypedDict, total=False):
 class Settings:
     """The keywords; `WildfireEnv` explains them. None: as the server has it."""
 
+    backend: str = SERVER
     instance: str | None = None
     world: int = 0
     robot: int | None = None
@@ -85,6 +91,10 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise invalid(field.name, field.type, repr(value))
+        if self.backend not in (SERVER, EMBEDDED):
+            raise invalid("backend", f"{SERVER!r} or {EMBEDDED!r}", repr(self.backend))
+        if self.is_embedded and self.instance is not None:
+            raise invalid("backend", f"{SERVER!r} with instance=...", repr(self.backend))
         for name in ("task", "model", "states"):
             if getattr(self, name) is not None:
                 utf8(name, getattr(self, name))
@@ -92,6 +102,11 @@ class Settings:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
             raise invalid("timeout", "seconds above 0", self.timeout)
+
+    @property
+    def is_embedded(self) -> bool:
+        """Whether the worlds are in this process."""
+        return self.backend == EMBEDDED
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
@@ -115,7 +130,7 @@ class Settings:
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
     def server_flags(self, n_worlds: int) -> list[str]:
-        """The flags of a private server with these worlds."""
+        """The flags of a private server with these worlds, or of embedded ones."""
         flags = {
             "worlds": n_worlds,
             "robots": self.robots,
@@ -187,9 +202,9 @@ def draw_seed(generator: np.random.Generator) -> int:
 
 
 def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
-    """The worlds that a private server will have, and the robots to fly.
+    """The worlds that a private server will have, or this process, and the robots to fly.
 
-    `n_rows`: how many robots; None: those of one world. The program itself checks the settings.
+    `n_rows`: how many robots; None: those of one world. Settings are checked as a server does.
     """
     if settings.takeover or settings.world != 0 or settings.robot is not None:
         raise InvalidArgumentError(

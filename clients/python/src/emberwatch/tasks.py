@@ -6,9 +6,9 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Self
 
+from emberwatch.arguments import check_settings
 from emberwatch.model import built_in
 from emberwatch.paths import utf8
-from emberwatch.programs import check_settings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -155,7 +155,7 @@ class StepAnswer:
         payload: NDArray[np.uint8],
     ) -> None:
         """Takes a payload as it is: results of the worlds, results of the robots, frames."""
-        n_worlds = shape.n_worlds(first_robot, n_robots)
+        n_worlds = 1 if n_robots == 1 else shape.n_worlds(first_robot, n_robots)
         n_frames = n_worlds if flags & TEAM_FRAMES else n_robots
         self._shape, self._payload, self._head = shape, payload, n_worlds * WORLD.size
         self.first_robot, self.simulation_nanos = first_robot, simulation_nanos

@@ -1,0 +1,106 @@
+//! What answers requests: a server, or worlds in this process.
+
+use crate::refusal::failed;
+use clap::{Args, Command, FromArgMatches};
+use emberwatch_protocol::connection::{Connection, ConnectionError};
+use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::{StepReply, StepRequest};
+use emberwatch_server::config::{Checked, ServerConfig};
+use emberwatch_server::embedded::Embedded;
+use emberwatch_server::flags::ServerFlags;
+use pyo3::prelude::*;
+use std::time::Duration;
+
+pub enum Backend {
+    Server(Connection),
+    Embedded(Box<Embedded>),
+}
+
+impl Backend {
+    pub fn info(&self) -> ServerInfo {
+        match self {
+            Self::Server(wire) => wire.info().clone(),
+            Self::Embedded(worlds) => worlds.info(),
+        }
+    }
+
+    pub fn control_text(
+        &mut self,
+        text: &[u8],
+        timeout: Duration,
+    ) -> Result<Vec<u8>, ConnectionError> {
+        match self {
+            Self::Server(wire) => wire.control_text(text, timeout),
+            Self::Embedded(worlds) => worlds.control_text(text, timeout),
+        }
+    }
+
+    pub fn step_payload(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+        timeout: Duration,
+    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
+        match self {
+            Self::Server(wire) => wire.step_payload(request, body, timeout),
+            Self::Embedded(worlds) => worlds.step_payload(request, body),
+        }
+    }
+}
+
+/// Worlds in this process, with the flags of `emberwatch-server`.
+pub fn embedded(py: Python<'_>, flags: Vec<String>) -> PyResult<Embedded> {
+    let checked = checked(py, flags)?;
+    check_embeddable(py, &checked.config)?;
+    let worlds = py.detach(|| Embedded::new(checked));
+    worlds.map_err(|error| failed(py, &format!("{error:#}"), "embedded"))
+}
+
+/// The settings that a server with these flags would have, as TOML.
+#[pyfunction]
+pub fn check_settings(py: Python<'_>, flags: Vec<String>) -> PyResult<String> {
+    let settings = checked(py, flags)?.config;
+    Ok(toml::to_string(&settings).expect("invariant: settings serialise"))
+}
+
+fn checked(py: Python<'_>, flags: Vec<String>) -> PyResult<Checked> {
+    let command = ServerFlags::augment_args(Command::new("emberwatch-server").no_binary_name(true));
+    let checked = py.detach(|| {
+        let matches = command.try_get_matches_from(flags)?;
+        let settings = ServerFlags::from_arg_matches(&matches)?.effective();
+        Ok::<_, clap::Error>(settings.and_then(ServerConfig::check))
+    });
+    match checked {
+        Ok(Ok(checked)) => Ok(checked),
+        Ok(Err(problem)) => Err(refused(py, &problem.to_string())),
+        Err(problem) => Err(refused(py, &problem.to_string())),
+    }
+}
+
+/// Refuses settings that only a server can have.
+fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
+    let own = ServerConfig::default();
+    let of_servers = [
+        ("instance", settings.instance == own.instance),
+        ("restore", settings.restore == own.restore),
+        (
+            "snapshot_every",
+            settings.snapshot_every == own.snapshot_every,
+        ),
+        ("snapshot_dir", settings.snapshot_dir == own.snapshot_dir),
+    ];
+    match of_servers.into_iter().find(|(_, is_own)| !is_own) {
+        None => Ok(()),
+        Some((setting, _)) => Err(refused(
+            py,
+            &format!("{setting}: expected none, as embedded worlds have no server"),
+        )),
+    }
+}
+
+fn refused(py: Python<'_>, problem: &str) -> PyErr {
+    // Without the hint at flags of commands.
+    let problem = problem.split("\n\nFor more information").next();
+    let problem = problem.unwrap_or_default().trim_start_matches("error: ");
+    crate::errors::error(py, "InvalidArgumentError", (problem.trim(),))
+}

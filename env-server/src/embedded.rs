@@ -1,0 +1,362 @@
+//! Worlds inside a process that uses them alone: the requests and answers of a server, without channels.
+//!
+//! Threads of its own reset worlds and work on files, so that a wait for them may end early.
+
+use crate::config::Checked;
+use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
+use crate::simulator::{Simulator, Stepped};
+use crate::snapshot::Job;
+use crate::world::{Episode, Rules};
+use anyhow::{Context, Result};
+use emberwatch_protocol::connection::{ConnectionError, check_status};
+use emberwatch_protocol::control::{Reply, ServerInfo};
+use emberwatch_protocol::interrupt::check_interrupt;
+use emberwatch_protocol::message::{StepReply, StepRequest, VERSION};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+/// The name in errors.
+pub const INSTANCE: &str = "embedded";
+
+/// How often a wait looks whether it is interrupted.
+const INTERVAL: Duration = Duration::from_millis(5);
+
+/// A world after its reset.
+type Reset = (usize, Box<Episode>);
+
+/// Worlds inside this process.
+pub struct Embedded {
+    simulator: Simulator,
+    rules: Arc<Rules>,
+    threads: Arc<ThreadPool>,
+    resets: (Sender<Reset>, Receiver<Reset>),
+    client: ClientId,
+    started: Instant,
+    is_over: bool,
+}
+
+impl Embedded {
+    /// Begins the worlds of these settings; those about channels and saving by itself are not used.
+    ///
+    /// # Errors
+    /// If the model does not fit the grid, or no threads can be started.
+    pub fn new(checked: Checked) -> Result<Self> {
+        let n_worlds = checked.config.worlds as usize;
+        let n_threads = match checked.config.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            n_threads => n_threads,
+        };
+        let threads = ThreadPoolBuilder::new().num_threads(n_threads.min(n_worlds));
+        let threads = Arc::new(threads.build().context("start threads")?);
+        let mut n_leases = 0;
+        let next_token = move || {
+            n_leases += 1;
+            n_leases
+        };
+        let (simulator, jobs) = Simulator::new(checked, threads.clone(), Box::new(next_token))?;
+        let embedded = Self {
+            rules: Arc::new(simulator.spec().rules.clone()),
+            simulator,
+            threads,
+            resets: channel(),
+            client: ClientId {
+                node: 0,
+                pid: std::process::id(),
+            },
+            started: Instant::now(),
+            is_over: false,
+        };
+        embedded.start(jobs);
+        Ok(embedded)
+    }
+
+    /// What a server of these worlds would say of itself.
+    pub fn info(&self) -> ServerInfo {
+        self.simulator.info()
+    }
+
+    /// Answers a control request, JSON with JSON.
+    ///
+    /// # Errors
+    /// If it is refused, not done in time, or interrupted; and after a `shutdown`.
+    pub fn control_text(
+        &mut self,
+        text: &[u8],
+        timeout: Duration,
+    ) -> Result<Vec<u8>, ConnectionError> {
+        self.begin()?;
+        let stats = ServerStats {
+            uptime: self.started.elapsed(),
+            n_clients: 1,
+            ..ServerStats::default()
+        };
+        let (now, client) = (Instant::now(), self.client);
+        let reply = match self.simulator.control(now, client, VERSION, text, &stats) {
+            Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
+            Outcome::Pending(jobs, pending) => {
+                self.start(jobs);
+                self.reset(&pending, timeout)?
+            }
+            Outcome::File(job, pending) => self.file(job, &pending, timeout)?,
+            Outcome::Shutdown => {
+                self.is_over = true;
+                Reply::Done
+            }
+        };
+        if let Reply::Error {
+            status,
+            detail,
+            message,
+        } = reply
+        {
+            check_status("a control request", status as u32, detail, Some(message))?;
+            unreachable!("invariant: refusals have a status");
+        }
+        Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
+    }
+
+    /// Answers a step request: the header, and results of the worlds, results of the robots, frames.
+    ///
+    /// # Errors
+    /// If it is refused; and after a `shutdown`.
+    pub fn step_payload(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
+        self.begin()?;
+        let now = Instant::now();
+        let request = StepRequest {
+            version: VERSION,
+            ..request
+        };
+        let mut payload = Vec::new();
+        let stepped = self
+            .simulator
+            .step(now, self.client, &request, body, &mut payload);
+        let Stepped::Reply(mut reply) = stepped else {
+            unreachable!("invariant: the only client names all robots that it holds in a world");
+        };
+        check_status("step", reply.status, reply.detail, None)?;
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        Ok((reply, payload))
+    }
+
+    /// The present episode of a world; `None` during its reset.
+    pub fn episode(&self, world: usize) -> Option<&Episode> {
+        self.simulator.episode(world)
+    }
+
+    /// Takes in what an interrupted wait has left.
+    fn begin(&mut self) -> Result<(), ConnectionError> {
+        if self.is_over {
+            return Err(ConnectionError::ServerGone {
+                who: "server",
+                instance: INSTANCE.into(),
+            });
+        }
+        while let Ok((world, episode)) = self.resets.1.try_recv() {
+            self.simulator.put(world, episode);
+        }
+        Ok(())
+    }
+
+    fn start(&self, jobs: Vec<ResetJob>) {
+        for job in jobs {
+            let (rules, sender) = (self.rules.clone(), self.resets.0.clone());
+            // Nobody receives it once this is dropped.
+            self.threads
+                .spawn(move || drop(sender.send(job.run(&rules))));
+        }
+    }
+
+    /// Waits until worlds are ready.
+    fn reset(
+        &mut self,
+        pending: &PendingReply,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        let start = Instant::now();
+        loop {
+            if let Some(reply) = self.simulator.pending_reply(Instant::now(), pending) {
+                return Ok(reply);
+            }
+            match next(&self.resets.1, start, timeout) {
+                Ok((world, episode)) => self.simulator.put(world, episode),
+                Err(ended) => {
+                    self.simulator.cancel_reply(Instant::now(), pending);
+                    return Err(ended);
+                }
+            }
+        }
+    }
+
+    /// Waits for work on a file.
+    fn file(
+        &mut self,
+        job: Job,
+        pending: &PendingFile,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        let (sender, receiver) = channel();
+        let spec = self.simulator.spec().clone();
+        self.threads
+            .spawn(move || drop(sender.send(job.run(&spec))));
+        let done = next(&receiver, Instant::now(), timeout);
+        let now = Instant::now();
+        if done.is_err() {
+            self.simulator.cancel_file(now, pending);
+        }
+        Ok(self.simulator.file_reply(now, pending, done?))
+    }
+}
+
+/// What comes next, unless the time since `start` is over or the wait is interrupted.
+fn next<T>(
+    receiver: &Receiver<T>,
+    start: Instant,
+    timeout: Duration,
+) -> Result<T, ConnectionError> {
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        match receiver.recv_timeout(left.min(INTERVAL)) {
+            Ok(next) => return Ok(next),
+            Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
+            // A thread that has panicked sends nothing.
+            Err(_) => {
+                return Err(ConnectionError::Timeout {
+                    what: "a control request",
+                    instance: INSTANCE.into(),
+                    timeout,
+                });
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::ServerConfig;
+    use emberwatch_protocol::control::{Request, WorldSeed};
+    use emberwatch_protocol::message::{Operation, Status};
+
+    const LONG: Duration = Duration::from_secs(60);
+
+    fn embedded(n_worlds: u32) -> Embedded {
+        let config = ServerConfig {
+            worlds: n_worlds,
+            height: 7,
+            width: 5,
+            moves: 4,
+            burn_in: 20,
+            model: "wildfire-small".into(),
+            ..ServerConfig::default()
+        };
+        Embedded::new(config.check().expect("settings")).expect("worlds")
+    }
+
+    fn ask(embedded: &mut Embedded, request: &Request) -> Result<Reply, ConnectionError> {
+        let text = serde_json::to_vec(request).expect("JSON");
+        let answer = embedded.control_text(&text, LONG)?;
+        Ok(serde_json::from_slice(&answer).expect("a reply"))
+    }
+
+    fn acquire(embedded: &mut Embedded, n_robots: u32) -> u64 {
+        let request = Request::Acquire {
+            first_robot: 0,
+            n_robots,
+            takeover: false,
+            ttl_millis: None,
+        };
+        match ask(embedded, &request) {
+            Ok(Reply::Lease(lease)) => lease.lease,
+            other => panic!("expected a lease, got {other:?}"),
+        }
+    }
+
+    fn step(embedded: &mut Embedded, lease: u64, k: u64) -> Result<Vec<u8>, ConnectionError> {
+        let request = StepRequest {
+            operation: Operation::Step as u32,
+            lease,
+            n_robots: 1,
+            n_moves: 4,
+            ..StepRequest::default()
+        };
+        let mut body = k.to_ne_bytes().to_vec();
+        body.extend([1, 3, 1, 3]);
+        embedded
+            .step_payload(request, &body)
+            .map(|(_, payload)| payload)
+    }
+
+    #[test]
+    fn a_snapshot_has_the_same_future() {
+        let mut embedded = embedded(2);
+        let lease = acquire(&mut embedded, 2);
+        step(&mut embedded, lease, 0).expect("a step");
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("worlds").display().to_string();
+        let (first_world, n_worlds) = (0, 1);
+        let save = Request::Snapshot {
+            first_world,
+            n_worlds,
+            path: path.clone(),
+        };
+        ask(&mut embedded, &save).expect("a file");
+        let future = step(&mut embedded, lease, 1).expect("a step");
+        let load = Request::Restore {
+            lease,
+            first_world,
+            n_worlds,
+            from: 0,
+            path,
+        };
+        ask(&mut embedded, &load).expect("worlds");
+        assert_eq!(step(&mut embedded, lease, 1).expect("a step"), future);
+    }
+
+    #[test]
+    fn refusals_are_those_of_a_server() {
+        let mut embedded = embedded(1);
+        let lease = acquire(&mut embedded, 1);
+        let status = |refused| match refused {
+            Err(ConnectionError::Refused { status, .. }) => status,
+            other => panic!("expected a refusal, got {other:?}"),
+        };
+        assert_eq!(status(step(&mut embedded, lease, 7)), Status::Early);
+        assert_eq!(status(step(&mut embedded, lease + 1, 0)), Status::NoLease);
+        let worlds = vec![WorldSeed {
+            world: 3,
+            seed: None,
+        }];
+        let reset = ask(&mut embedded, &Request::Reset { lease, worlds });
+        assert_eq!(status(reset.map(|_| Vec::new())), Status::NoSuchWorld);
+        ask(&mut embedded, &Request::Shutdown {}).expect("an end");
+        let gone = step(&mut embedded, lease, 0);
+        assert!(matches!(gone, Err(ConnectionError::ServerGone { .. })));
+    }
+
+    #[test]
+    fn a_wait_that_ended_early_leaves_the_worlds_to_the_next_one() {
+        let mut embedded = embedded(1);
+        let lease = acquire(&mut embedded, 1);
+        let reset = Request::Reset {
+            lease,
+            worlds: vec![WorldSeed {
+                world: 0,
+                seed: Some(5),
+            }],
+        };
+        let text = serde_json::to_vec(&reset).expect("JSON");
+        let ended = embedded.control_text(&text, Duration::ZERO);
+        assert!(
+            matches!(ended, Err(ConnectionError::Timeout { .. })) || ended.is_ok(),
+            "{ended:?}"
+        );
+        ask(&mut embedded, &Request::Renew { lease }).expect("a world");
+        assert_eq!(embedded.episode(0).expect("a world").result().seed, 5);
+    }
+}
