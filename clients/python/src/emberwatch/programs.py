@@ -17,11 +17,10 @@ import weakref
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Final, Protocol, TypeVar
+from typing import IO, Final, Protocol, TypeVar
 
 from emberwatch.errors import (
     EmberwatchError,
-    InvalidArgumentError,
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
