@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 use std::time::Duration;
 
 pub enum Backend {
-    Server(Connection),
+    Server(Box<Connection>),
     Embedded(Box<Embedded>),
 }
 

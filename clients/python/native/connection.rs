@@ -46,7 +46,7 @@ impl Server {
         let name = checked(py, instance)?;
         let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
         let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
-        Ok(Self::of(instance, Backend::Server(wire)))
+        Ok(Self::of(instance, Backend::Server(Box::new(wire))))
     }
 
     /// Worlds in this process, with the flags of `emberwatch-server`.
