@@ -9,6 +9,7 @@ use emberwatch_server::config::{Checked, ServerConfig};
 use emberwatch_server::embedded::Embedded;
 use emberwatch_server::flags::ServerFlags;
 use pyo3::prelude::*;
+use std::ffi::OsString;
 use std::time::Duration;
 
 pub enum Backend {
@@ -49,7 +50,7 @@ impl Backend {
 }
 
 /// Worlds in this process, with the flags of `emberwatch-server`.
-pub fn embedded(py: Python<'_>, flags: Vec<String>) -> PyResult<Embedded> {
+pub fn embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Embedded> {
     let checked = checked(py, flags)?;
     check_embeddable(py, &checked.config)?;
     let worlds = py.detach(|| Embedded::new(checked));
@@ -58,12 +59,12 @@ pub fn embedded(py: Python<'_>, flags: Vec<String>) -> PyResult<Embedded> {
 
 /// The settings that a server with these flags would have, as TOML.
 #[pyfunction]
-pub fn check_settings(py: Python<'_>, flags: Vec<String>) -> PyResult<String> {
+pub fn check_settings(py: Python<'_>, flags: Vec<OsString>) -> PyResult<String> {
     let settings = checked(py, flags)?.config;
     Ok(toml::to_string(&settings).expect("invariant: settings serialise"))
 }
 
-fn checked(py: Python<'_>, flags: Vec<String>) -> PyResult<Checked> {
+fn checked(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Checked> {
     let command = ServerFlags::augment_args(Command::new("emberwatch-server").no_binary_name(true));
     let checked = py.detach(|| {
         let matches = command.try_get_matches_from(flags)?;

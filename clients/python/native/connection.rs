@@ -14,6 +14,7 @@ use emberwatch_server::world::Episode;
 use numpy::PyArray1;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
+use std::ffi::OsString;
 use std::time::Duration;
 
 /// How long the server worked on a step, and what it answered: results of the worlds, of the robots, frames.
@@ -52,7 +53,7 @@ impl Server {
     /// Worlds in this process, with the flags of `emberwatch-server`.
     #[staticmethod]
     #[pyo3(name = "embedded")]
-    fn new_embedded(py: Python<'_>, flags: Vec<String>) -> PyResult<Self> {
+    fn new_embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Self> {
         let worlds = Backend::Embedded(Box::new(embedded(py, flags)?));
         Ok(Self::of(INSTANCE, worlds))
     }
