@@ -70,7 +70,7 @@ def _servers_of(pid: int) -> list[str]:
     found = list[str]()
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            words = (process / "cmdline").read_text().split("\0")
+            words = (process / "cmdline").read_text(errors="replace").split("\0")
         except OSError:
             continue
         if "--exit-with" in words and words[words.index("--exit-with") + 1] == str(pid):
