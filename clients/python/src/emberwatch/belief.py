@@ -138,8 +138,11 @@ def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 
 def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
-    logarithm = np.log(belief, out=np.zeros_like(belief), where=belief > 0.0)
-    return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
+    total = np.zeros(belief.shape[1:])
+    # State by state, as memory for all is got and given back in each call, which takes most time.
+    for probability in belief:
+        total += probability * np.log(np.where(probability > 0.0, probability, 1.0))
+    return np.maximum(0.0, 0.0 - total)
 
 
 def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:

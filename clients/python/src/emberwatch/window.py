@@ -65,7 +65,9 @@ class Windows:
 
 def of_belief(model: Model, filters: Filters, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The channels of `local` about the world: probability that pays, and entropy."""
-    predictor = filters.predictor[:, rows]
-    target = predictor[model.target_state]
-    shown = np.stack((target, entropy(predictor) / np.log(model.n_states)), -1)
-    return np.rint(255.0 * shown).astype(np.uint8)
+    predictor = filters.predictor if rows.all() else filters.predictor[:, rows]
+    shown = np.empty((*predictor.shape[1:], N_OF_BELIEF), np.uint8)
+    channels = predictor[model.target_state], entropy(predictor) / np.log(model.n_states)
+    for index, channel in enumerate(channels):
+        shown[..., index] = np.rint(255.0 * channel)
+    return shown
