@@ -85,6 +85,7 @@ def moves(world: dict[str, Any], instances: list[str], n_worlds: int) -> dict[st
     ]
     return {
         "native vector": gymnasium.make_vec(MOVES, n_worlds, **world),
+        "native vector, embedded": gymnasium.make_vec(MOVES, n_worlds, backend="embedded", **world),
         "native vector, reward='move'": gymnasium.make_vec(MOVES, n_worlds, reward="move", **world),
         "SyncVectorEnv": SyncVectorEnv(single),
         "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * n_worlds),

@@ -74,17 +74,22 @@ def _spread(values: Any) -> str:
     return f"{statistics.median(values):8.1f} ({min(values):.1f} to {max(values):.1f})"
 
 
-def emberwatch_row(n_envs: int) -> Row:
+def emberwatch_row(n_envs: int, backend: str = "server") -> Row:
     """Wildfire-v0, the simulation included: single, or the vector environment."""
-    if n_envs == 1:
-        env = gymnasium.make("emberwatch/Wildfire-v0", max_episode_steps=NO_END)
-        env.reset(seed=0)
-        return Row("emberwatch, env.step", env, env.action_space.sample(), 1)
-    envs = gymnasium.make_vec(
-        "emberwatch/Wildfire-v0", num_envs=n_envs, max_episode_steps=NO_END, burn_in=1000
+    world: dict[str, Any] = {"max_episode_steps": NO_END, "backend": backend, "burn_in": 1000}
+    envs: Any = (
+        gymnasium.make("emberwatch/Wildfire-v0", **world)
+        if n_envs == 1
+        else gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=n_envs, **world)
     )
     envs.reset(seed=0)
-    return Row(f"emberwatch, {n_envs} worlds", envs, envs.action_space.sample(), n_envs)
+    name = f"emberwatch, {backend}, worlds: {n_envs}"
+    return Row(name, envs, envs.action_space.sample(), n_envs)
+
+
+def embedded_row(n_envs: int) -> Row:
+    """The same inside this process."""
+    return emberwatch_row(n_envs, "embedded")
 
 
 def async_row(n_envs: int) -> Row:
@@ -168,8 +173,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.busy is None:
         start_up(5)
-        race([emberwatch_row, async_row, envpool_row], 1, 4000, args.rounds)
-        race([emberwatch_row, async_row, envpool_row], 64, 200, args.rounds)
+        race([emberwatch_row, embedded_row, async_row, envpool_row], 1, 4000, args.rounds)
+        race([emberwatch_row, embedded_row, async_row, envpool_row], 64, 200, args.rounds)
     for n in args.busy or [3]:
         print(f"beside {n} busy processes:")
         with busy_processes(n):
