@@ -33,6 +33,9 @@ OUTSIDE = {
 #: An index for readers of the repository; the site has its navigation.
 LEFT_OUT = {"docs/README.md"}
 
+#: A paragraph of the first page for readers of the repository.
+OF_REPOSITORY = re.compile(r"^All documents: .*?\n\n", re.MULTILINE | re.DOTALL)
+
 #: The home page has no list of pages at its side.
 HOME = "---\nhide: [navigation]\n---\n\n"
 
@@ -41,6 +44,8 @@ FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
 INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
+#: A number's error or interval, which stays on its line.
+SPREAD = re.compile(r"(?<=\d)( ± (?=\d)| \[-?[\d.]+, -?[\d.]+\])")
 
 
 def pages() -> dict[str, str]:
@@ -67,7 +72,9 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         if path in found:
             # All pictures but the first are loaded when they come into sight.
             later = "{loading=lazy}" if mark and n_pictures > 1 else ""
-            return f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
+            shown = f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
+            # A picture opens alone, as large as it is: on a phone its words are small.
+            return f"[{shown}]({posixpath.relpath(found[path], here)})" if mark else shown
         if (ROOT / path).exists():
             return words
         raise SystemExit(f"{source}: expected a file of the repository, got {target}")
@@ -76,13 +83,15 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         page = found.get(match[1])
         if page is None or match[1] == source:
             return match[0]
-        return f"[{match[0]}]({posixpath.relpath(page, here)})"
+        heading = (ROOT / match[1]).read_text("utf-8").partition("\n")[0].removeprefix("# ")
+        return f"[{heading}]({posixpath.relpath(page, here)})"
 
     parts = FENCE.split(text)
     for index, part in enumerate(parts):
         if part.startswith("```"):
             parts[index] = INFO.sub(r"\1", part)
         else:
+            part = SPREAD.sub(lambda match: match[0].replace(" ", "\u00a0"), part)
             parts[index] = NAMED.sub(name, LINK.sub(link, part))
     return "".join(parts)
 
@@ -118,7 +127,8 @@ def main() -> None:
             place.write_text(page_of(json.loads(path.read_text("utf-8")), path.name), "utf-8")
         elif path.suffix == ".md":
             text = linked(path.read_text("utf-8"), source, found)
-            place.write_text(HOME + text if page == "index.md" else text, "utf-8")
+            home = page == "index.md"
+            place.write_text(HOME + OF_REPOSITORY.sub("", text) if home else text, "utf-8")
         else:
             shutil.copy(path, place)
 

@@ -30,6 +30,9 @@ __all__ = [
     "prepare_metadata_for_build_wheel",
 ]
 
+# Each hook of maturin fails without the folder that `data` names; git keeps none.
+Path(maturin.get_config()["data"]).mkdir(exist_ok=True)
+
 
 def build_wheel(folder: str, settings: Any = None, metadata: str | None = None) -> str:
     """Of the module, the programs and the Python files."""

@@ -149,7 +149,8 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
     let remark: Vec<&str> = team.into_iter().chain(estimator).collect();
     let remark = match remark.as_slice() {
         [] => String::new(),
-        remark => format!(" ({})", readable(&remark.join(", "))),
+        // Programs that draw SVG drop a usual space at the end of a part.
+        remark => format!("\u{a0}({})", readable(&remark.join(", "))),
     };
     let pair = |run: &&PolicyRun| (run.world_seed, run.mean_reward);
     Bar {

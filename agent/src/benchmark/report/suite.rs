@@ -124,7 +124,8 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
         markdown(&heading(None), rows.into_iter())
     };
     format!(
-        "Scores: 0 is {FLOOR}'s mean reward of a task, 1 is {CEILING}'s; over tasks the interquartile mean.\n\n{scores}\n\n\
+        "Scores: 0 is {FLOOR}'s mean reward of a task, 1 is {CEILING}'s; over all the interquartile mean \
+         over the worlds of all tasks.\n\n{scores}\n\n\
          Log-likelihood of a visited cell (higher is better):\n\n{}\n\nBrier score (lower is better):\n\n{}\n",
         belief(|run| run.log_likelihood),
         belief(|run| run.brier),

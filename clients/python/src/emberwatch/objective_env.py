@@ -52,8 +52,7 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
 
     ## Starting State
 
-    As `WildfireEnv`, with the belief that the world's burn-in leaves one with (`prior`), or the
-    learned one.
+    As `WildfireEnv`, with the first belief that `prior` names, or the learned one.
 
     ## Rewards, Episode End, Information
 
