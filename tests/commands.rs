@@ -253,20 +253,15 @@ fn status_tells_people_and_programs_of_every_world() {
 #[test]
 fn the_documented_prior_is_written() {
     let page = include_str!("../docs/commands.md");
-    let line = page
-        .lines()
-        .find(|line| line.contains("emberwatch-agent prior"));
-    let (command, _) = line
-        .expect("the command")
-        .split_once('#')
-        .expect("what it does");
+    let mut quoted = page.split('`').skip(1).step_by(2);
+    let command = quoted.find(|command| command.starts_with("prior "));
     let folder = tempfile::TempDir::new().expect("a folder");
     let file = folder.path().join("prior.npy");
+    let command = command.expect("the command");
     let command = command.replace("FILE", file.to_str().expect("a plain path"));
     // Fewer and younger worlds than documented: it is the flags that are checked.
     let command = command.replace("--burn-in 10000", "--burn-in 10 --worlds 1");
-    let (_, flags) = command.trim().split_once(' ').expect("program and flags");
-    agent(flags);
+    agent(&command);
     assert!(file.is_file());
 }
 
