@@ -4,6 +4,7 @@ use crate::commands::agent;
 use emberwatch_protocol::{Dynamics, Model, Shape};
 use emberwatch_server::world::{Source, World};
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 use tempfile::TempDir;
 use tests::harness::{Program, Server, repository};
 
@@ -220,7 +221,7 @@ fn the_road_ice_model_keeps_all_its_states() {
     let shape = Shape::new(24, 40).expect("a shape");
     let source = Source::Simulated(Dynamics::new(&model, shape).expect("a model that fits"));
     for seed in 0..4 {
-        let world = World::new(source.clone(), seed, 5_000);
+        let world = World::new(source.clone(), seed, 5_000, &AtomicBool::new(false));
         let mut counts = [0; 4];
         world
             .states()

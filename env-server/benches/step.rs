@@ -44,7 +44,7 @@ impl Session {
         let threads = ThreadPoolBuilder::new().num_threads(1).build();
         let threads = threads.expect("bench threads");
         let (mut simulator, jobs) =
-            Simulator::new(checked, threads.into(), Box::new(|| 1)).expect("bench model");
+            Simulator::new(checked, threads, Box::new(|| 1)).expect("bench model");
         for job in jobs {
             let (world, episode) = job.run(&simulator.spec().rules);
             simulator.put(world, episode);

@@ -3,22 +3,31 @@
 //! Threads of its own reset worlds and work on files, so that a wait for them may end early.
 
 use crate::config::Checked;
+use crate::server::Rate;
 use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
 use crate::simulator::{Simulator, Stepped};
 use crate::snapshot::Job;
 use crate::world::{Episode, Rules};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use emberwatch_protocol::connection::{ConnectionError, check_status};
 use emberwatch_protocol::control::{Reply, ServerInfo};
 use emberwatch_protocol::interrupt::check_interrupt;
-use emberwatch_protocol::message::{StepReply, StepRequest, VERSION};
+use emberwatch_protocol::message::{Status, StepReply, StepRequest, VERSION};
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::ops::Range;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// The name in errors.
-pub const INSTANCE: &str = "embedded";
+/// The name in errors: no instance can have it.
+pub const INSTANCE: &str = "(embedded)";
+
+/// Jobs on files that may wait, each with its bytes.
+const MAX_FILES: usize = 16;
+
+/// Bytes of a cell, and of what a robot knows of it, in a world and its beginning.
+const CELL_BYTES: u64 = 4;
 
 /// How often a wait looks whether it is interrupted.
 const INTERVAL: Duration = Duration::from_millis(5);
@@ -30,10 +39,15 @@ type Reset = (usize, Box<Episode>);
 pub struct Embedded {
     simulator: Simulator,
     rules: Arc<Rules>,
-    threads: Arc<ThreadPool>,
     resets: (Sender<Reset>, Receiver<Reset>),
+    /// Apart from the simulator's own, which steps would wait for.
+    reset_threads: ThreadPool,
+    /// One thread: of two snapshots to one file the later one stays.
+    file_thread: ThreadPool,
+    n_files: Arc<AtomicUsize>,
     client: ClientId,
     started: Instant,
+    rate: Rate,
     is_over: bool,
 }
 
@@ -41,31 +55,37 @@ impl Embedded {
     /// Begins the worlds of these settings; those about channels and saving by itself are not used.
     ///
     /// # Errors
-    /// If the model does not fit the grid, or no threads can be started.
+    /// If the model does not fit the grid, there is too little memory, or no threads can be started.
     pub fn new(checked: Checked) -> Result<Self> {
-        let n_worlds = checked.config.worlds as usize;
-        let n_threads = match checked.config.threads {
+        let config = &checked.config;
+        let n_threads = match config.threads {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             n_threads => n_threads,
         };
-        let threads = ThreadPoolBuilder::new().num_threads(n_threads.min(n_worlds));
-        let threads = Arc::new(threads.build().context("start threads")?);
+        let n_threads = n_threads.min(config.worlds as usize);
+        let of_cell = u64::from(config.worlds) * (CELL_BYTES + u64::from(config.robots));
+        check_memory(of_cell.saturating_mul(checked.shape.n_cells() as u64))?;
         let mut n_leases = 0;
         let next_token = move || {
             n_leases += 1;
             n_leases
         };
-        let (simulator, jobs) = Simulator::new(checked, threads.clone(), Box::new(next_token))?;
+        let steps = threads(n_threads)?;
+        let (simulator, jobs) = Simulator::new(checked, steps, Box::new(next_token))?;
+        let now = Instant::now();
         let embedded = Self {
             rules: Arc::new(simulator.spec().rules.clone()),
             simulator,
-            threads,
             resets: channel(),
+            reset_threads: threads(n_threads)?,
+            file_thread: threads(1)?,
+            n_files: Arc::default(),
             client: ClientId {
                 node: 0,
                 pid: std::process::id(),
             },
-            started: Instant::now(),
+            started: now,
+            rate: Rate::since(now),
             is_over: false,
         };
         embedded.start(jobs);
@@ -86,13 +106,14 @@ impl Embedded {
         text: &[u8],
         timeout: Duration,
     ) -> Result<Vec<u8>, ConnectionError> {
-        self.begin()?;
-        let stats = ServerStats {
-            uptime: self.started.elapsed(),
-            n_clients: 1,
-            ..ServerStats::default()
-        };
         let (now, client) = (Instant::now(), self.client);
+        self.begin(now)?;
+        let stats = ServerStats {
+            uptime: now - self.started,
+            steps_per_second: self.rate.per_second,
+            n_clients: 1,
+            n_observers: 0,
+        };
         let reply = match self.simulator.control(now, client, VERSION, text, &stats) {
             Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
             Outcome::Pending(jobs, pending) => {
@@ -126,8 +147,8 @@ impl Embedded {
         request: StepRequest,
         body: &[u8],
     ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
-        self.begin()?;
         let now = Instant::now();
+        self.begin(now)?;
         let request = StepRequest {
             version: VERSION,
             ..request
@@ -144,13 +165,24 @@ impl Embedded {
         Ok((reply, payload))
     }
 
-    /// The present episode of a world; `None` during its reset.
-    pub fn episode(&self, world: usize) -> Option<&Episode> {
-        self.simulator.episode(world)
+    /// The present episodes of consecutive worlds; `None` if one is missing, or in its reset.
+    ///
+    /// # Errors
+    /// After a `shutdown`.
+    pub fn episodes(
+        &mut self,
+        mut worlds: Range<usize>,
+    ) -> Result<Option<Vec<&Episode>>, ConnectionError> {
+        self.begin(Instant::now())?;
+        let simulator = &self.simulator;
+        Ok(worlds.try_fold(Vec::new(), |mut found, world| {
+            found.push(simulator.episode(world)?);
+            Some(found)
+        }))
     }
 
-    /// Takes in what an interrupted wait has left.
-    fn begin(&mut self) -> Result<(), ConnectionError> {
+    /// Takes in what an interrupted wait has left, and ends leases that are over.
+    fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
                 who: "server",
@@ -160,15 +192,21 @@ impl Embedded {
         while let Ok((world, episode)) = self.resets.1.try_recv() {
             self.simulator.put(world, episode);
         }
+        self.simulator.tick(now);
+        self.rate.update(now, self.simulator.n_steps());
         Ok(())
     }
 
     fn start(&self, jobs: Vec<ResetJob>) {
         for job in jobs {
             let (rules, sender) = (self.rules.clone(), self.resets.0.clone());
-            // Nobody receives it once this is dropped.
-            self.threads
-                .spawn(move || drop(sender.send(job.run(&rules))));
+            self.reset_threads.spawn(move || {
+                let reset = job.run(&rules);
+                if !rules.ended.load(Ordering::Relaxed) {
+                    // Nobody receives it once this is dropped.
+                    drop(sender.send(reset));
+                }
+            });
         }
     }
 
@@ -183,7 +221,7 @@ impl Embedded {
             if let Some(reply) = self.simulator.pending_reply(Instant::now(), pending) {
                 return Ok(reply);
             }
-            match next(&self.resets.1, start, timeout) {
+            match wait_for(&self.resets.1, start, timeout) {
                 Ok((world, episode)) => self.simulator.put(world, episode),
                 Err(ended) => {
                     self.simulator.cancel_reply(Instant::now(), pending);
@@ -200,11 +238,20 @@ impl Embedded {
         pending: &PendingFile,
         timeout: Duration,
     ) -> Result<Reply, ConnectionError> {
+        if self.n_files.fetch_add(1, Ordering::Relaxed) >= MAX_FILES {
+            self.n_files.fetch_sub(1, Ordering::Relaxed);
+            self.simulator.cancel_file(Instant::now(), pending);
+            let message = "too many files at a time: try again later".into();
+            return Ok(Reply::error(Status::BadFile, 0, message));
+        }
         let (sender, receiver) = channel();
-        let spec = self.simulator.spec().clone();
-        self.threads
-            .spawn(move || drop(sender.send(job.run(&spec))));
-        let done = next(&receiver, Instant::now(), timeout);
+        let (spec, n_files) = (self.simulator.spec().clone(), self.n_files.clone());
+        self.file_thread.spawn(move || {
+            let done = job.run(&spec);
+            n_files.fetch_sub(1, Ordering::Relaxed);
+            drop(sender.send(done));
+        });
+        let done = wait_for(&receiver, Instant::now(), timeout);
         let now = Instant::now();
         if done.is_err() {
             self.simulator.cancel_file(now, pending);
@@ -213,8 +260,18 @@ impl Embedded {
     }
 }
 
-/// What comes next, unless the time since `start` is over or the wait is interrupted.
-fn next<T>(
+impl Drop for Embedded {
+    /// Burn-ins that still run end.
+    fn drop(&mut self) {
+        self.rules.ended.store(true, Ordering::Relaxed);
+    }
+}
+
+/// What another thread sends, unless the time since `start` is over or the wait is interrupted.
+///
+/// # Errors
+/// [`ConnectionError::Timeout`], or of a wait that is interrupted.
+pub fn wait_for<T>(
     receiver: &Receiver<T>,
     start: Instant,
     timeout: Duration,
@@ -224,7 +281,7 @@ fn next<T>(
         match receiver.recv_timeout(left.min(INTERVAL)) {
             Ok(next) => return Ok(next),
             Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
-            // A thread that has panicked sends nothing.
+            // A job that has panicked sends nothing.
             Err(_) => {
                 return Err(ConnectionError::Timeout {
                     what: "a control request",
@@ -236,12 +293,37 @@ fn next<T>(
     }
 }
 
+fn threads(n_threads: usize) -> Result<ThreadPool> {
+    // A panic ends the job, not the process.
+    let threads = ThreadPoolBuilder::new().panic_handler(|_| ());
+    threads
+        .num_threads(n_threads)
+        .build()
+        .with_context(|| format!("start {n_threads} threads"))
+}
+
+/// Refuses worlds that would not fit in memory.
+fn check_memory(needed: u64) -> Result<()> {
+    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let mut lines = text.lines();
+    let line = lines.find_map(|line| line.strip_prefix("MemAvailable:"));
+    let free = line.and_then(|line| line.trim().strip_suffix(" kB")?.parse::<u64>().ok());
+    let free = free.map_or(u64::MAX, |free| free << 10);
+    ensure!(
+        needed < free,
+        "memory: expected {} MiB for the worlds, got {} MiB that are free",
+        needed >> 20,
+        free >> 20
+    );
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::ServerConfig;
     use emberwatch_protocol::control::{Request, WorldSeed};
-    use emberwatch_protocol::message::{Operation, Status};
+    use emberwatch_protocol::message::Operation;
 
     const LONG: Duration = Duration::from_secs(60);
 
@@ -357,6 +439,7 @@ mod tests {
             "{ended:?}"
         );
         ask(&mut embedded, &Request::Renew { lease }).expect("a world");
-        assert_eq!(embedded.episode(0).expect("a world").result().seed, 5);
+        let worlds = embedded.episodes(0..1).expect("worlds");
+        assert_eq!(worlds.expect("a world")[0].result().seed, 5);
     }
 }

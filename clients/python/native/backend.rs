@@ -1,16 +1,21 @@
 //! What answers requests: a server, or worlds in this process.
 
+use crate::errors::raise;
 use crate::refusal::failed;
 use clap::{Args, Command, FromArgMatches};
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::{StepReply, StepRequest};
 use emberwatch_server::config::{Checked, ServerConfig};
-use emberwatch_server::embedded::Embedded;
+use emberwatch_server::embedded::{Embedded, wait_for};
 use emberwatch_server::flags::ServerFlags;
 use pyo3::prelude::*;
 use std::ffi::OsString;
-use std::time::Duration;
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+
+/// How long it may take to read settings and their files.
+const LONGEST_READ: Duration = Duration::from_secs(20);
 
 pub enum Backend {
     Server(Box<Connection>),
@@ -64,14 +69,19 @@ pub fn check_settings(py: Python<'_>, flags: Vec<OsString>) -> PyResult<String> 
     Ok(toml::to_string(&settings).expect("invariant: settings serialise"))
 }
 
+/// Reads files on a thread of its own: one may be a pipe.
 fn checked(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Checked> {
-    let command = ServerFlags::augment_args(Command::new("emberwatch-server").no_binary_name(true));
-    let checked = py.detach(|| {
-        let matches = command.try_get_matches_from(flags)?;
+    let (sender, receiver) = channel();
+    let read = move || {
+        let command = Command::new("emberwatch-server").no_binary_name(true);
+        let matches = ServerFlags::augment_args(command).try_get_matches_from(flags)?;
         let settings = ServerFlags::from_arg_matches(&matches)?.effective();
         Ok::<_, clap::Error>(settings.and_then(ServerConfig::check))
-    });
-    match checked {
+    };
+    std::thread::spawn(move || drop(sender.send(read())));
+    let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
+    let checked = py.detach(wait);
+    match checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))? {
         Ok(Ok(checked)) => Ok(checked),
         Ok(Err(problem)) => Err(refused(py, &problem.to_string())),
         Err(problem) => Err(refused(py, &problem.to_string())),
@@ -80,23 +90,25 @@ fn checked(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Checked> {
 
 /// Refuses settings that only a server can have.
 fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
-    let own = ServerConfig::default();
-    let of_servers = [
-        ("instance", settings.instance == own.instance),
-        ("restore", settings.restore == own.restore),
-        (
-            "snapshot_every",
-            settings.snapshot_every == own.snapshot_every,
-        ),
-        ("snapshot_dir", settings.snapshot_dir == own.snapshot_dir),
-    ];
-    match of_servers.into_iter().find(|(_, is_own)| !is_own) {
-        None => Ok(()),
-        Some((setting, _)) => Err(refused(
-            py,
-            &format!("{setting}: expected none, as embedded worlds have no server"),
-        )),
-    }
+    let of_servers = |settings: &ServerConfig| {
+        [
+            ("instance", settings.instance.clone()),
+            ("deadline_millis", settings.deadline_millis.to_string()),
+            ("restore", settings.restore.clone()),
+            ("snapshot_every", settings.snapshot_every.to_string()),
+            ("snapshot_dir", settings.snapshot_dir.clone()),
+            ("snapshot_keep", settings.snapshot_keep.to_string()),
+        ]
+    };
+    let (given, usual) = (of_servers(settings), of_servers(&ServerConfig::default()));
+    let wrong = given
+        .into_iter()
+        .zip(usual)
+        .find(|(one, other)| one != other);
+    wrong.map_or(Ok(()), |((setting, got), _)| {
+        let expected = "expected none, as embedded worlds have no server";
+        Err(refused(py, &format!("{setting}: {expected}, got {got}")))
+    })
 }
 
 fn refused(py: Python<'_>, problem: &str) -> PyErr {

@@ -3,6 +3,7 @@
 use crate::backend::{Backend, embedded};
 use crate::errors::{raise, raise_of_channel};
 use crate::owned::Owned;
+use crate::refusal::invalid;
 use crate::samples::{Truth, truth_of};
 use emberwatch_protocol::Decider;
 use emberwatch_protocol::channels::Instance;
@@ -58,28 +59,31 @@ impl Server {
         Ok(Self::of(INSTANCE, worlds))
     }
 
-    /// Hidden states of consecutive embedded worlds, as the fields of `Truth`; `None` of a server's.
+    /// Hidden states of consecutive embedded worlds that publish them, as the fields of `Truth`.
     fn truths<'py>(
         &self,
         py: Python<'py>,
         first_world: usize,
         n_worlds: usize,
-    ) -> PyResult<Option<Vec<Truth<'py>>>> {
+    ) -> PyResult<Vec<Truth<'py>>> {
         let worlds = first_world..first_world.saturating_add(n_worlds);
-        let copied = self.backend.with(py, |backend| match backend {
-            Backend::Server(_) => None,
-            Backend::Embedded(own) => {
-                let present = worlds.map_while(|world| Some((world, own.episode(world)?)));
-                Some(present.map(copied).collect())
+        let read = |backend: &mut Backend| match backend {
+            Backend::Embedded(own) if own.info().publish_truth => {
+                let found = own.episodes(worlds.clone())?;
+                Ok(found.map(|found| worlds.zip(found).map(copied).collect::<Vec<_>>()))
             }
-        })?;
-        let copied: Option<Vec<_>> = copied;
-        Ok(copied.map(|copied| {
-            let truths = copied.into_iter();
-            truths
-                .map(|(world, result, states)| truth_of(py, world, &result, states))
-                .collect()
-        }))
+            _ => Ok(None),
+        };
+        let found = self.backend.with(py, read)?;
+        let found = found.map_err(|error| raise(py, error, "truths", 0.0))?;
+        let Some(found) = found else {
+            let expected = "embedded worlds with publish_truth that are not in a reset";
+            let got = format!("{n_worlds} from {first_world} on");
+            return Err(invalid(py, "truths", expected, got));
+        };
+        let truths = found.into_iter();
+        let of = |(world, result, states)| truth_of(py, world, &result, states);
+        Ok(truths.map(of).collect())
     }
 
     /// Sends JSON text, `what` in errors; returns that of the answer.

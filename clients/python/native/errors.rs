@@ -2,6 +2,7 @@
 
 use emberwatch_protocol::channels::ChannelError;
 use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_server::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
 use pyo3::exceptions::PyKeyboardInterrupt;
 use pyo3::prelude::*;
@@ -37,6 +38,14 @@ pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) 
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
+        ConnectionError::ServerGone { instance, .. } if instance == INSTANCE => {
+            let text = "these worlds were ended by shutdown: make others";
+            error(py, "ServerGoneError", (text,))
+        }
+        ConnectionError::Timeout { instance, .. } if instance == INSTANCE => {
+            let text = format!("{what} did not end within {seconds:?} s");
+            error(py, "RequestTimeoutError", (text,))
+        }
         ConnectionError::ServerGone { who, instance } => {
             let text = format!("the {who} on instance '{instance}' is gone");
             error(py, "ServerGoneError", (text,))

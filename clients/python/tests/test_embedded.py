@@ -27,7 +27,7 @@ from environments import (
 )
 from failures import fails
 from gymnasium.vector import AsyncVectorEnv
-from processes import script, server
+from processes import eventually, script, server
 
 import emberwatch
 from emberwatch import programs
@@ -124,10 +124,13 @@ def test_errors_have_the_codes_of_a_server(client: emberwatch.Client) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
+        ({"snapshot_keep": 9}, "snapshot_keep: expected none, .* got 9"),
+        ({"deadline_ms": 7}, "deadline_millis: expected none, .* got 7"),
+        ({"model": "\ud800"}, "model: expected UTF-8"),
         ({"wrolds": 2}, "unexpected argument '--wrolds'"),
         ({"worlds": 0}, "worlds: expected 1 to 1024, got 0"),
         ({"height": "x"}, "invalid value 'x' for '--height"),
-        ({"instance": "lab"}, "instance: expected none"),
+        ({"instance": "lab"}, "instance: expected none, .* got lab"),
         ({"snapshot_every": 5, "snapshot_dir": "."}, "snapshot_every: expected none"),
         ({"restore": "file"}, "restore: expected none"),
         ({"model": "nothing"}, "nothing"),
@@ -162,11 +165,14 @@ def test_there_is_no_instance_to_attach_to() -> None:
 
 def test_forked_and_spawned_workers_have_worlds_of_their_own() -> None:
     expected = rollout(make(), 5, seed=9)
+    path = actions(make(), 1)[0]
     for context in ("fork", "spawn"):
         makers = [lambda: gymnasium.make(f"emberwatch:{WILDFIRE}", backend="embedded", **SMALL)]
         env = AsyncVectorEnv(makers, context=context)
-        seen, _ = env.reset(seed=9)
-        assert_same(seen["frame"][0], expected[0][0]["frame"])
+        env.reset(seed=9)
+        seen, reward, *_ = env.step(path[np.newaxis])
+        assert_same(seen["frame"][0], expected[1][0]["frame"])
+        assert reward[0] == expected[1][1]
         env.close()
 
 
@@ -191,6 +197,7 @@ def test_a_forked_child_is_refused_by_name_and_harms_nothing() -> None:
     receiver, sender = context.Pipe()
     process = context.Process(target=child, args=(sender,))
     process.start()
+    sender.close()
     assert (receiver.recv(), receiver.recv()) == ("forked", expected[1][1])
     process.join()
     assert process.exitcode == 0
@@ -227,6 +234,44 @@ def test_a_closed_environment_is_copied_and_an_open_one_refused() -> None:
     again.close()
 
 
+def test_many_large_worlds_are_refused() -> None:
+    with fails("embedded", match="memory: expected .* MiB for the worlds, got"):
+        emberwatch.embed(worlds=1024, height=4096, width=4096)
+
+
+def test_a_lease_that_nobody_knows_ends() -> None:
+    with emberwatch.embed(robots=2, **FLAGS) as client:
+        client.acquire(1, ttl=0.1)
+        lease = client.acquire(0)
+        assert eventually(lambda: client.status().worlds[0].holder_pids[1] is None)
+        assert lease.step([3] * 4).result().world.hovered == 2
+
+
+def test_settings_of_a_pipe_are_not_waited_for_without_end(tmp_path: Path) -> None:
+    os.mkfifo(fifo := tmp_path / "model.toml")
+    started = script(
+        f"import emberwatch; print(1, flush=True); emberwatch.embed(model={str(fifo)!r})"
+    )
+    assert started.line() == "1"
+    threading.Event().wait(0.3)
+    started.signal(signal.SIGINT)
+    _, _, err = started.end()
+    assert "KeyboardInterrupt" in err
+
+
+def test_truths_are_those_of_embedded_worlds_that_publish_them(client: emberwatch.Client) -> None:
+    for at in (client, server(worlds=2, **FLAGS).connect()):
+        with fails("invalid_argument", match="embedded worlds with publish_truth"):
+            at.truths(range(1))
+
+
+def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
+    large = {"height": 512, "width": 512, "burn_in": 1000, "worlds": 3, "threads": 1}
+    with emberwatch.embed(**large, moves=4) as client:
+        client.acquire(0).step([3] * 4)
+        assert client.status().worlds[2].resetting
+
+
 #: A burn-in of hours, which Ctrl-C ends; then short ones.
 INTERRUPTED = """
 import gymnasium, emberwatch, time
@@ -241,6 +286,13 @@ try:
 except emberwatch.EmberwatchError as error:
     print(error.code, flush=True)
 env.close()
+time.sleep(0.1)
+before = time.process_time()
+time.sleep(0.2)
+assert time.process_time() - before < 0.1
+env = gymnasium.make("emberwatch/Wildfire-v0", backend="embedded", burn_in=10)
+env.reset(seed=1)
+env.step(env.action_space.sample())
 print("closed", flush=True)
 """
 

@@ -56,10 +56,10 @@ pub(super) struct Server {
 }
 
 /// World steps a second over the last window.
-pub(super) struct Rate {
+pub struct Rate {
     since: Instant,
     n_steps: u64,
-    pub(super) per_second: f64,
+    pub per_second: f64,
 }
 
 impl Server {
@@ -161,7 +161,7 @@ impl Server {
 }
 
 impl Rate {
-    fn since(now: Instant) -> Self {
+    pub fn since(now: Instant) -> Self {
         Self {
             since: now,
             n_steps: 0,
@@ -169,7 +169,7 @@ impl Rate {
         }
     }
 
-    pub(super) fn update(&mut self, now: Instant, n_steps: u64) {
+    pub fn update(&mut self, now: Instant, n_steps: u64) {
         let elapsed = now - self.since;
         if elapsed >= RATE_WINDOW {
             let per_second = (n_steps - self.n_steps) as f64 / elapsed.as_secs_f64();
@@ -203,7 +203,7 @@ fn announce(checked: &Checked) {
 fn simulator(checked: Checked) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
     let pool = threads(checked.config.threads)?;
-    let (mut simulator, mut resets) = Simulator::new(checked, pool.into(), token_source())?;
+    let (mut simulator, mut resets) = Simulator::new(checked, pool, token_source())?;
     if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
         tracing::info!(file = %path.display(), "restored");
         let worlds = worlds.into_iter().enumerate();

@@ -107,7 +107,7 @@ impl Simulator {
         };
         let n_cells = rules.shape.n_cells() + team * rules.n_moves;
         let places = &mut self.places[worlds.clone()];
-        if places.len() * n_cells >= PARALLEL_CELLS {
+        if places.len() > 1 && places.len() * n_cells >= PARALLEL_CELLS {
             self.threads.install(|| {
                 let places = places.par_iter_mut().enumerate();
                 places.for_each(|(index, place)| step((worlds.start + index, place)));

@@ -12,7 +12,6 @@ use emberwatch_protocol::model::ModelError;
 use rayon::ThreadPool;
 use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
-use std::sync::Arc;
 use std::time::Instant;
 
 /// All worlds and leases of a server: requests in, answers out, no I/O and no clock.
@@ -29,7 +28,7 @@ pub struct Simulator {
     /// Worlds that moved without a request of their own.
     pub(super) moved: Vec<usize>,
     pub(super) n_tickets: u64,
-    pub(super) threads: Arc<ThreadPool>,
+    pub(super) threads: ThreadPool,
     pub(super) next_token: Box<dyn FnMut() -> u64 + Send>,
     pub(super) n_steps: u64,
     pub(super) n_refused: u64,
@@ -67,7 +66,7 @@ impl Simulator {
     /// The worlds of a server and the jobs that start them; `next_token` makes the tokens of leases.
     pub fn new(
         checked: Checked,
-        threads: Arc<ThreadPool>,
+        threads: ThreadPool,
         next_token: Box<dyn FnMut() -> u64 + Send>,
     ) -> Result<(Self, Vec<ResetJob>), ModelError> {
         let config = &checked.config;

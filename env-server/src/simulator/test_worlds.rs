@@ -13,7 +13,7 @@ pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
         token
     });
     let checked = config.check().expect("valid settings");
-    Simulator::new(checked, threads.expect("a thread").into(), next_token).expect("a valid model")
+    Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
 }
 
 /// Ends burn-ins.

@@ -7,6 +7,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 use thiserror::Error;
 
 /// What is wrong with pipes, devices, folders and links.
@@ -14,6 +15,8 @@ const NOT_A_FILE: &str = "expected a regular file, got something else";
 
 /// Ending of the name of a file that is being written.
 pub(super) const PART: &str = ".part";
+
+static N_PARTS: AtomicU64 = AtomicU64::new(0);
 
 /// A file that could not be written or is refused.
 #[derive(Debug, Error)]
@@ -38,7 +41,9 @@ pub enum Durability {
 /// Writes a file under another name first, so that there is never half of it; mode 0600.
 pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), FileError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(format!(".{}{PART}", std::process::id()));
+    // Several threads of a process may write one file.
+    let n = N_PARTS.fetch_add(1, Ordering::Relaxed);
+    name.push(format!(".{}-{n}{PART}", std::process::id()));
     let part = path.with_file_name(name);
     may_be_replaced(path).map_err(|error| failed(path, error))?;
     let written = create(&part).and_then(|mut file| {

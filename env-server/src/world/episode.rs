@@ -38,7 +38,7 @@ impl Episode {
 
     /// A new world at k = 0 that was reset before.
     pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
-        let world = World::new(rules.source.clone(), seed, rules.burn_in);
+        let world = World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended);
         Self::beginning(rules, world, episode)
     }
 
@@ -47,7 +47,7 @@ impl Episode {
         let world = if self.beginning.seed() == seed {
             self.beginning.clone()
         } else {
-            World::new(rules.source.clone(), seed, rules.burn_in)
+            World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended)
         };
         *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
     }

@@ -7,6 +7,7 @@
 use super::recorded::Recorded;
 use emberwatch_protocol::{Dynamics, Grid};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Where hidden states come from.
 #[derive(Debug, Clone)]
@@ -36,13 +37,13 @@ impl Source {
 }
 
 impl World {
-    /// Starts a world; simulates `burn_in` steps.
-    pub fn new(mut source: Source, seed: u64, burn_in: u64) -> Self {
+    /// Starts a world; simulates `burn_in` steps, or fewer once it has `ended`.
+    pub fn new(mut source: Source, seed: u64, burn_in: u64, ended: &AtomicBool) -> Self {
         let states = match &mut source {
             Source::Recorded(recorded) => recorded.states(seed, 0),
             Source::Simulated(dynamics) => {
                 let mut states = dynamics.initial(seed);
-                for n in 0..burn_in {
+                for n in (0..burn_in).take_while(|_| !ended.load(Ordering::Relaxed)) {
                     dynamics.step(seed, n, &mut states);
                 }
                 states
@@ -103,7 +104,12 @@ mod tests {
     fn world(seed: u64, burn_in: u64, steps: u64) -> World {
         let shape = Shape::new(64, 48).expect("test shape");
         let dynamics = Dynamics::new(&Model::wildfire(), shape).expect("valid model");
-        let mut world = World::new(Source::Simulated(dynamics), seed, burn_in);
+        let mut world = World::new(
+            Source::Simulated(dynamics),
+            seed,
+            burn_in,
+            &AtomicBool::new(false),
+        );
         (0..steps).for_each(|_| world.advance());
         world
     }

@@ -9,6 +9,7 @@ use emberwatch_protocol::task::Start;
 use emberwatch_protocol::{Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// What all episodes of a server share.
 #[derive(Debug, Clone)]
@@ -33,6 +34,8 @@ pub struct Rules {
     pub n_moves: usize,
     /// Robots of a world.
     pub n_robots: usize,
+    /// Set when nobody wants the worlds any more: burn-ins that still run end at once, and are not to be used.
+    pub ended: Arc<AtomicBool>,
     pub(super) sensor: Sensor,
     pub(super) source: Source,
 }
@@ -58,6 +61,7 @@ impl Rules {
             history: 0,
             n_moves: 0,
             n_robots: 1,
+            ended: Arc::default(),
             sensor: Sensor::new(model),
             source: Source::Simulated(Dynamics::new(model, shape)?),
         })

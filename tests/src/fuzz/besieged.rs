@@ -116,7 +116,7 @@ impl Siege {
         });
         let checked = config.check().expect("valid settings");
         let (simulator, jobs) =
-            Simulator::new(checked, threads.into(), next_token).expect("valid settings");
+            Simulator::new(checked, threads, next_token).expect("valid settings");
         let (now, pending) = (Instant::now(), Vec::new());
         let mirror = Episode::new(&simulator.spec().rules, SHARED as u64);
         let mut siege = Self {

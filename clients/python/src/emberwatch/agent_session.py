@@ -22,6 +22,7 @@ from emberwatch.errors import (
     bad_answer,
     invalid,
 )
+from emberwatch.lease import Lease
 from emberwatch.moves import fly
 from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.programs import Program
@@ -104,6 +105,10 @@ class AgentSession(Session):
     @property
     def instance(self) -> str:
         return self.info.instance
+
+    @property
+    def lease(self) -> Lease:
+        raise invalid("lease", "an environment that flies itself", "one whose agent flies")
 
     @property
     def is_open(self) -> bool:

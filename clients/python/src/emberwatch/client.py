@@ -9,8 +9,10 @@ import os
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable, Iterable
-from typing import Final, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Final, TypeVar, cast
+
+import numpy as np
 
 from emberwatch import _native, wire
 from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
@@ -32,6 +34,9 @@ from emberwatch.wire import StepAnswer
 _Connection = TypeVar("_Connection")
 
 _log: Final = logging.getLogger("emberwatch")
+
+#: After which leases of embedded worlds end, milliseconds.
+_EMBEDDED_LEASE: Final = 86_400_000
 
 #: How long to sleep between two attempts to connect, seconds.
 _RETRY: Final = 0.2
@@ -177,7 +182,8 @@ def embed(**settings: str | float | bool | os.PathLike[str]) -> Client:
     """Worlds inside this process, with all that a `Client` can do, and without a server.
 
     Nobody else can watch them or fly in them, and they end with the client. Wherever a server's
-    results would depend on seeds and actions alone, theirs are the same bytes.
+    results would depend on seeds and actions alone, theirs are the same bytes. Leases end a day
+    after their last use. Ctrl-C ends the wait for a reset or a file, and comes after a step.
 
     Args:
         settings: Those of `emberwatch-server --help`, with underscores, such as `worlds=4`,
@@ -186,16 +192,22 @@ def embed(**settings: str | float | bool | os.PathLike[str]) -> Client:
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
     """
-    given = {name.replace("_", "-"): value for name, value in settings.items()}
-    return embed_flags(
-        f"--{name}={str(value).lower() if isinstance(value, bool) else value}"
-        for name, value in given.items()
-    )
+    flags = list[str]()
+    for name, given in settings.items():
+        value: Any = cast("Any", given).item() if isinstance(given, np.generic) else given
+        if isinstance(value, bool):
+            value = str(value).lower()
+        elif not isinstance(value, int | float):
+            value = utf8(name, value)
+        flags.append(f"--{name.replace('_', '-')}={value}")
+    return embed_flags(flags)
 
 
-def embed_flags(flags: Iterable[str]) -> Client:
+def embed_flags(flags: Sequence[str]) -> Client:
     """As `embed`, with the flags of a server."""
-    return Client("embedded", embedded=_native.Server.embedded(list(flags)))
+    if not any(flag.startswith("--lease-millis") for flag in flags):
+        flags = [*flags, f"--lease-millis={_EMBEDDED_LEASE}"]  # nobody else waits for its robots
+    return Client("(embedded)", embedded=_native.Server.embedded(flags))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

@@ -12,9 +12,10 @@ class EmberwatchError(Exception):
     Attributes:
         code: The cause. A refusal has the name of its status (PROTOCOL.md section 5), such as
             `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
-            earlier step or reset did not finish: reset or resume), `"forked"` (shared memory does
-            not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
-            and server are not of one release), `"program"` (could not be started, or failed),
+            earlier step or reset did not finish: reset or resume), `"forked"` (neither shared
+            memory nor embedded worlds survive `fork`), `"embedded"` (worlds in this process could
+            not be made), `"channel"` (iceoryx2 failed), `"bad_answer"` (client and server
+            are not of one release), `"program"` (could not be started, or failed),
             `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
     """

@@ -77,7 +77,7 @@ def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
     if is_open:
         raise TypeError(
             f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
-            f"that acts on a server's worlds: close it first, or make another with {maker}; "
+            f"that acts on worlds: close it first, or make another with {maker}; "
             "Client.snapshot and Lease.fork copy worlds"
         )
     return vars(environment).copy()

@@ -95,7 +95,7 @@ class Settings:
             raise invalid("backend", f"{SERVER!r} or {EMBEDDED!r}", repr(self.backend))
         if self.is_embedded and self.instance is not None:
             raise invalid("backend", f"{SERVER!r} with instance=...", repr(self.backend))
-        for name in ("task", "model", "states"):
+        for name in ("task", "model", "states", "start"):
             if getattr(self, name) is not None:
                 utf8(name, getattr(self, name))
         if self.robots is not None and self.robots < 1:
@@ -208,8 +208,8 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     """
     if settings.takeover or settings.world != 0 or settings.robot is not None:
         raise InvalidArgumentError(
-            "takeover, world, robot: expected instance=..., a running server to attach to; a "
-            f"private server has its own worlds, got world {settings.world}"
+            "takeover, world, robot: expected instance=..., a running server to attach to, and no "
+            f"backend; without one, worlds are an environment's own, got world {settings.world}"
         )
     n_robots = settings.robots or 1
     if settings.task is not None:
