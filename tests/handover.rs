@@ -219,3 +219,15 @@ fn an_agent_told_to_stop_leaves_its_belief() {
     assert_eq!(info.length, (3 + 1) * 16 * 16 * 4 + 16);
     assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }
+
+#[test]
+fn an_agent_that_lacks_something_takes_no_robot() {
+    let server = Server::start(SMALL);
+    let mut holder = server.acquire(0..1);
+    for policy in ["learned_beam", "oracle_beam"] {
+        let flags = format!("--policy {policy} --takeover --steps 1");
+        let ended = run(&server, &flags).ends(1);
+        assert!(ended.stderr.contains("needs"), "{}", ended.stderr);
+        fly(&mut holder, Paths::new(1).next(6));
+    }
+}

@@ -63,7 +63,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
     std::fs::write(path("page.md"), PAGE).expect("write");
     let [entries, page] = ["entries", "page.md"].map(|name| path(name).display().to_string());
     let board = format!("leaderboard --entries {entries} --page {page}");
-    let about = "--by us --code here --commit abc --training-seconds 5";
+    let about = "--by us --code here --commit abcdef0 --training-seconds 5";
     let entry = |policy: &str| format!("{board} --add {out} --policy {policy} {about}");
     check(
         AGENT,

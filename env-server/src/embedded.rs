@@ -45,6 +45,8 @@ pub struct Embedded {
     /// One thread: of two snapshots to one file the later one stays.
     file_thread: ThreadPool,
     n_files: Arc<AtomicUsize>,
+    /// Those of the last answer: the next is mostly as long.
+    n_bytes: usize,
     client: ClientId,
     started: Instant,
     rate: Rate,
@@ -80,6 +82,7 @@ impl Embedded {
             reset_threads: threads(n_threads)?,
             file_thread: threads(1)?,
             n_files: Arc::default(),
+            n_bytes: 0,
             client: ClientId {
                 node: 0,
                 pid: std::process::id(),
@@ -153,7 +156,7 @@ impl Embedded {
             version: VERSION,
             ..request
         };
-        let mut payload = Vec::new();
+        let mut payload = Vec::with_capacity(self.n_bytes);
         let stepped = self
             .simulator
             .step(now, self.client, &request, body, &mut payload);
@@ -161,6 +164,7 @@ impl Embedded {
             unreachable!("invariant: the only client names all robots that it holds in a world");
         };
         check_status("step", reply.status, reply.detail, None)?;
+        self.n_bytes = payload.len();
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         Ok((reply, payload))
     }

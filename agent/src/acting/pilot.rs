@@ -70,13 +70,28 @@ impl Pilot {
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );
-        let shape = info.shape()?;
+        if policy.estimator == EstimatorKind::Truth {
+            check_truth(mission, &info)?;
+        }
+        let any = Belief::from_initial(&model, info.shape()?);
+        let task = Task {
+            model: &model,
+            shape: any.shape(),
+            n_moves: 1,
+            prior: &any,
+            seed: 0,
+            learned: &mission.learned,
+        };
+        // Made first: an agent that lacks something must not take robots from one that flies them.
+        let agent = registry::agent(&policy, &mission.config, task)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
-        if policy.estimator.knows_model() {
-            let any = Belief::from_initial(&model, shape);
-            if let Some(attached) = Self::go_on(mission, &numbers, &model, &policy, &any)? {
-                return Ok(attached);
-            }
+        if let Some(kind) = agent
+            .handover_kind()
+            .filter(|_| policy.estimator.knows_model())
+            && is_belief_left(&mission.instance, numbers.start, &kind)?
+            && let Some(attached) = Self::go_on(mission, &numbers, &model, &policy, &any)?
+        {
+            return Ok(attached);
         }
         let prior = prior(mission, &info, &model, &policy)?;
         let mut attached = Self::acquire(mission, &numbers, &model, &policy, &prior)?;
@@ -87,7 +102,7 @@ impl Pilot {
         Ok(attached)
     }
 
-    /// Acquires the robots if a belief was left for the first, in the place of `any`.
+    /// Acquires the robots and takes over the belief that was left for the first, in the place of `any`.
     fn go_on(
         mission: &Mission,
         numbers: &Range<u32>,
@@ -95,21 +110,6 @@ impl Pilot {
         policy: &Policy,
         any: &Belief,
     ) -> Result<Option<Self>> {
-        let task = Task {
-            model,
-            shape: any.shape(),
-            n_moves: 1,
-            prior: any,
-            seed: 0,
-            learned: &mission.learned,
-        };
-        let agent = registry::agent(policy, &mission.config, task)?;
-        let Some(kind) = agent.handover_kind() else {
-            return Ok(None);
-        };
-        if !is_belief_left(&mission.instance, numbers.start, &kind)? {
-            return Ok(None);
-        }
         let mut attached = Self::acquire(mission, numbers, model, policy, any)?;
         if take_over_left(&mut attached.client, numbers.start, &mut attached.rollout)? {
             return Ok(Some(attached));
@@ -364,10 +364,15 @@ fn truth_of(
 }
 
 fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {
+    check_truth(mission, client.info())?;
+    TruthFeed::open(&mission.instance, client.shape())
+}
+
+fn check_truth(mission: &Mission, info: &ServerInfo) -> Result<()> {
     ensure!(
-        client.info().publish_truth,
+        info.publish_truth,
         "policy {:?} needs the truth channel: start the server with --publish-truth",
         mission.policy
     );
-    TruthFeed::open(&mission.instance, client.shape())
+    Ok(())
 }

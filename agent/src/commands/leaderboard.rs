@@ -82,6 +82,14 @@ impl LeaderboardCommand {
             "--training-seconds: expected 0 or more, got {}",
             about.training_seconds
         );
+        let is_hash = |text: &str| {
+            (7..=40).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_hexdigit())
+        };
+        ensure!(
+            is_hash(&about.commit),
+            "--commit: expected 7 to 40 hexadecimal digits, got {:?}",
+            about.commit
+        );
         for (flag, text) in [
             ("--policy", &about.policy),
             ("--by", &about.by),

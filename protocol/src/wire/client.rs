@@ -16,8 +16,8 @@ use std::time::Duration;
 /// How long a step may take, beside the server's deadline.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long anything else may take; resets simulate the burn-in of all their worlds.
-pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
+/// How long anything else may take; resets simulate the burn-in of all their worlds, on a busy machine for minutes.
+pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// What a robot's world shows after a step, or when the robot is acquired.
 #[derive(Debug, Clone, PartialEq)]
