@@ -266,7 +266,7 @@ def test_truths_are_those_of_embedded_worlds_that_publish_them(client: emberwatc
 
 
 def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
-    large = {"height": 512, "width": 512, "burn_in": 1000, "worlds": 3, "threads": 1}
+    large = {"height": 512, "width": 512, "burn_in": 4000, "worlds": 3, "threads": 1}
     with emberwatch.embed(**large, moves=4) as client:
         client.acquire(0).step([3] * 4)
         assert client.status().worlds[2].resetting
