@@ -68,7 +68,7 @@ impl Server {
     ) -> PyResult<Vec<Truth<'py>>> {
         let worlds = first_world..first_world.saturating_add(n_worlds);
         let read = |backend: &mut Backend| match backend {
-            Backend::Embedded(own) if own.info().publish_truth => {
+            Backend::Embedded(own) if own.publishes_truth() => {
                 let found = own.episodes(worlds.clone())?;
                 Ok(found.map(|found| worlds.zip(found).map(copied).collect::<Vec<_>>()))
             }

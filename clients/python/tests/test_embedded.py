@@ -234,11 +234,6 @@ def test_a_closed_environment_is_copied_and_an_open_one_refused() -> None:
     again.close()
 
 
-def test_many_large_worlds_are_refused() -> None:
-    with fails("embedded", match="memory: expected .* MiB for the worlds, got"):
-        emberwatch.embed(worlds=1024, height=4096, width=4096)
-
-
 def test_a_lease_that_nobody_knows_ends() -> None:
     with emberwatch.embed(robots=2, **FLAGS) as client:
         client.acquire(1, ttl=0.1)

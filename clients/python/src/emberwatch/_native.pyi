@@ -27,7 +27,7 @@ class Server:
         """Worlds in this process, with the flags of `emberwatch-server`."""
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
-        """The hidden states of embedded worlds, as the fields of `Truth`; None of a server's."""
+        """The hidden states of embedded worlds, as the fields of `Truth`; refused of a server's."""
 
     @property
     def info(self) -> str:

@@ -14,7 +14,7 @@ from emberwatch.wire import StepAnswer
 STEP_TIMEOUT: Final = 5.0
 
 #: Default timeout of what may wait for a burn-in, seconds.
-RESET_TIMEOUT: Final = 120.0
+RESET_TIMEOUT: Final = 600.0
 
 #: How this program names itself in logs.
 CLIENT: Final = f"emberwatch-python {VERSION}"
