@@ -178,7 +178,7 @@ def connect(
     return connect_with_retry(wait, lambda: Client(instance, timeout=timeout))
 
 
-def embed(**settings: str | float | bool | os.PathLike[str]) -> Client:
+def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
     """Worlds inside this process, with all that a `Client` can do, and without a server.
 
     Nobody else can watch them or fly in them, and they end with the client. Wherever a server's
@@ -187,13 +187,17 @@ def embed(**settings: str | float | bool | os.PathLike[str]) -> Client:
 
     Args:
         settings: Those of `emberwatch-server --help`, with underscores, such as `worlds=4`,
-            `task="small"`, `seed=7`; not `instance`, nor the server's own snapshots.
+            `task="small"`, `seed=7`; None: the default. Not `instance`, nor the server's own
+            snapshots.
 
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
+        EmberwatchError: With code `"embedded"` if there is too little memory.
     """
     flags = list[str]()
     for name, given in settings.items():
+        if given is None:
+            continue
         value: Any = cast("Any", given).item() if isinstance(given, np.generic) else given
         if isinstance(value, bool):
             value = str(value).lower()
