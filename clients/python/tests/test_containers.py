@@ -34,9 +34,11 @@ from emberwatch.env import WildfireEnv
 from emberwatch.errors import EmberwatchError
 from emberwatch.programs import Program, find
 def fill(left=0):
-    found = os.statvfs("/dev/shm")
     with open("/dev/shm/filler", "wb") as file:
-        os.posix_fallocate(file.fileno(), 0, found.f_bavail * found.f_frsize - left)
+        while True:
+            found = os.statvfs("/dev/shm")
+            try: return os.posix_fallocate(file.fileno(), 0, found.f_bavail * found.f_frsize - left)
+            except OSError: time.sleep(0.01)  # A program took a page in between.
 def tell(what, call):
     try: print(what, call(), flush=True)
     except EmberwatchError as error: print(what, error.code, error, flush=True)
