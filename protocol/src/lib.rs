@@ -21,7 +21,7 @@ pub use model::frame::{self, Coverage, Frame, UNOBSERVED};
 pub use model::grid::{self, Cell, Grid, Probabilities, Shape};
 pub use model::path::{self, Move};
 pub use model::transition::{self, Transition};
-pub use model::{Model, randomness, vectors};
+pub use model::{Airspace, Model, randomness, vectors};
 pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::decider::Decider;

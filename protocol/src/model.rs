@@ -3,6 +3,8 @@
 //! Nothing here knows the wire. [`grid`] is what every other file indexes; [`dynamics`] draws hidden states,
 //! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
 
+mod airspace;
+mod cell_map;
 mod check;
 mod description;
 pub mod dynamics;
@@ -15,9 +17,11 @@ pub mod randomness;
 pub mod transition;
 pub mod vectors;
 
+pub use airspace::{Airspace, SeenCell};
+pub use cell_map::CellMap;
 pub use description::{DescribedState, Description};
 pub use file::{
-    KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, ObservationEntry, StateEntry,
-    parse_color,
+    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
+    ObservationEntry, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
 };
 pub use parameters::Model;

@@ -6,3 +6,4 @@ mod models;
 mod own_state;
 mod statistics;
 mod transition;
+mod zones;

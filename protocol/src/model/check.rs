@@ -1,9 +1,13 @@
 //! The checks that turn a [`ModelFile`] into arrays; the first that fails names its entry.
 
+use super::cell_map::CellMap;
 use super::file::{
-    KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, StateEntry, parse_color,
+    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
+    StateEntry, parse_color,
 };
-use ndarray::{Array1, Array2, Array3, Array4};
+use super::grid::Grid;
+use ndarray::{Array1, Array2, Array4, ArrayViewMut1, s};
+use std::collections::HashSet;
 use std::ops::RangeInclusive;
 
 /// Range of weights and biases that are not zero, and of the size of rewards: no sum or product of
@@ -39,7 +43,7 @@ impl Checker<'_> {
             .iter()
             .map(|o| (&o.name, &o.color))
             .collect();
-        self.entries("state", "states", 2, &states)?;
+        self.entries("state", "states", 2..=MAX_VALUES, &states)?;
         for state in &file.states {
             let (name, is_plain) = (&state.name, |c: char| {
                 c.is_ascii_alphanumeric() || "-_".contains(c)
@@ -49,22 +53,25 @@ impl Checker<'_> {
                 return self.wrong("state name".into(), &expected, format!("{name:?}"));
             }
         }
-        self.entries("observation", "observations", 1, &observations)
+        self.entries("observation", "observations", 1..=MAX_VALUES, &observations)?;
+        let zones: Vec<_> = file.zones.iter().map(|z| (&z.name, &z.color)).collect();
+        self.entries("zone", "zones", 0..=MAX_ZONES, &zones)
     }
 
     fn entries(
         &self,
         what: &'static str,
         plural: &'static str,
-        least: usize,
+        range: RangeInclusive<usize>,
         entries: &[(&String, &String)],
     ) -> Result<(), ModelError> {
         let got = entries.len();
-        if !(least..=MAX_VALUES).contains(&got) {
+        if !range.contains(&got) {
             return Err(ModelError::Count {
                 model: self.model.into(),
                 what: plural,
-                least,
+                least: *range.start(),
+                most: *range.end(),
                 got,
             });
         }
@@ -123,25 +130,102 @@ impl Checker<'_> {
         Ok(())
     }
 
+    /// The observation matrices of the path and of each ring, side by side: shape `[S, O]`.
     pub fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
-        let n_observations = file.observations.len();
-        let mut likelihood = Array2::zeros((file.states.len(), n_observations));
-        for (state, mut row) in file.states.iter().zip(likelihood.rows_mut()) {
-            let what = format!("state {:?}: observed_as", state.name);
-            if state.observed_as.len() != n_observations {
-                let expected = format!("{n_observations} probabilities, one per observation");
-                return self.wrong(what, &expected, state.observed_as.len());
+        let (n_states, n_named) = (file.states.len(), file.observations.len());
+        let sensor = file.sensor.clone().unwrap_or_default();
+        if sensor.radius > MAX_RADIUS {
+            let expected = format!("0 to {MAX_RADIUS} cells");
+            return self.wrong("sensor: radius".into(), &expected, sensor.radius);
+        }
+        let (n_rings, got) = (1 + sensor.rings.len(), sensor.rings.len());
+        if got > sensor.radius {
+            let expected = format!("at most {} rings, as the radius is", sensor.radius);
+            return self.wrong("sensor: rings".into(), &expected, got);
+        }
+        if n_named * n_rings > MAX_VALUES {
+            let expected = format!("at most {MAX_VALUES} observations times observation matrices");
+            return self.wrong("sensor: rings".into(), &expected, n_named * n_rings);
+        }
+        let mut likelihood = Array2::zeros((n_states, n_named * n_rings));
+        for (state, entry) in file.states.iter().enumerate() {
+            let what = format!("state {:?}: observed_as", entry.name);
+            let row = likelihood.slice_mut(s![state, ..n_named]);
+            self.observed_as(what, &entry.observed_as, row)?;
+        }
+        for (index, ring) in sensor.rings.iter().enumerate() {
+            let what = format!("sensor: ring {}: observed_as", index + 1);
+            if ring.observed_as.len() != n_states {
+                let expected = format!("{n_states} rows, one per state");
+                return self.wrong(what, &expected, ring.observed_as.len());
             }
-            self.distribution(&what, &state.observed_as)?;
-            let sum: f64 = state.observed_as.iter().sum();
-            row.iter_mut()
-                .zip(&state.observed_as)
-                .for_each(|(to, p)| *to = p / sum);
+            for (state, values) in ring.observed_as.iter().enumerate() {
+                let what = format!("{what} of state {:?}", file.states[state].name);
+                let columns = (index + 1) * n_named..(index + 2) * n_named;
+                self.observed_as(what, values, likelihood.slice_mut(s![state, columns]))?;
+            }
         }
         Ok(likelihood)
     }
 
-    /// One kernel for all cells, or one for each state that a cell itself can be in.
+    /// Writes one state's row of an observation matrix.
+    fn observed_as(
+        &self,
+        what: String,
+        values: &[f64],
+        mut row: ArrayViewMut1<'_, f64>,
+    ) -> Result<(), ModelError> {
+        if values.len() != row.len() {
+            let expected = format!("{} probabilities, one per observation", row.len());
+            return self.wrong(what, &expected, values.len());
+        }
+        self.distribution(&what, values)?;
+        let sum: f64 = values.iter().sum();
+        row.iter_mut().zip(values).for_each(|(to, p)| *to = p / sum);
+        Ok(())
+    }
+
+    /// The zone of each cell, if there are zones.
+    pub fn zone_map(&self, file: &ModelFile) -> Result<Option<Grid<u8>>, ModelError> {
+        let n_zones = file.zones.len();
+        let Some(map) = &file.zone_map else {
+            return match n_zones {
+                0 => Ok(None),
+                _ => self.wrong("zone_map".into(), "the zone of each cell", "none"),
+            };
+        };
+        let map = self.map("zone_map", map)?;
+        match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
+            None => Ok(Some(map)),
+            Some(got) => {
+                let expected = format!("zones below {n_zones}, as `zones` has");
+                self.wrong("zone_map".into(), &expected, got)
+            }
+        }
+    }
+
+    /// Where no robot may be, if there is such a cell.
+    pub fn no_fly(&self, file: &ModelFile) -> Result<Option<Grid<bool>>, ModelError> {
+        let Some(map) = &file.no_fly else {
+            return Ok(None);
+        };
+        let map = self.map("no_fly", map)?;
+        if let Some(got) = map.iter().find(|&&flag| flag > 1) {
+            return self.wrong("no_fly".into(), "0 or 1 for each cell", got);
+        }
+        if map.iter().all(|&flag| flag == 1) {
+            return self.wrong("no_fly".into(), "a cell where robots may be", "none");
+        }
+        let any = map.iter().any(|&flag| flag == 1);
+        Ok(any.then(|| map.mapv(|flag| flag == 1)))
+    }
+
+    fn map(&self, what: &str, map: &CellMap) -> Result<Grid<u8>, ModelError> {
+        map.grid()
+            .or_else(|(expected, got)| self.wrong(what.into(), &expected, got))
+    }
+
+    /// One kernel for all cells, or one for each state that a cell itself can be in; as many for each zone.
     pub fn kernels(&self, file: &ModelFile) -> Result<Vec<Array4<f64>>, ModelError> {
         let [height, width] = file.kernel_size;
         let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
@@ -154,16 +238,19 @@ impl Checker<'_> {
             );
         }
         let n_states = file.states.len();
-        let n_kernels = self.n_kernels(file)?;
-        let mut kernels = vec![Array4::zeros((n_states, n_states, height, width)); n_kernels];
-        let mut filled = Array3::from_elem((n_kernels, n_states, n_states), false);
+        let (n_zones, n_own) = (file.zones.len().max(1), self.n_own(file)?);
+        self.check_zones(file)?;
+        let mut kernels = vec![Array4::zeros((n_states, n_states, height, width)); n_zones * n_own];
+        let mut filled = HashSet::new();
         for entry in &file.kernel {
             let own = match &entry.own {
                 Some(own) => self.state(file, own)?,
                 None => 0,
             };
+            let named = |name: &String| file.zones.iter().position(|zone| zone.name == *name);
+            let zone = entry.zone.as_ref().and_then(named).unwrap_or(0);
             let (to, from) = (self.state(file, &entry.to)?, self.state(file, &entry.from)?);
-            if std::mem::replace(&mut filled[[own, to, from]], true) {
+            if !filled.insert((zone, own, to, from)) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
             // The centre of a cell's kernel is the cell itself: weights of other states there have no effect.
@@ -173,13 +260,44 @@ impl Checker<'_> {
                 if is_void((row, col)) {
                     continue;
                 }
-                kernels[own][[to, from, row, col]] = weight;
+                kernels[zone * n_own + own][[to, from, row, col]] = weight;
             }
         }
         Ok(kernels)
     }
 
-    fn n_kernels(&self, file: &ModelFile) -> Result<usize, ModelError> {
+    /// Checks that each zone has kernels, and each kernel a zone, if there are zones.
+    fn check_zones(&self, file: &ModelFile) -> Result<(), ModelError> {
+        let names: HashSet<&str> = file.zones.iter().map(|zone| zone.name.as_str()).collect();
+        let mut with_kernel = HashSet::new();
+        for entry in &file.kernel {
+            let zone = entry.zone.as_deref();
+            let fits = zone.map_or(names.is_empty(), |zone| names.contains(zone));
+            if !fits {
+                let expected = if names.is_empty() {
+                    "no zone, as `zones` has none"
+                } else {
+                    "the name of one of `zones`"
+                };
+                let got = zone.map_or("none".into(), |zone| format!("{zone:?}"));
+                return self.wrong(format!("{}: zone", entry.what()), expected, got);
+            }
+            with_kernel.extend(zone);
+        }
+        match file
+            .zones
+            .iter()
+            .find(|zone| !with_kernel.contains(&*zone.name))
+        {
+            None => Ok(()),
+            Some(zone) => {
+                let what = format!("zone {:?}", zone.name);
+                self.wrong(what, "kernel entries of its own", "none")
+            }
+        }
+    }
+
+    fn n_own(&self, file: &ModelFile) -> Result<usize, ModelError> {
         let names_own = |entry: &&KernelEntry| entry.own.is_some();
         let n_named = file.kernel.iter().filter(names_own).count();
         if n_named == 0 {

@@ -1,6 +1,7 @@
 //! The description of a recorded world in TOML: a model file without a transition.
 
-use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, StateEntry};
+use super::cell_map::CellMap;
+use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, SensorEntry, StateEntry};
 use super::parameters::Model;
 use serde::{Deserialize, Serialize};
 
@@ -12,6 +13,12 @@ pub struct Description {
     pub name: String,
     /// What one step means in time, for people.
     pub step: String,
+    /// 1 for each cell where no robot may be, as in a [`ModelFile`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub no_fly: Option<CellMap>,
+    /// What a robot sees, as in a [`ModelFile`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<SensorEntry>,
     /// The states, in the order of their values.
     pub states: Vec<DescribedState>,
     /// The observations, in the order of their values.
@@ -50,6 +57,7 @@ impl Description {
             observed_as: state.observed_as.clone(),
         };
         let stays = |state: &DescribedState| KernelEntry {
+            zone: None,
             own: None,
             from: state.name.clone(),
             to: state.name.clone(),
@@ -59,6 +67,11 @@ impl Description {
         Model::new(ModelFile {
             name: self.name.clone(),
             kernel_size: [1, 1],
+            zones_public: true,
+            zone_map: None,
+            no_fly: self.no_fly.clone(),
+            sensor: self.sensor.clone(),
+            zones: Vec::new(),
             states: self.states.iter().map(state).collect(),
             observations: self.observations.clone(),
             kernel: self.states.iter().map(stays).collect(),

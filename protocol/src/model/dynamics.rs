@@ -59,8 +59,12 @@ pub struct Dynamics {
 struct Tables {
     n_states: usize,
     initial: Vec<f64>,
-    /// One, or one for each state that a cell itself can be in.
+    /// One, or one for each state that a cell itself can be in; as many for each zone.
     kernels: Vec<Kernel>,
+    /// Kernels of a zone.
+    n_own: usize,
+    /// The zone of each home, where zones differ.
+    zones: Option<Vec<u8>>,
     /// Where each tap reads, relative to a cell's home.
     offsets: Vec<usize>,
     bytes: Bytes,
@@ -139,7 +143,7 @@ impl Dynamics {
     fn sum_kernels(&mut self, n_undecided: usize, words: &mut Words) {
         for &home in &self.undecided[..n_undecided] {
             let home = home as usize;
-            let weights = self.tables.weights(&self.places.states[home..]);
+            let weights = self.tables.weights(home, &self.places.states[home..]);
             let weights = &weights[..self.tables.n_states];
             self.places.next[home] = invert(weights, uniform(words.draw()));
         }
@@ -149,9 +153,9 @@ impl Dynamics {
 impl Tables {
     fn new(model: &Model, shape: Shape, places: &Places) -> Self {
         let kernels = Kernel::of_model(model);
-        let mixtures = Mixture::of_kernels(&kernels, model.sees_own_state());
-        let offsets = places.offsets(model);
-        let parents = Parents::new(&mixtures, &offsets);
+        let mixtures = Mixture::of_kernels(&kernels, model.n_zones(), model.sees_own_state());
+        let (offsets, zones) = (places.offsets(model), places.zones(model));
+        let parents = Parents::new(&mixtures, &offsets, zones.as_deref());
         // Summed kernels follow the whole distribution: no byte may stand for part of it.
         let by_bytes = if parents.is_some() {
             &mixtures[..]
@@ -161,16 +165,20 @@ impl Tables {
         Self {
             n_states: model.n_states(),
             initial: model.initial().to_vec(),
-            bytes: Bytes::new(by_bytes, &offsets, shape, places.stride),
+            bytes: Bytes::new(by_bytes, &offsets, shape, places.stride, zones.as_deref()),
             parents,
+            n_own: kernels.len() / model.n_zones(),
             kernels,
+            zones,
             offsets,
         }
     }
 
     /// Eq. 2: the weight of each next state of a cell, by the states from its home on.
-    fn weights(&self, states: &[u8]) -> [f64; MAX_VALUES] {
-        let kernel = match &self.kernels[..] {
+    fn weights(&self, home: usize, states: &[u8]) -> [f64; MAX_VALUES] {
+        let zone = self.zones.as_ref().map_or(0, |zones| zones[home]);
+        let of_zone = &self.kernels[usize::from(zone) * self.n_own..][..self.n_own];
+        let kernel = match of_zone {
             [kernel] => kernel,
             by_own_state => &by_own_state[usize::from(states[centre(&self.offsets)])],
         };

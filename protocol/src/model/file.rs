@@ -1,5 +1,6 @@
 //! The model file in TOML, and the errors in one.
 
+use super::cell_map::CellMap;
 use super::grid::{Cell, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -14,6 +15,12 @@ pub const MAX_KERNEL_SIDE: usize = 15;
 /// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
+/// Most zones: as many as a byte tells apart.
+pub const MAX_ZONES: usize = 256;
+
+/// Largest radius of a sensor: 8 cells.
+pub const MAX_RADIUS: usize = 8;
+
 /// A model as written in TOML; [`super::Model::new`] checks it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -22,6 +29,21 @@ pub struct ModelFile {
     pub name: String,
     /// Rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
+    /// Whether learners are told the zones.
+    #[serde(default = "yes", skip_serializing_if = "is_yes")]
+    pub zones_public: bool,
+    /// The zone of each cell: its place in `zones`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zone_map: Option<CellMap>,
+    /// 1 for each cell where no robot may be.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub no_fly: Option<CellMap>,
+    /// What a robot sees; without it, the cells of its path.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<SensorEntry>,
+    /// Kinds of land, each with kernels of its own.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub zones: Vec<ZoneEntry>,
     /// The states, in the order of their values.
     pub states: Vec<StateEntry>,
     /// The observations, in the order of their values.
@@ -60,10 +82,58 @@ pub struct ObservationEntry {
     pub color: String,
 }
 
+/// What a robot sees from its path.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SensorEntry {
+    /// Rows and columns that it sees beyond each cell of the path (a Chebyshev distance).
+    #[serde(default)]
+    pub radius: usize,
+    /// The cells that pay.
+    #[serde(default)]
+    pub pays: Pays,
+    /// The observation matrix of ring 1, 2 and so on; the last holds for the rings beyond. Without one, `observed_as`
+    /// of the states holds everywhere.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub rings: Vec<RingEntry>,
+}
+
+/// The observation matrix of a ring.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RingEntry {
+    /// `P(y | x)`: a row for each state, one entry per observation.
+    pub observed_as: Vec<Vec<f64>>,
+}
+
+/// The distinct cells that earn their states' rewards.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Pays {
+    /// Those on the path.
+    #[default]
+    Visited,
+    /// Those in sight of the path.
+    Seen,
+}
+
+/// A kind of land in a model file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZoneEntry {
+    /// Name, unique among the zones.
+    pub name: String,
+    /// Colour in pictures, `#rrggbb`.
+    pub color: String,
+}
+
 /// One block `w[to, from]` of the kernel in a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KernelEntry {
+    /// Name of the zone; in all entries of a file, or in none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zone: Option<String>,
     /// Name of the state that the cell itself is in at k; in all entries of a file, or in none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub own: Option<String>,
@@ -86,7 +156,7 @@ pub enum ModelError {
     #[error("model file: {0}")]
     Toml(String),
     /// Too few or too many states or observations.
-    #[error("model {model:?}: expected {least} to {MAX_VALUES} {what}, got {got}")]
+    #[error("model {model:?}: expected {least} to {most} {what}, got {got}")]
     Count {
         /// The model's name.
         model: String,
@@ -94,6 +164,8 @@ pub enum ModelError {
         what: &'static str,
         /// Smallest number allowed.
         least: usize,
+        /// Largest number allowed.
+        most: usize,
         /// Number in the file.
         got: usize,
     },
@@ -106,6 +178,14 @@ pub enum ModelError {
         what: &'static str,
         /// The repeated name.
         name: String,
+    },
+    /// A file that cannot be read.
+    #[error("{path}: {problem}")]
+    File {
+        /// The file.
+        path: String,
+        /// Why not.
+        problem: String,
     },
     /// A kernel entry that names a state the model lacks.
     #[error("model {model:?}: kernel entry names state {name:?}, expected one of {known:?}")]
@@ -164,9 +244,11 @@ impl KernelEntry {
     /// Names the entry in errors.
     pub(super) fn what(&self) -> String {
         let pair = format!("from {:?} to {:?}", self.from, self.to);
+        let zone = self.zone.iter().map(|zone| format!("in zone {zone:?} "));
+        let zone: String = zone.collect();
         match &self.own {
-            Some(own) => format!("kernel of {own:?} {pair}"),
-            None => format!("kernel {pair}"),
+            Some(own) => format!("kernel {zone}of {own:?} {pair}"),
+            None => format!("kernel {zone}{pair}"),
         }
     }
 }
@@ -182,4 +264,13 @@ pub fn parse_color(text: &str) -> Option<[u8; 3]> {
 
 fn one() -> f64 {
     1.0
+}
+
+fn yes() -> bool {
+    true
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's form")]
+fn is_yes(it: &bool) -> bool {
+    *it
 }

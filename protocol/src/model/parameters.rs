@@ -3,10 +3,13 @@
 //! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of eq. 1.
 //! [`super::file`] is the file format. [`super::transition`] applies them to beliefs, [`super::dynamics`] to states.
 
+use super::airspace::Airspace;
 use super::check::Checker;
-use super::file::{LEAST_SHARE, ModelError, ModelFile};
-use super::grid::{Cell, Shape};
+use super::file::{LEAST_SHARE, ModelError, ModelFile, Pays};
+use super::grid::{Cell, Grid, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
+use std::path::Path;
+use std::sync::Arc;
 
 /// The built-in models by name.
 const BUILT_IN: [(&str, &str); 6] = [
@@ -39,6 +42,9 @@ pub struct Model {
     likelihood: Array2<f64>,
     initial: Array1<f64>,
     reward: Array1<f64>,
+    zone_map: Option<Arc<Grid<u8>>>,
+    /// Where no robot may be.
+    no_fly: Option<Arc<Grid<bool>>>,
 }
 
 impl Model {
@@ -69,6 +75,34 @@ impl Model {
         Self::new(file)
     }
 
+    /// Reads and checks a model file and the maps beside it.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or an entry is wrong.
+    pub fn read(path: &Path) -> Result<Self, ModelError> {
+        Self::new(ModelFile::read(path)?)
+    }
+
+    /// The same with a sensor that sees so many cells far, which `pays`, where they are given.
+    ///
+    /// # Errors
+    /// If the radius is over 8.
+    pub fn with_sensor(
+        self,
+        radius: Option<usize>,
+        pays: Option<Pays>,
+    ) -> Result<Self, ModelError> {
+        if radius.is_none() && pays.is_none() {
+            return Ok(self);
+        }
+        let mut file = self.file;
+        let sensor = file.sensor.get_or_insert_default();
+        sensor.radius = radius.unwrap_or(sensor.radius);
+        sensor.pays = pays.unwrap_or(sensor.pays);
+        sensor.rings.truncate(sensor.radius);
+        Self::new(file)
+    }
+
     /// Checks a model file and lays out its arrays.
     ///
     /// # Errors
@@ -83,7 +117,11 @@ impl Model {
         check.distribution("initial", initial.as_slice().unwrap_or_default())?;
         let likelihood = check.likelihood(&file)?;
         let initial = &initial / initial.sum();
+        let zone_map = check.zone_map(&file)?.map(Arc::new);
+        let no_fly = check.no_fly(&file)?.map(Arc::new);
         Ok(Self {
+            zone_map,
+            no_fly,
             file,
             kernels,
             bias,
@@ -93,16 +131,31 @@ impl Model {
         })
     }
 
-    /// Checks that eq. 3 never divides by zero or nearly zero on a grid, whatever the states.
+    /// Checks that its maps are of a grid, and that eq. 3 never divides by zero or nearly zero there, whatever the
+    /// states.
     ///
     /// # Errors
-    /// If it can; the error names the first such cell.
+    /// If they are not, or it can; the error names the first such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
-        (0..self.kernels.len()).try_for_each(|own| self.check_kernel_on(own, shape))
+        let maps = [
+            ("zone_map", self.zone_map.as_ref().map(|map| map.dim())),
+            ("no_fly", self.no_fly.as_ref().map(|map| map.dim())),
+        ];
+        for (what, dim) in maps {
+            if let Some((height, width)) = dim.filter(|&dim| dim != shape.dim()) {
+                return Err(ModelError::Value {
+                    model: self.name().into(),
+                    what: what.into(),
+                    expected: format!("a map of the {shape} grid"),
+                    got: format!("{height} x {width}"),
+                });
+            }
+        }
+        (0..self.kernels.len()).try_for_each(|kernel| self.check_kernel_on(kernel, shape))
     }
 
-    fn check_kernel_on(&self, own: usize, shape: Shape) -> Result<(), ModelError> {
-        let kernel = &self.kernels[own];
+    fn check_kernel_on(&self, index: usize, shape: Shape) -> Result<(), ModelError> {
+        let (kernel, own) = (&self.kernels[index], index % self.n_own());
         let column_sums = kernel.sum_axis(Axis(0));
         let mut least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
         let (kernel_height, kernel_width) = least.dim();
@@ -110,8 +163,10 @@ impl Model {
             let (row, col) = (kernel_height / 2, kernel_width / 2);
             least[[row, col]] = column_sums[[own, row, col]];
         }
-        let largest = kernel
-            .iter()
+        // Of all zones: they are computed with one scale.
+        let in_zones = self.kernels.iter().skip(own).step_by(self.n_own());
+        let largest = in_zones
+            .flatten()
             .chain(&self.bias)
             .copied()
             .fold(f64::MIN_POSITIVE, f64::max);
@@ -167,23 +222,81 @@ impl Model {
         self.file.states.len()
     }
 
-    /// Number of observations O.
+    /// Number of observations O: those that the file names, once for each observation matrix of the sensor.
     pub fn n_observations(&self) -> usize {
-        self.file.observations.len()
+        self.likelihood.ncols()
+    }
+
+    /// Observation matrices of the sensor: of the path itself, then of each ring around it, up to the radius; the last
+    /// holds for the rings beyond. Observation `y` by matrix `m` has the number `m * O / n_rings + y`.
+    pub fn n_rings(&self) -> usize {
+        1 + self
+            .file
+            .sensor
+            .as_ref()
+            .map_or(0, |sensor| sensor.rings.len())
+    }
+
+    /// Names of the observations: those of rings further out end in the ring.
+    pub fn observation_names(&self) -> Vec<String> {
+        let names = (0..self.n_rings()).flat_map(|ring| {
+            self.file.observations.iter().map(move |it| match ring {
+                0 => it.name.clone(),
+                _ => format!("{} ring {ring}", it.name),
+            })
+        });
+        names.collect()
     }
 
     /// Whether a cell's weights depend on the state that it is in itself.
     pub fn sees_own_state(&self) -> bool {
-        self.kernels.len() > 1
+        self.n_own() > 1
+    }
+
+    /// Kernels of a zone: 1, or S if cells see their own state.
+    fn n_own(&self) -> usize {
+        self.kernels.len() / self.n_zones()
+    }
+
+    /// Number of zones, 1 where all cells are alike.
+    pub fn n_zones(&self) -> usize {
+        self.file.zones.len().max(1)
+    }
+
+    /// The zone of each cell, shape `[H, W]`, where cells differ.
+    pub fn zone_map(&self) -> Option<&Arc<Grid<u8>>> {
+        self.zone_map.as_ref()
+    }
+
+    /// Whether learners are told the zones.
+    pub fn zones_are_public(&self) -> bool {
+        self.file.zones_public
+    }
+
+    /// Where robots of a grid may fly, and what they see from there.
+    ///
+    /// # Errors
+    /// If maps are of another grid.
+    pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
+        self.check_on(shape)?;
+        let sensor = self.file.sensor.clone().unwrap_or_default();
+        Ok(Airspace::new(
+            shape,
+            self.no_fly.clone(),
+            sensor.radius,
+            self.n_rings(),
+            sensor.pays,
+        ))
     }
 
     /// Transition weights `w[to, from, row, col]`, shape `[S, S, KH, KW]`, all `>= 0` (eq. 2): one kernel
-    /// for all cells, or one for each state that a cell itself can be in.
+    /// for all cells, or one for each state that a cell itself can be in; as many for each zone, one zone after the
+    /// other.
     pub fn kernels(&self) -> &[Array4<f64>] {
         &self.kernels
     }
 
-    /// The first of [`Model::kernels`]: that of all cells, unless [`Model::sees_own_state`].
+    /// The first of [`Model::kernels`]: that of all cells, unless there are zones or [`Model::sees_own_state`].
     pub fn kernel(&self) -> &Array4<f64> {
         &self.kernels[0]
     }
@@ -193,7 +306,7 @@ impl Model {
         &self.bias
     }
 
-    /// `P(y | x)`, shape `[S, O]`; each row sums to one (eq. 1).
+    /// `P(y | x)`, shape `[S, O]`; each row sums to one for each of the [`Model::n_rings`] matrices (eq. 1).
     pub fn likelihood(&self) -> &Array2<f64> {
         &self.likelihood
     }
@@ -233,218 +346,4 @@ impl Model {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::model::KernelEntry;
-
-    #[test]
-    fn built_in_models_have_their_names_and_fit_the_grid() {
-        let shape = Shape::new(64, 64).expect("test shape");
-        let mut n_models = 0;
-        for name in Model::built_in_names() {
-            let model = Model::built_in(name).expect(name);
-            assert_eq!(model.name(), name);
-            assert_eq!(model.check_on(shape), Ok(()), "{name}");
-            n_models += 1;
-        }
-        assert_eq!(n_models, 6);
-        assert_eq!(Model::built_in("wildfire-dense"), None);
-    }
-
-    #[test]
-    fn the_built_in_model_has_the_published_parameters() {
-        // Factors g = 0.1, a0 = 0.9999, a1 = 0.99992, a2 = 0.999; the authors' kernel.
-        let model = Model::wildfire();
-        let around = [[0.1, 0.1, 0.1], [0.1, 1.0, 0.1], [0.1, 0.1, 0.1]];
-        let drift = [[0.12, 0.12, 0.12], [0.1, 1.0, 0.1], [0.08, 0.08, 0.08]];
-        let blocks = [
-            (0, 0, 0.9999, around),
-            (0, 2, 1.0 - 0.9999, around),
-            (1, 1, 0.99992, around),
-            (1, 0, 1.0 - 0.99992, around),
-            (2, 1, 1.0 - 0.999, around),
-            (2, 2, 0.999, drift),
-        ];
-        let mut expected = Array4::<f64>::zeros((3, 3, 3, 3));
-        for (to, from, scale, block) in blocks {
-            for (row, values) in block.iter().enumerate() {
-                for (col, value) in values.iter().enumerate() {
-                    expected[[to, from, row, col]] = scale * value;
-                }
-            }
-        }
-        assert!((&expected - model.kernel()).iter().all(|d| d.abs() < 1e-12));
-        assert_eq!(model.likelihood().row(1).to_vec(), [0.80, 0.15, 0.05]);
-        assert_eq!(model.initial().to_vec(), [0.99, 0.01, 0.0]);
-        assert_eq!(model.target_state(), 2);
-    }
-
-    fn check(change: impl FnOnce(&mut ModelFile), expected: &str) {
-        let mut file = Model::wildfire().file;
-        change(&mut file);
-        let error = Model::new(file)
-            .expect_err("the change must be rejected")
-            .to_string();
-        assert!(
-            error.contains(expected),
-            "{error:?} does not say {expected:?}"
-        );
-    }
-
-    #[test]
-    fn wrong_entries_are_rejected_by_name() {
-        check(|f| f.states.truncate(1), "expected 2 to 64 states, got 1");
-        check(
-            |f| f.states[1].name = "normal".into(),
-            "state name \"normal\" stands twice",
-        );
-        check(
-            |f| f.kernel[0].weights[0][1] = -0.1,
-            "kernel from \"normal\" to \"normal\": expected finite weights >= 0, got -0.",
-        );
-        check(
-            |f| f.states[0].name = "explore".into(),
-            "state name: expected letters, digits, '-' and '_', and none of",
-        );
-        check(|f| f.kernel[0].scale = f64::NAN, "got NaN");
-        check(|f| f.kernel[0].to = "ash".into(), "names state \"ash\"");
-        check(|f| f.kernel_size = [3, 5], "expected 3 rows of 5 weights");
-        check(
-            |f| f.kernel_size = [2, 3],
-            "two odd numbers up to 15, got [2, 3]",
-        );
-        check(
-            |f| f.states[2].observed_as = vec![0.5, 0.4, 0.0],
-            "observed_as: expected a sum of 1, got 0.9",
-        );
-        check(
-            |f| f.states[2].observed_as = vec![1.0],
-            "expected 3 probabilities",
-        );
-        check(
-            |f| f.states[0].initial = 0.5,
-            "initial: expected a sum of 1, got 0.51",
-        );
-        check(|f| f.states[0].bias = -1.0, "state \"normal\": bias");
-        check(
-            |f| f.states[0].color = "red".into(),
-            "expected #rrggbb, got red",
-        );
-        check(|f| f.states[0].color = "#+1+2+3".into(), "got #+1+2+3");
-        check(
-            |f| f.kernel.push(f.kernel[0].clone()),
-            "expected one entry for each pair of states, got two",
-        );
-    }
-
-    #[test]
-    fn numbers_too_large_or_too_small_to_compute_with_are_rejected() {
-        let around = "0, or a size of 1e-100 to 1e100";
-        for (number, shown) in [(1e101, "e101"), (1e-320, "e-320")] {
-            check(|f| f.states[0].bias = number, around);
-            check(|f| f.states[2].reward = -number, shown);
-            check(|f| f.kernel[0].weights[1][1] = number, around);
-        }
-        // Each factor is in range, their product vanishes.
-        check(
-            |f| {
-                f.kernel[0].scale = 1e-99;
-                f.kernel[0].weights = vec![vec![1e-99; 3]; 3];
-            },
-            "kernel from \"normal\" to \"normal\": expected 0, or a size of",
-        );
-    }
-
-    #[test]
-    fn weights_that_can_vanish_beside_the_largest_are_rejected() {
-        let mut file = Model::wildfire().file;
-        for entry in file.kernel.iter_mut().filter(|e| e.from == "latent") {
-            entry.scale *= 1e-31;
-        }
-        let shape = Shape::new(4, 4).expect("test shape");
-        let error = Model::new(file.clone()).expect("valid until a grid is named");
-        let error = error.check_on(shape).expect_err("a cell among latent ones");
-        assert!(
-            matches!(error, ModelError::FaintWeight { share, .. } if share > 0.0),
-            "{error}"
-        );
-        file.states[0].bias = 1e-6;
-        let rescued = Model::new(file).expect("valid");
-        assert_eq!(rescued.check_on(shape), Ok(()));
-    }
-
-    #[test]
-    fn weights_that_can_sum_to_zero_are_rejected_on_the_grid_where_they_can() {
-        let mut file = Model::wildfire().file;
-        for entry in &mut file.kernel {
-            entry.weights[1][1] = 0.0;
-        }
-        let model = Model::new(file).expect("valid until a grid is named");
-        let shape = |height, width| Shape::new(height, width).expect("test shape");
-        assert_eq!(model.check_on(shape(5, 9)), Ok(()));
-        let error = model
-            .check_on(shape(1, 1))
-            .expect_err("a cell without neighbours");
-        assert!(error.to_string().contains("cell (0, 0)"), "{error}");
-        assert_eq!(Model::wildfire().check_on(shape(1, 1)), Ok(()));
-    }
-
-    #[test]
-    fn kernels_of_own_states_are_checked() {
-        let check = |change: fn(&mut ModelFile), expected: &str| {
-            let mut file = burnout().file;
-            change(&mut file);
-            let error = Model::new(file).and_then(|model| {
-                let shape = Shape::new(2, 2).expect("test shape");
-                model.check_on(shape)
-            });
-            let error = error.expect_err(expected).to_string();
-            assert!(
-                error.contains(expected),
-                "{error:?} does not say {expected:?}"
-            );
-        };
-        check(
-            |f| f.kernel[1].own = None,
-            "kernel: expected own in every entry, or in none, got 7 of 8",
-        );
-        check(
-            |f| f.kernel[1].own = Some("ash".into()),
-            "names state \"ash\"",
-        );
-        check(
-            |f| f.kernel.push(f.kernel[7].clone()),
-            "kernel of \"burnt\" from \"burnt\" to \"unburnt\": expected one entry for each",
-        );
-        check(|f| f.kernel[2].scale = -1.0, "expected finite weights >= 0");
-        // Burning cells have no weight left; those of others in the centre are no help.
-        check(
-            |f| {
-                f.kernel
-                    .retain(|entry| entry.own.as_deref() != Some("burning"));
-                let unburnt = f.kernel[0].clone();
-                f.kernel.push(KernelEntry {
-                    own: Some("burning".into()),
-                    ..unburnt
-                });
-            },
-            "transition weights of cell (0, 0) can sum to zero",
-        );
-    }
-
-    fn burnout() -> Model {
-        Model::built_in("wildfire-burnout").expect("built in")
-    }
-
-    #[test]
-    fn a_model_file_survives_toml() {
-        for model in [Model::wildfire(), burnout()] {
-            let text = toml::to_string(model.file()).expect("models serialise");
-            assert_eq!(Model::from_toml(&text), Ok(model));
-        }
-        assert!(matches!(
-            Model::from_toml("name = 3"),
-            Err(ModelError::Toml(_))
-        ));
-    }
-}
+mod tests;

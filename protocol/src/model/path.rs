@@ -1,5 +1,6 @@
 //! A robot's path: [`Move`]s from a start cell to the cells flown over (paper eq. 12).
 
+use super::airspace::Airspace;
 use super::grid::{Cell, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -102,37 +103,9 @@ pub fn path_to_bytes(path: &[Move]) -> Vec<u8> {
     path.iter().map(|&m| m as u8).collect()
 }
 
-/// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, each move clamped to the grid).
+/// Flies a path from `start` over a grid without no-fly cells, as [`Airspace::fly`].
 pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
-    let mut visited = Vec::new();
-    let end = fly_into(shape, start, path, &mut visited, &mut Vec::new());
-    Flight { visited, end }
-}
-
-/// [`fly`] without new memory: the visited cells go to `visited`; `seen` is scratch of any content. Returns the
-/// robot's last cell.
-pub fn fly_into(
-    shape: Shape,
-    start: Cell,
-    path: &[Move],
-    visited: &mut Vec<usize>,
-    seen: &mut Vec<u64>,
-) -> Cell {
-    seen.clear();
-    seen.resize(shape.n_cells().div_ceil(64), 0);
-    visited.resize(path.len(), 0);
-    let (mut n_visited, mut cell) = (0, start);
-    for &step in path {
-        cell = step.apply(cell, shape);
-        let index = shape.index(cell);
-        // Branch-free: whether a random path has been here before is not predictable either.
-        let (word, bit) = (&mut seen[index / 64], index % 64);
-        visited[n_visited] = index;
-        n_visited += usize::from(*word >> bit & 1 == 0);
-        *word |= 1 << bit;
-    }
-    visited.truncate(n_visited);
-    cell
+    Airspace::open(shape).fly(start, path)
 }
 
 #[cfg(test)]

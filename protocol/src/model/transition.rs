@@ -9,7 +9,9 @@
 //! sees `o` itself: `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it takes the
 //! cell and its neighbours for independent, as the filter does.
 //!
-//! `tests/model/transition.rs` and `own_state.rs` have these sums as they stand, and compare for any models and grids.
+//! Where a land has zones, each cell has the weights of its zone.
+//!
+//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs` have these sums as they stand, and compare for any models and grids.
 //!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
 //! a margin of zeros, so no cell is special and many are computed at once. And taps that weigh alike are added up
@@ -20,12 +22,14 @@ mod layout;
 mod rows;
 
 use super::file::ModelError;
-use super::grid::Shape;
+use super::grid::{Grid, Shape};
 use super::parameters::Model;
 use super::vectors::vectorised;
 use layout::{LANES, Layout};
 use ndarray::{Array3, Array4, NdFloat};
-use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
+use rows::{Kernels, Own, Slots, kernel_rows, taps_that_weigh_alike};
+use std::collections::HashMap;
+use std::sync::Arc;
 
 /// `Phi` for one model on one grid, with its work space: give each thread its own clone.
 ///
@@ -38,6 +42,7 @@ pub struct Transition<T = f32> {
     /// Groups of taps that weigh alike: where each reads, relative to a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
+    land: Arc<Land<T>>,
     /// The belief with a margin of zeros.
     planes: Vec<T>,
     /// The inputs of each group, added up.
@@ -48,6 +53,55 @@ pub struct Transition<T = f32> {
     own_weights: Vec<[T; LANES]>,
 }
 
+/// What differs between the zones of a land.
+#[derive(Debug)]
+struct Land<T> {
+    /// Weights that differ.
+    n_slots: usize,
+    /// The pattern of zones that each [`LANES`] cells have, row by row; none where zones do not differ.
+    of_chunk: Vec<u32>,
+    /// For each pattern the slots of its lanes.
+    slots: Vec<[T; LANES]>,
+}
+
+impl<T: NdFloat> Land<T> {
+    fn new(zones: Option<&Grid<u8>>, slots: &Slots<T>) -> Self {
+        let mut land = Self {
+            n_slots: slots.len(),
+            of_chunk: Vec::new(),
+            slots: Vec::new(),
+        };
+        let mut patterns = HashMap::new();
+        for row in zones
+            .filter(|_| land.n_slots > 0)
+            .iter()
+            .flat_map(|map| map.rows())
+        {
+            for cells in row.to_vec().chunks(LANES) {
+                let mut pattern = [0; LANES];
+                pattern[..cells.len()].copy_from_slice(cells);
+                let n_known = patterns.len() as u32;
+                let number = *patterns.entry(pattern).or_insert(n_known);
+                if number == n_known {
+                    let of_lanes = |slot: &Vec<T>| pattern.map(|zone| slot[usize::from(zone)]);
+                    land.slots.extend(slots.iter().map(of_lanes));
+                }
+                land.of_chunk.push(number);
+            }
+        }
+        land
+    }
+
+    /// The slots of a chunk's lanes.
+    #[inline(always)]
+    fn slots(&self, chunk: usize) -> &[[T; LANES]] {
+        let Some(&pattern) = self.of_chunk.get(chunk) else {
+            return &[];
+        };
+        &self.slots[pattern as usize * self.n_slots..][..self.n_slots]
+    }
+}
+
 impl<T: NdFloat> Transition<T> {
     /// Lays out a model's operator for a grid.
     ///
@@ -56,20 +110,47 @@ impl<T: NdFloat> Transition<T> {
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let bias = model.bias().to_vec();
-        Ok(Self::of_weights(model.kernels(), &bias, shape))
+        let zones = model.zone_map().map(|map| &**map);
+        Ok(Self::of_weights(
+            model.kernels(),
+            &bias,
+            shape,
+            (zones, model.n_zones()),
+        ))
     }
 
     /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid:
-    /// one kernel for all cells, or one for each state that a cell itself can be in.
+    /// one kernel for all cells, or one for each state that a cell itself can be in; as many for each of so many zones,
+    /// which the map tells of each cell, shape `[H, W]`.
     /// All are finite and 0 or more; where a cell's weights can all be 0, its prediction is NaN.
-    pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
+    ///
+    /// # Panics
+    /// If the map is of another grid, or the kernels are not as many for each zone.
+    pub fn of_weights(
+        kernels: &[Array4<f64>],
+        bias: &[f64],
+        shape: Shape,
+        (zones, n_zones): (Option<&Grid<u8>>, usize),
+    ) -> Self {
         let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
+        let dim = zones.map_or(shape.dim(), |map| map.dim());
+        assert_eq!(dim, shape.dim(), "zones: expected the grid");
+        assert_eq!(
+            kernels.len() % n_zones,
+            0,
+            "kernels: expected those of {n_zones} zones"
+        );
         let layout = Layout::new(shape, kernel_height, kernel_width);
-        let sees_own_state = kernels.len() > 1;
-        let (columns, groups): (Vec<_>, Vec<_>) =
-            taps_that_weigh_alike(kernels, layout).into_iter().unzip();
-        let rows = |own: usize| kernel_rows(own, &kernels[own], bias, sees_own_state, &columns);
-        let kernels = if sees_own_state {
+        let n_own = kernels.len() / n_zones;
+        let (columns, groups): (Vec<_>, Vec<_>) = taps_that_weigh_alike(kernels, n_own > 1, layout)
+            .into_iter()
+            .unzip();
+        let mut slots = Vec::new();
+        let mut rows = |own: usize| {
+            let of_zones: Vec<_> = kernels.iter().skip(own).step_by(n_own).collect();
+            kernel_rows(own, &of_zones, bias, n_own, &columns, &mut slots)
+        };
+        let kernels = if n_own > 1 {
             Kernels::Own((0..n_states).map(|own| Own::new(rows(own))).collect())
         } else {
             Kernels::Alike(rows(0))
@@ -84,6 +165,7 @@ impl<T: NdFloat> Transition<T> {
             own_weights: vec![[T::zero(); LANES]; n_states],
             groups,
             kernels,
+            land: Arc::new(Land::new(zones, &slots)),
         }
     }
 
@@ -100,10 +182,12 @@ impl<T: NdFloat> Transition<T> {
         vectorised(
             #[inline(always)]
             || {
+                let mut chunk = 0;
                 for row in 0..self.shape.height() {
                     for col in (0..self.shape.width()).step_by(LANES) {
-                        self.weigh(row * self.layout.stride + col);
+                        self.weigh(row * self.layout.stride + col, chunk);
                         self.store(row, col, out);
+                        chunk += 1;
                     }
                 }
             },
@@ -122,16 +206,17 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Eq. 2 for the [`LANES`] cells from place `at` on.
+    /// Eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
     #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
-    fn weigh(&mut self, at: usize) {
+    fn weigh(&mut self, at: usize, chunk: usize) {
+        let slots = self.land.slots(chunk);
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
         }
         match &self.kernels {
             Kernels::Alike(rows) => {
                 for (weight, row) in self.weights.iter_mut().zip(rows) {
-                    *weight = row.weigh(&self.sums);
+                    *weight = row.weigh(&self.sums, slots);
                 }
             }
             Kernels::Own(kernels) => {
@@ -139,7 +224,8 @@ impl<T: NdFloat> Transition<T> {
                 let centre = at + self.layout.above * self.layout.stride + self.layout.left;
                 for (plane, own) in self.planes.chunks_exact(self.layout.plane).zip(kernels) {
                     let p = lanes_from(plane, centre);
-                    own.add(p, &self.sums, &mut self.own_weights, &mut self.weights);
+                    let sums = (&self.sums[..], slots);
+                    own.add(p, sums, &mut self.own_weights, &mut self.weights);
                 }
             }
         }

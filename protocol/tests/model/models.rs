@@ -33,6 +33,7 @@ pub fn model(
                 .collect()
         };
         file.kernel.push(KernelEntry {
+            zone: None,
             own: None,
             from: name(from),
             to: name(to),

@@ -10,20 +10,25 @@
 //!
 //! Where kernels see the cell's own state, each own state has byte values of its own: the centre tap has one state
 //! alone, so that `f` there is the likeliest outcome, and a cell that stays as it is for certain takes its byte alone.
+//!
+//! Where zones differ, lanes have bounds of their own: a table for each pattern of zones that [`LANES`] cells have.
 
 use super::super::grid::Shape;
 use super::lanes::{
-    FastOwn, FastTap, LANES, blend, blend_own, fast_taps, fill, high_bits, list_lanes, transposed,
+    FastOwn, FastTap, LANES, blend, blend_own, bounds, fast_taps, fill, high_bits, list_lanes,
+    transposed,
 };
 use super::mixture::Mixture;
 use super::places::{Places, centre};
-use std::iter::zip;
+use std::collections::HashMap;
 use std::ops::Range;
 
 /// What byte values stand for.
 #[derive(Debug)]
 pub(super) struct Bytes {
     fast: Fast,
+    /// Which table of `fast` each chunk of homes takes, where zones differ; else the first.
+    of_chunk: Option<Vec<u32>>,
     /// A bit for each home: whether it is a cell's.
     on_grid: Vec<u64>,
 }
@@ -32,39 +37,57 @@ pub(super) struct Bytes {
 enum Fast {
     /// In every cell.
     Alike {
-        taps: Vec<FastTap>,
+        tables: Vec<Vec<FastTap>>,
         /// `f` as a table over bytes, unless it maps every state to itself.
         likeliest: Option<Box<[u8; 256]>>,
     },
     /// By the cell's own state, with the offset under which it lies.
-    Own(Vec<FastOwn>, usize),
+    Own(Vec<Vec<FastOwn>>, usize),
 }
 
 impl Bytes {
-    /// Tables of one mixture for all cells, or of one for each own state; without any, every byte escapes.
+    /// Tables of one mixture for all cells, or of one for each own state; as many for each zone, where `zones` has that
+    /// of each home. Without any mixture, every byte escapes.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
         shape: Shape,
         stride: usize,
+        zones: Option<&[u8]>,
     ) -> Self {
-        let fast = match mixtures {
-            [] => Fast::Alike {
-                taps: Vec::new(),
+        let n_zones = mixtures.first().map_or(1, Mixture::n_zones);
+        let n_own = mixtures.len() / n_zones;
+        let (patterns, of_chunk) = zones.map_or((vec![[0; LANES]], None), patterns);
+        let tables = patterns.iter().map(|zones| {
+            let by_lane = |own: usize| zones.map(|zone| &mixtures[usize::from(zone) * n_own + own]);
+            (0..n_own).map(by_lane).collect::<Vec<_>>()
+        });
+        let is_zoned = of_chunk.is_some();
+        let fast = match n_own {
+            0 => Fast::Alike {
+                tables: patterns.iter().map(|_| Vec::new()).collect(),
                 likeliest: None,
             },
-            [mixture] => Fast::Alike {
-                taps: fast_taps(0, zip(mixture.counts().to_vec(), offsets.to_vec())),
-                likeliest: table_unless_identity(mixture.likeliest(0)),
+            1 => Fast::Alike {
+                tables: tables
+                    .map(|of| fast_alike(&of[0], offsets, is_zoned))
+                    .collect(),
+                likeliest: table_unless_identity(mixtures[0].likeliest(0)),
             },
-            by_own_state => {
-                let states = by_own_state.iter().enumerate();
-                let tables = states.map(|(own, mixture)| fast_own(own, mixture, offsets));
-                Fast::Own(tables.collect(), centre(offsets))
+            _ => {
+                let of_pattern = |of: Vec<[&Mixture; LANES]>| {
+                    let states = of.iter().enumerate();
+                    let tables = states.map(|(own, of)| fast_own(own, of, offsets, is_zoned));
+                    tables.collect()
+                };
+                Fast::Own(tables.map(of_pattern).collect(), centre(offsets))
             }
         };
-        let on_grid = on_grid(shape, stride);
-        Self { fast, on_grid }
+        Self {
+            fast,
+            of_chunk,
+            on_grid: on_grid(shape, stride),
+        }
     }
 
     /// Writes next states of a band's cells, and marks of those that escape.
@@ -72,12 +95,26 @@ impl Bytes {
     pub(super) fn decide(&self, places: &mut Places, band: Range<usize>, key: u64) {
         let bytes = &mut places.next[band.clone()];
         fill(bytes, key, band.start / 8);
-        let (chunks, _) = bytes.as_chunks_mut();
+        match &self.of_chunk {
+            None => self.blend::<false>(places, band, |_| 0),
+            Some(of_chunk) => self.blend::<true>(places, band, |chunk| of_chunk[chunk] as usize),
+        }
+    }
+
+    #[inline(always)]
+    fn blend<const DIFFER: bool>(
+        &self,
+        places: &mut Places,
+        band: Range<usize>,
+        table: impl Fn(usize) -> usize,
+    ) {
+        let (chunks, _) = places.next[band.clone()].as_chunks_mut();
         let chunks = band.step_by(LANES).zip(chunks);
         match &self.fast {
-            Fast::Alike { taps, likeliest } => {
+            Fast::Alike { tables, likeliest } => {
                 for (home, lanes) in chunks {
-                    blend(lanes, taps, &places.states[home..]);
+                    let taps = &tables[table(home / LANES)];
+                    blend::<DIFFER>(lanes, taps, &places.states[home..]);
                     if let Some(likeliest) = likeliest {
                         *lanes = lanes.map(|state| likeliest[usize::from(state)]);
                     }
@@ -85,7 +122,8 @@ impl Bytes {
             }
             Fast::Own(tables, centre) => {
                 for (home, lanes) in chunks {
-                    blend_own(lanes, tables, &places.states[home..], *centre);
+                    let table = &tables[table(home / LANES)];
+                    blend_own::<DIFFER>(lanes, table, &places.states[home..], *centre);
                 }
             }
         }
@@ -114,21 +152,58 @@ impl Bytes {
     }
 }
 
-/// What the bytes stand for in cells of one own state.
-fn fast_own(own: usize, mixture: &Mixture, offsets: &[usize]) -> FastOwn {
+/// The patterns of zones that chunks of homes have, and which of them each has.
+fn patterns(zones: &[u8]) -> (Vec<[u8; LANES]>, Option<Vec<u32>>) {
+    let mut numbers = HashMap::new();
+    let mut patterns = Vec::new();
+    let of_chunk = zones.as_chunks::<LANES>().0.iter().map(|pattern| {
+        *numbers.entry(*pattern).or_insert_with(|| {
+            patterns.push(*pattern);
+            patterns.len() as u32 - 1
+        })
+    });
+    let of_chunk = of_chunk.collect();
+    (patterns, Some(of_chunk))
+}
+
+/// What the bytes stand for in cells whose own state does not matter, by the mixture of each lane.
+fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -> Vec<FastTap> {
+    let taps = offsets.iter().enumerate();
+    let taps = taps.map(|(tap, offset)| (mixtures.map(|it| it.counts()[tap]), *offset));
+    if is_zoned {
+        fast_taps::<true>([0; LANES], taps)
+    } else {
+        fast_taps::<false>([0; LANES], taps)
+    }
+}
+
+/// What the bytes stand for in cells of one own state, by the mixture of each lane.
+fn fast_own(
+    own: usize,
+    mixtures: &[&Mixture; LANES],
+    offsets: &[usize],
+    is_zoned: bool,
+) -> FastOwn {
     let centre = offsets.len() / 2;
-    let count = mixture.counts()[centre];
+    let counts = |tap: usize| mixtures.map(|mixture| mixture.counts()[tap]);
+    let count = counts(centre);
     let neighbours = (0..offsets.len()).filter(|&tap| tap != centre);
-    let taps = neighbours
-        .clone()
-        .map(|tap| (mixture.counts()[tap], offsets[tap]));
-    let likeliest = neighbours.take(1).flat_map(|tap| mixture.likeliest(tap));
+    let taps = neighbours.clone().map(|tap| (counts(tap), offsets[tap]));
+    let likeliest = neighbours
+        .take(1)
+        .flat_map(|tap| mixtures[0].likeliest(tap));
     let changes = likeliest.enumerate().filter(|(from, to)| from != *to);
+    let (bound, neighbours) = if is_zoned {
+        (bounds::<true>(count), fast_taps::<true>(count, taps))
+    } else {
+        let bound = count.map(|n| n.max(1));
+        (bounds::<false>(bound), fast_taps::<false>(count, taps))
+    };
     FastOwn {
         own: own as u8,
-        likeliest: mixture.likeliest(centre)[own] as u8,
-        count,
-        neighbours: fast_taps(count, taps),
+        likeliest: mixtures[0].likeliest(centre)[own] as u8,
+        bound: count.iter().any(|&n| n > 0).then_some(bound),
+        neighbours,
         changes: changes.map(|(from, &to)| (from as u8, to as u8)).collect(),
     }
 }

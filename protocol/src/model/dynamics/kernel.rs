@@ -14,13 +14,13 @@ pub(super) struct Kernel {
 }
 
 impl Kernel {
-    /// One for all cells, or one for each state that a cell itself can be in.
+    /// One for all cells, or one for each state that a cell itself can be in; as many for each zone.
     pub(super) fn of_model(model: &Model) -> Vec<Self> {
         let bias = model.bias().to_vec();
-        let own = |state| model.sees_own_state().then_some(state);
+        let own = |index| (model.sees_own_state()).then_some(index % model.n_states());
         let kernels = model.kernels().iter().enumerate();
         kernels
-            .map(|(state, kernel)| Self::new(kernel, &bias, own(state)))
+            .map(|(index, kernel)| Self::new(kernel, &bias, own(index)))
             .collect()
     }
 

@@ -14,8 +14,9 @@ const ESCAPED: u8 = 254;
 #[derive(Debug)]
 pub(super) struct FastTap {
     offset: usize,
-    /// The last of them (the first follows on the tap before), in every lane.
-    last: [u8; LANES],
+    /// In every lane the last of them (the first follows on the tap before); where lanes differ, the first beyond them,
+    /// so that there may be none.
+    bound: [u8; LANES],
 }
 
 /// What bytes stand for in cells of one own state: first the centre, then the other taps.
@@ -24,28 +25,41 @@ pub(super) struct FastOwn {
     pub(super) own: u8,
     /// The state that the cell itself leads to.
     pub(super) likeliest: u8,
-    /// How many byte values stand for it.
-    pub(super) count: usize,
+    /// The bound of the byte values that stand for it, as in [`FastTap`]; `None` if none does in any lane.
+    pub(super) bound: Option<[u8; LANES]>,
     pub(super) neighbours: Vec<FastTap>,
     /// Where a neighbour's state mostly leads to another: that state, and the other.
     pub(super) changes: Vec<(u8, u8)>,
 }
 
-/// The taps that bytes from `first` on stand for, with the last byte value of each.
-pub(super) fn fast_taps(first: usize, taps: impl Iterator<Item = (usize, usize)>) -> Vec<FastTap> {
+/// The taps that bytes from `first` on stand for, each with its offset and how many do in each lane; `DIFFER`: whether
+/// lanes do.
+pub(super) fn fast_taps<const DIFFER: bool>(
+    first: [usize; LANES],
+    taps: impl Iterator<Item = ([usize; LANES], usize)>,
+) -> Vec<FastTap> {
     let mut end = first;
     let mut fast = Vec::new();
-    for (count, offset) in taps {
-        end += count;
-        if count > 0 {
-            let last = u8::try_from(end - 1).expect("invariant: fast probabilities sum to <= 1");
-            fast.push(FastTap {
-                offset,
-                last: [last; LANES],
-            });
+    for (counts, offset) in taps {
+        end.iter_mut().zip(counts).for_each(|(end, n)| *end += n);
+        if counts.iter().any(|&n| n > 0) {
+            let bound = bounds::<DIFFER>(end);
+            fast.push(FastTap { offset, bound });
         }
     }
     fast
+}
+
+/// The bounds of byte values below `end`.
+pub(super) fn bounds<const DIFFER: bool>(end: [usize; LANES]) -> [u8; LANES] {
+    let bound = |end: usize| if DIFFER { end } else { end - 1 };
+    end.map(|end| u8::try_from(bound(end)).expect("invariant: fast probabilities sum to <= 1"))
+}
+
+/// Whether a byte is within a bound.
+#[inline(always)]
+fn is_within<const DIFFER: bool>(byte: u8, bound: u8) -> bool {
+    if DIFFER { byte < bound } else { byte <= bound }
 }
 
 /// Words `first..` of the SplitMix64 generator of a key; `bytes` are whole words.
@@ -83,7 +97,7 @@ impl Words {
 
 /// Replaces each byte by the parent under the tap that it stands for, or by [`ESCAPED`].
 #[inline(always)]
-pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
+pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
     // From the last tap back, so that each overwrites the lanes of the taps after it.
     for tap in fast.iter().rev() {
@@ -92,7 +106,8 @@ pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
             .expect("invariant: a whole chunk of places is under every tap");
         for lane in 0..LANES {
             // Arithmetic where an `if` would do: LLVM vectorises this one.
-            let chosen = u8::from(lanes[lane] <= tap.last[lane]).wrapping_neg();
+            let is_chosen = is_within::<DIFFER>(lanes[lane], tap.bound[lane]);
+            let chosen = u8::from(is_chosen).wrapping_neg();
             states[lane] ^= (states[lane] ^ parent[lane]) & chosen;
         }
     }
@@ -101,21 +116,26 @@ pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
 
 /// The same where the cell's own state, which lies under `centre`, tells what bytes stand for.
 #[inline(always)]
-pub(super) fn blend_own(lanes: &mut [u8; LANES], fast: &[FastOwn], parents: &[u8], centre: usize) {
+pub(super) fn blend_own<const DIFFER: bool>(
+    lanes: &mut [u8; LANES],
+    fast: &[FastOwn],
+    parents: &[u8],
+    centre: usize,
+) {
     let own: &[u8; LANES] = parents[centre..]
         .first_chunk()
         .expect("invariant: a whole chunk of places is under every tap");
     let mut next = [ESCAPED; LANES];
     for table in fast {
         let mut states = *lanes;
-        blend(&mut states, &table.neighbours, parents);
+        blend::<DIFFER>(&mut states, &table.neighbours, parents);
         let before = states;
         for &(from, to) in &table.changes {
             replace(&mut states, to, |lane| before[lane] == from);
         }
-        if let Some(last) = table.count.checked_sub(1) {
+        if let Some(bound) = &table.bound {
             replace(&mut states, table.likeliest, |lane| {
-                usize::from(lanes[lane]) <= last
+                is_within::<DIFFER>(lanes[lane], bound[lane])
             });
         }
         for lane in 0..LANES {

@@ -14,44 +14,58 @@ pub(super) struct Mixture<'k> {
     likeliest: Vec<Vec<usize>>,
     /// How many of 256 byte values stand for each tap.
     counts: Vec<usize>,
+    n_zones: usize,
 }
 
 impl<'k> Mixture<'k> {
-    /// One mixture for each kernel.
-    pub(super) fn of_kernels(kernels: &'k [Kernel], see_own_state: bool) -> Vec<Self> {
-        let mixtures = kernels
-            .iter()
-            .map(|kernel| Self::new(kernel, see_own_state));
-        mixtures.collect()
+    /// One mixture for each kernel; those of all zones agree in `f`.
+    pub(super) fn of_kernels(
+        kernels: &'k [Kernel],
+        n_zones: usize,
+        see_own_state: bool,
+    ) -> Vec<Self> {
+        let n_own = kernels.len() / n_zones;
+        let of_zones = |own: usize| kernels.iter().skip(own).step_by(n_own);
+        let likeliest: Vec<_> = (0..n_own)
+            .map(|own| likeliest(&of_zones(own).collect::<Vec<_>>(), see_own_state))
+            .collect();
+        let mixtures = kernels.iter().enumerate();
+        mixtures
+            .map(|(index, kernel)| Self::new(kernel, likeliest[index % n_own].clone(), n_zones))
+            .collect()
     }
 
-    fn new(kernel: &'k Kernel, sees_own_state: bool) -> Self {
+    fn new(kernel: &'k Kernel, likeliest: Vec<Vec<usize>>, n_zones: usize) -> Self {
         let columns = kernel.weights.chunks(kernel.n_states);
         let column_sums: Vec<f64> = columns.map(|column| column.iter().sum()).collect();
         let largest = |sums: &[f64]| sums.iter().copied().fold(0.0, f64::max);
         let most: Vec<f64> = column_sums.chunks(kernel.n_states).map(largest).collect();
-        let likeliest = if sees_own_state {
-            let centre = kernel.n_taps / 2;
-            let neighbours = (0..kernel.n_taps).filter(|&tap| tap != centre);
-            let mut likeliest = vec![likeliest_under(kernel, neighbours); kernel.n_taps];
-            likeliest[centre] = likeliest_under(kernel, std::iter::once(centre));
-            likeliest
-        } else {
-            vec![likeliest_under(kernel, 0..kernel.n_taps); kernel.n_taps]
-        };
         let total = most.iter().sum();
         let count = |tap: usize| {
             let certain = likeliest[tap].iter().enumerate();
             let certain = certain.map(|(from, &to)| kernel.weights(tap, from)[to]);
             (256.0 * certain.fold(f64::INFINITY, f64::min) / total) as usize
         };
+        let mut counts: Vec<usize> = (0..kernel.n_taps).map(count).collect();
+        // Where lanes differ, bounds are the first value beyond: a byte holds 255 at most.
+        if n_zones > 1
+            && counts.iter().sum::<usize>() > 255
+            && let Some(most) = counts.iter_mut().max()
+        {
+            *most -= 1;
+        }
         Self {
-            counts: (0..kernel.n_taps).map(count).collect(),
+            counts,
             kernel,
             most,
             total,
             likeliest,
+            n_zones,
         }
+    }
+
+    pub(super) fn n_zones(&self) -> usize {
+        self.n_zones
     }
 
     pub(super) fn n_states(&self) -> usize {
@@ -97,13 +111,32 @@ impl<'k> Mixture<'k> {
     }
 }
 
+/// `f` of some kernels together, by tap.
+fn likeliest(kernels: &[&Kernel], see_own_state: bool) -> Vec<Vec<usize>> {
+    let n_taps = kernels[0].n_taps;
+    if !see_own_state {
+        return vec![likeliest_under(kernels, 0..n_taps); n_taps];
+    }
+    let centre = n_taps / 2;
+    let neighbours = (0..n_taps).filter(|&tap| tap != centre);
+    let mut likeliest = vec![likeliest_under(kernels, neighbours); n_taps];
+    likeliest[centre] = likeliest_under(kernels, std::iter::once(centre));
+    likeliest
+}
+
 /// The state that each state mostly leads to under some taps.
-fn likeliest_under(kernel: &Kernel, taps: impl Iterator<Item = usize> + Clone) -> Vec<usize> {
-    let sum = |from, to| taps.clone().map(|tap| kernel.weights(tap, from)[to]).sum();
-    let likeliest = |from| {
-        let sums: Vec<f64> = (0..kernel.n_states).map(|to| sum(from, to)).collect();
-        let better = |best, to| if sums[to] > sums[best] { to } else { best };
-        (0..kernel.n_states).fold(0, better)
+fn likeliest_under(kernels: &[&Kernel], taps: impl Iterator<Item = usize> + Clone) -> Vec<usize> {
+    let n_states = kernels[0].n_states;
+    let sum = |from, to| {
+        let of_kernel = |kernel: &&Kernel| -> f64 {
+            taps.clone().map(|tap| kernel.weights(tap, from)[to]).sum()
+        };
+        kernels.iter().map(of_kernel).sum()
     };
-    (0..kernel.n_states).map(likeliest).collect()
+    let likeliest = |from| {
+        let sums: Vec<f64> = (0..n_states).map(|to| sum(from, to)).collect();
+        let better = |best, to| if sums[to] > sums[best] { to } else { best };
+        (0..n_states).fold(0, better)
+    };
+    (0..n_states).map(likeliest).collect()
 }

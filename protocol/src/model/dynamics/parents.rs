@@ -42,6 +42,8 @@ pub(super) struct Parents {
     mask: u8,
     /// Where a cell's own state lies, if it chooses the mixture.
     own: Option<usize>,
+    /// The first mixture of each home's zone, where zones differ.
+    first_mixtures: Option<Vec<u16>>,
 }
 
 /// A tap, and the outcome for each state of its parent.
@@ -62,9 +64,13 @@ struct Slot {
 }
 
 impl Parents {
-    /// What the bytes leave of each mixture, and the whole of it; the taps read at `offsets`. `None` if the
-    /// rules would be too many.
-    pub(super) fn new(mixtures: &[Mixture], offsets: &[usize]) -> Option<Self> {
+    /// What the bytes leave of each mixture, and the whole of it; the taps read at `offsets`, and `zones` has that of
+    /// each home. `None` if the rules would be too many.
+    pub(super) fn new(
+        mixtures: &[Mixture],
+        offsets: &[usize],
+        zones: Option<&[u8]>,
+    ) -> Option<Self> {
         let n_weights: usize = mixtures.iter().map(Mixture::n_weights).sum();
         if n_weights + mixtures.len() * offsets.len() > MOST_RULES {
             return None;
@@ -77,6 +83,8 @@ impl Parents {
                 tables.push(rules(mixture, offsets, taken, &mut outcomes));
             }
         }
+        let n_own = mixtures.len() / mixtures[0].n_zones();
+        let first = |&zone: &u8| u16::from(zone) * n_own as u16;
         let most_rules = tables.iter().map(Vec::len).max().unwrap_or(0);
         let n_slots = most_rules.next_power_of_two();
         let slots = tables.iter().map(|rules| alias_table(rules, n_slots));
@@ -85,7 +93,8 @@ impl Parents {
             log_n_slots: n_slots.trailing_zeros(),
             outcomes,
             mask: (row_length(mixtures[0].n_states()) - 1) as u8,
-            own: (mixtures.len() > 1).then(|| centre(offsets)),
+            own: (n_own > 1).then(|| centre(offsets)),
+            first_mixtures: zones.map(|zones| zones.iter().map(first).collect()),
         })
     }
 
@@ -104,9 +113,19 @@ impl Parents {
             let randoms = &mut randoms[..n_undecided.next_multiple_of(2) * 4];
             words.fill(randoms);
             let undecided = &mut undecided[..n_undecided];
-            n_undecided = match self.own {
-                None => self.round::<false>(places, undecided, randoms, 0),
-                Some(own) => self.round::<true>(places, undecided, randoms, own),
+            n_undecided = match (self.own, &self.first_mixtures) {
+                (None, None) => self.round(places, undecided, randoms, |_, _| 0),
+                (Some(own), None) => self.round(places, undecided, randoms, |states, home| {
+                    usize::from(states[home + own])
+                }),
+                (None, Some(first)) => self.round(places, undecided, randoms, |_, home| {
+                    usize::from(first[home])
+                }),
+                (Some(own), Some(first)) => {
+                    self.round(places, undecided, randoms, |states, home| {
+                        usize::from(first[home]) + usize::from(states[home + own])
+                    })
+                }
             };
             if n_undecided == 0 {
                 break;
@@ -115,14 +134,15 @@ impl Parents {
         n_undecided
     }
 
-    /// One draw for every listed cell; the rejected ones come first in the list, which has as many as are returned.
+    /// One draw for every listed cell, by the `mixture` that states and home tell; the rejected ones come first in the
+    /// list, which has as many as are returned.
     #[inline(never)] // As `Bytes::list_undecided`.
-    fn round<const OWN: bool>(
+    fn round(
         &self,
         places: &mut Places,
         undecided: &mut [u32],
         randoms: &[u8],
-        own: usize,
+        mixture: impl Fn(&[u8], usize) -> usize,
     ) -> usize {
         let (states, next) = (&places.states[..], &mut places.next[..]);
         let randoms = &randoms.as_chunks().0[..undecided.len()];
@@ -131,7 +151,7 @@ impl Parents {
             let home = undecided[index];
             let mark = next[home as usize];
             let random = u32::from_le_bytes(randoms[index]);
-            let mixture = if OWN { states[home as usize + own] } else { 0 };
+            let mixture = mixture(states, home as usize);
             let state = self.outcome(mixture, mark, random, states, home);
             next[home as usize] = state;
             // Branch-free: no rejection is predictable.
@@ -144,8 +164,8 @@ impl Parents {
     /// Draws for the cell at `home`, by its mark: from the residual distribution after a byte, from the whole
     /// after a rejection.
     #[inline]
-    fn outcome(&self, mixture: u8, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
-        let table = usize::from(mixture << 1 | mark & 1) << self.log_n_slots;
+    fn outcome(&self, mixture: usize, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
+        let table = (mixture << 1 | usize::from(mark & 1)) << self.log_n_slots;
         let slot = &self.slots[(u64::from(random) << self.log_n_slots >> 32) as usize | table];
         let within = random << self.log_n_slots;
         let rule = slot.rules[usize::from(within >= slot.threshold)];

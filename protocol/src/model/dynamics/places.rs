@@ -43,6 +43,16 @@ impl Places {
         taps.map(|(row, col)| row * self.stride + col).collect()
     }
 
+    /// The zone of each home, where zones differ; 0 in the margin.
+    pub(super) fn zones(&self, model: &Model) -> Option<Vec<u8>> {
+        let map = model.zone_map().filter(|_| model.n_zones() > 1)?;
+        let mut zones = vec![0; self.next.len()];
+        for (row, to) in map.rows().into_iter().zip(zones.chunks_mut(self.stride)) {
+            to[..self.width].copy_from_slice(&row.to_vec());
+        }
+        Some(zones)
+    }
+
     /// Copies the states inside the margins.
     #[inline(always)]
     pub(super) fn load(&mut self, cells: &[u8]) {

@@ -4,7 +4,10 @@
 //! up once for all next states: 35 additions and 16 multiplications a cell where the formula has 54 of each.
 //!
 //! Why it is the same: `w x + w y = w (x + y)`. The sums of the formula, in double precision, are in
-//! `tests/model/transition.rs` and `own_state.rs`, which compare them for any models and grids.
+//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs`, which compare them for any models and grids.
+//!
+//! A weight that differs between zones has a *slot*: a number for each lane, by the zones of the cells there. Most
+//! weights of a land do not differ.
 
 use super::layout::{LANES, Layout};
 use ndarray::{Array4, NdFloat, s};
@@ -33,30 +36,37 @@ pub(super) enum Own<T> {
 #[derive(Debug, Clone)]
 pub(super) struct Row<T> {
     bias: T,
+    /// The slot that the bias has, where zones differ in it.
+    bias_slot: Option<usize>,
     /// Group and weight.
     terms: Vec<(usize, T)>,
+    /// Group and slot, where zones differ in the weight.
+    zoned_terms: Vec<(usize, usize)>,
 }
+
+/// The weights that differ between zones: of each slot, one for each zone.
+pub(super) type Slots<T> = Vec<Vec<T>>;
 
 impl<T: NdFloat> Own<T> {
     pub(super) fn new(rows: Rows<T>) -> Self {
-        let sees_neighbours = rows.iter().any(|row| !row.terms.is_empty());
+        let is_weighed = rows.iter().any(Row::is_weighed);
         let total = rows.iter().fold(T::zero(), |sum, row| sum + row.bias);
-        let is_possible = |row: &Row<T>| row.bias > T::zero() || !row.terms.is_empty();
+        let is_possible = |row: &Row<T>| row.bias > T::zero() || row.is_weighed();
         let possible = rows.into_iter().enumerate();
         let possible = possible.filter(|(_, row)| is_possible(row));
-        if sees_neighbours {
+        if is_weighed {
             Self::Weighed(possible.collect())
         } else {
             Self::Fixed(possible.map(|(to, row)| (to, row.bias / total)).collect())
         }
     }
 
-    /// Adds what becomes of the cells that are in this state with probability `p`.
+    /// Adds what becomes of the cells that are in this state with probability `p`; `slots` are those of the lanes.
     #[inline(always)]
     pub(super) fn add(
         &self,
         p: &[T; LANES],
-        sums: &[[T; LANES]],
+        (sums, slots): (&[[T; LANES]], &[[T; LANES]]),
         weights: &mut [[T; LANES]],
         next: &mut [[T; LANES]],
     ) {
@@ -71,7 +81,7 @@ impl<T: NdFloat> Own<T> {
             Self::Weighed(rows) => {
                 let mut total = [T::zero(); LANES];
                 for (weight, (_, row)) in weights.iter_mut().zip(rows) {
-                    *weight = row.weigh(sums);
+                    *weight = row.weigh(sums, slots);
                     for (total, &weight) in total.iter_mut().zip(&*weight) {
                         *total += weight;
                     }
@@ -92,11 +102,25 @@ impl<T: NdFloat> Own<T> {
 }
 
 impl<T: NdFloat> Row<T> {
+    /// Whether anything but a bias that is alike everywhere weighs.
+    fn is_weighed(&self) -> bool {
+        self.bias_slot.is_some() || !self.terms.is_empty() || !self.zoned_terms.is_empty()
+    }
+
     #[inline(always)]
-    pub(super) fn weigh(&self, sums: &[[T; LANES]]) -> [T; LANES] {
-        let mut weight = [self.bias; LANES];
+    pub(super) fn weigh(&self, sums: &[[T; LANES]], slots: &[[T; LANES]]) -> [T; LANES] {
+        let mut weight = match self.bias_slot {
+            None => [self.bias; LANES],
+            Some(slot) => slots[slot],
+        };
         for &(group, factor) in &self.terms {
             for (weight, &sum) in weight.iter_mut().zip(&sums[group]) {
+                *weight += factor * sum;
+            }
+        }
+        for &(group, slot) in &self.zoned_terms {
+            let lanes = weight.iter_mut().zip(&sums[group]).zip(&slots[slot]);
+            for ((weight, &sum), &factor) in lanes {
                 *weight += factor * sum;
             }
         }
@@ -104,30 +128,50 @@ impl<T: NdFloat> Row<T> {
     }
 }
 
-/// Eq. 2 for the cells in state `own`, or for all; `columns` are the weights of the groups.
+/// Eq. 2 for the cells in state `own`, or for all: `kernels` are those of each zone, `columns` the weights of the groups.
+/// Weights that differ between zones are added to the slots.
 pub(super) fn kernel_rows<T: NdFloat>(
     own: usize,
-    kernel: &Array4<f64>,
+    kernels: &[&Array4<f64>],
     bias: &[f64],
-    sees_own_state: bool,
+    n_own: usize,
     columns: &[Vec<f64>],
+    slots: &mut Slots<T>,
 ) -> Rows<T> {
     // Eq. 3 cancels a common factor; taken out, no weight overflows T.
-    let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
+    let weights = kernels.iter().flat_map(|kernel| kernel.iter());
+    let largest = weights.chain(bias).copied().fold(0.0, f64::max);
     let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
-    let (n_states, _, height, width) = kernel.dim();
-    let row = |to: usize| {
-        let centre = kernel[[to, own, height / 2, width / 2]];
-        let weights = columns.iter().map(|column| column[own * n_states + to]);
-        let terms = weights.enumerate().filter(|&(_, weight)| weight > 0.0);
+    let (n_states, _, height, width) = kernels[0].dim();
+    let mut slot = |by_zone: &[f64]| {
+        slots.push(by_zone.iter().copied().map(scaled).collect());
+        slots.len() - 1
+    };
+    let mut row = |to: usize| {
+        let centre = |kernel: &&Array4<f64>| match n_own {
+            1 => bias[to],
+            _ => bias[to] + kernel[[to, own, height / 2, width / 2]],
+        };
+        let biases: Vec<f64> = kernels.iter().map(centre).collect();
+        let differ = |by_zone: &[f64]| by_zone.iter().any(|weight| *weight != by_zone[0]);
+        let (mut terms, mut zoned_terms) = (Vec::new(), Vec::new());
+        for (group, column) in columns.iter().enumerate() {
+            let of_zone = |zone: usize| column[(zone * n_own + own) * n_states + to];
+            let by_zone: Vec<f64> = (0..kernels.len()).map(of_zone).collect();
+            if differ(&by_zone) {
+                zoned_terms.push((group, slot(&by_zone)));
+            } else if by_zone[0] > 0.0 {
+                terms.push((group, scaled(by_zone[0])));
+            }
+        }
         Row {
-            bias: scaled(bias[to] + if sees_own_state { centre } else { 0.0 }),
-            terms: terms
-                .map(|(group, weight)| (group, scaled(weight)))
-                .collect(),
+            bias: scaled(biases[0]),
+            bias_slot: differ(&biases).then(|| slot(&biases)),
+            terms,
+            zoned_terms,
         }
     };
-    (0..n_states).map(row).collect()
+    (0..n_states).map(&mut row).collect()
 }
 
 /// The taps of each state, or of all, by the column of weights `w[.., n, a, c]` they share, one kernel's after the
@@ -135,10 +179,11 @@ pub(super) fn kernel_rows<T: NdFloat>(
 /// cell's own state.
 pub(super) fn taps_that_weigh_alike(
     kernels: &[Array4<f64>],
+    sees_own_state: bool,
     layout: Layout,
 ) -> Vec<(Vec<f64>, Vec<usize>)> {
     let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
-    let is_own = |tap| kernels.len() > 1 && tap == (kernel_height / 2, kernel_width / 2);
+    let is_own = |tap| sees_own_state && tap == (kernel_height / 2, kernel_width / 2);
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
         // If all kernels are alike, sums are taken within one state alone: another order would change the last bits.
