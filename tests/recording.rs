@@ -116,6 +116,8 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        airspace: None,
+        zones: None,
         recorded_world: None,
         burn_in: 0,
         max_steps: 0,

@@ -1,7 +1,7 @@
 //! The server's settings and their checks.
 
 use crate::states_file::{StatesError, StatesFile};
-use crate::world::Recorded;
+use crate::world::{Recorded, check_start};
 use emberwatch_protocol::channels::{
     ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
 };
@@ -34,6 +34,7 @@ pub struct ServerConfig {
     pub deadline_millis: u64,
     pub task: String,
     pub model: String,
+    pub sensor_radius: i64,
     pub states: String,
     pub states_symmetries: bool,
     pub states_offset: u64,
@@ -118,6 +119,7 @@ impl Default for ServerConfig {
             deadline_millis: 0,
             task: String::new(),
             model: WILDFIRE.into(),
+            sensor_radius: -1,
             states: String::new(),
             states_symmetries: false,
             states_offset: 0,
@@ -167,7 +169,17 @@ impl ServerConfig {
             });
         }
         let model = model.map_or_else(|| self.read_model(), Ok)?;
-        model.check_on(shape)?;
+        let model = match usize::try_from(self.sensor_radius) {
+            Ok(radius) => model.with_radius(radius)?,
+            Err(_) => model,
+        };
+        let airspace = model.airspace(shape)?;
+        let wrong = |[expected, got]: [String; 2]| ConfigError::Range {
+            setting: "start",
+            expected,
+            got,
+        };
+        check_start(self.start, &airspace, self.robots as usize).map_err(wrong)?;
         Ok(Checked {
             config: self,
             instance,
@@ -185,6 +197,7 @@ impl ServerConfig {
         }
         let task = Task::named(&self.task)?;
         (self.model, self.states) = (task.model, task.states);
+        self.sensor_radius = ServerConfig::default().sensor_radius;
         (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
         (self.height, self.width) = (task.height, task.width);
         (self.moves, self.robots) = (task.moves, task.robots);
@@ -264,12 +277,13 @@ impl ServerConfig {
             return Ok(model);
         }
         let path = Path::new(&self.model);
-        let text = read_text(path).map_err(|error| {
+        // Read first for an error of its own: the name may be mistyped.
+        read_text(path).map_err(|error| {
             let names: Vec<&str> = Model::built_in_names().collect();
             let problem = format!("{error}: expected one, or {}", names.join(", "));
             file_error("model file", path, problem)
         })?;
-        Model::from_toml(&text).map_err(|error| file_error("model file", path, error))
+        Model::read(path).map_err(|error| file_error("model file", path, error))
     }
 }
 

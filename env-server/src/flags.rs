@@ -34,6 +34,9 @@ pub struct ServerFlags {
     /// a model file [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
+    /// Rows and columns that robots see beyond each cell of their path, 0 to 8 [default: as the model says]
+    #[arg(long, value_parser = clap::value_parser!(u8).range(0..=8))]
+    pub sensor_radius: Option<u8>,
     /// Worlds show the recorded states of this .npz or .npy file or folder, or `jacksboro`, which decide model, grid and
     /// burn-in
     #[arg(long, value_name = "FILE|FOLDER")]
@@ -126,6 +129,10 @@ impl ServerFlags {
         set(&mut config.deadline_millis, &self.deadline_ms);
         set(&mut config.task, &self.task);
         set(&mut config.model, &self.model);
+        set(
+            &mut config.sensor_radius,
+            &self.sensor_radius.map(i64::from),
+        );
         set(&mut config.states, &self.states);
         set(&mut config.states_symmetries, &self.states_symmetries);
         set(&mut config.states_offset, &self.states_offset);
@@ -137,6 +144,7 @@ impl ServerFlags {
         } else if !config.states.is_empty() {
             let left = [
                 "states",
+                "sensor_radius",
                 "states_symmetries",
                 "states_offset",
                 "moves",
@@ -171,6 +179,7 @@ impl ServerFlags {
         let text = |value: Option<u64>| value.map(|it| it.to_string());
         let of_worlds = [
             ("model", self.model.clone()),
+            ("sensor_radius", text(self.sensor_radius.map(u64::from))),
             ("states", self.states.clone()),
             (
                 "states_symmetries",

@@ -17,5 +17,5 @@ pub use hidden::{Source, World};
 pub use history::{PastRobot, PastStep};
 pub use recorded::Recorded;
 pub use robot::Robot;
-pub use rules::Rules;
+pub use rules::{Rules, check_start};
 pub use saved::{InvalidWorld, SavedRobot, SavedWorld};

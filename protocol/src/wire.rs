@@ -21,6 +21,7 @@ mod exchange;
 pub mod failed_connections;
 pub mod interrupt;
 mod json;
+mod land;
 pub mod message;
 mod node;
 pub mod observer;

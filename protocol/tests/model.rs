@@ -1,6 +1,7 @@
 //! The model's mathematics against its formulas and the authors' worlds. All seeds are fixed: a test passes always or
 //! never.
 
+mod airspace;
 mod dynamics;
 mod models;
 mod own_state;

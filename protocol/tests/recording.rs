@@ -28,6 +28,8 @@ fn server(height: usize, width: usize, n_moves: usize) -> Event {
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        airspace: None,
+        zones: None,
         recorded_world: None,
         burn_in: 20,
         max_steps: 0,

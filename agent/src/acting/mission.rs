@@ -176,5 +176,10 @@ pub(super) fn model_of(
         got == expected,
         "model: expected the server's {expected} observations, got {got}"
     );
+    let airspace = info.airspace().map_err(anyhow::Error::msg)?;
+    ensure!(
+        model.airspace(info.shape()?)? == airspace,
+        "model: expected the server's sensor and no-fly cells, got others"
+    );
     Ok(model)
 }

@@ -42,6 +42,7 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
         *state = target;
     }
     let setup = Setup {
+        airspace: task.model.airspace(task.shape)?,
         chooser: chooser(policy, &task, config, objective)?,
         basis: basis(policy, &task, config)?,
         beam_width: match policy.choice {

@@ -19,7 +19,7 @@ use emberwatch_belief::planning::Plan;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::WorldResult;
-use emberwatch_protocol::path::{Flight, fly};
+use emberwatch_protocol::path::Flight;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -298,9 +298,9 @@ impl Match<'_> {
 impl World {
     /// Takes in what an agent's robots flew; with those of the last agent the step is complete.
     fn fly(&mut self, rollout: &Rollout, plans: &[Plan], n_robots: usize) {
-        let shape = rollout.agent.belief().shape();
+        let airspace = rollout.agent.airspace();
         let flown = rollout.results().zip(plans);
-        let flown = flown.map(|(result, plan)| fly(shape, result.start(), &plan.moves));
+        let flown = flown.map(|(result, plan)| airspace.fly(result.start(), &plan.moves));
         self.flights.extend(flown);
         let n_visited = rollout.results().map(|it| u64::from(it.n_visited));
         self.tally.n_visited_each += n_visited.sum::<u64>();
@@ -327,11 +327,11 @@ impl World {
 
     fn snapshot(&self, rollout: &Rollout, turn: Turn, plans: &[Plan]) -> Option<Snapshot> {
         let (agent, observation) = (&rollout.agent, rollout.observation());
-        let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
+        let (airspace, start) = (agent.airspace(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
         let moves = &plans[0].moves;
         let mut path_cells = vec![start];
-        path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
+        path_cells.extend((1..=moves.len()).map(|n| airspace.fly(start, &moves[..n]).end));
         Some(Snapshot {
             seed: self.seed,
             step: observation.world.step,

@@ -5,7 +5,6 @@ use clap::Args;
 use emberwatch_agent::client::info::wait_for_server;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::program::read_text;
 use std::io::Write;
 use std::ops::Range;
 use std::path::Path;
@@ -61,8 +60,7 @@ pub fn model_named(name: &str) -> Result<Model> {
 }
 
 pub fn read_model(path: &Path) -> Result<Model> {
-    let text = read_text(path).with_context(|| format!("model file {}", path.display()))?;
-    Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
+    Model::read(path).with_context(|| format!("model file {}", path.display()))
 }
 
 /// Makes the folder of a file to come.

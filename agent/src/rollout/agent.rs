@@ -14,8 +14,7 @@ use emberwatch_belief::planning::{
 };
 use emberwatch_network::Dqn;
 use emberwatch_protocol::agent_belief::Intent;
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::{Cell, Frame, Grid};
+use emberwatch_protocol::{Airspace, Cell, Frame, Grid};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -42,6 +41,8 @@ pub struct Agent {
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
+    /// Where its robots may fly and what they see.
+    airspace: Airspace,
 }
 
 /// What says what each path is for.
@@ -75,6 +76,8 @@ pub struct Setup {
     pub seed: u64,
     /// What the belief calls the state that pays most.
     pub target: usize,
+    /// Where its robots may fly and what they see.
+    pub airspace: Airspace,
 }
 
 impl Agent {
@@ -105,7 +108,13 @@ impl Agent {
             state_names: setup.state_names,
             n_moves: setup.n_moves,
             seed: setup.seed,
+            airspace: setup.airspace,
         }
+    }
+
+    /// Where its robots may fly and what they see.
+    pub fn airspace(&self) -> &Airspace {
+        &self.airspace
     }
 
     /// What the belief calls the state that pays most.
@@ -129,7 +138,7 @@ impl Agent {
             PlannerKind::RandomWalk => RANDOM_MOVES.into(),
             _ => objective.target.label(&self.state_names),
         };
-        let values = objective.values(self.basis_belief());
+        let values = objective.values_in(self.basis_belief(), &self.airspace);
         self.plan_values(&values, &aim, robots, step)
     }
 
@@ -168,7 +177,8 @@ impl Agent {
 
     /// What the grid promises a robot now.
     fn outlook(&self) -> Outlook {
-        Outlook::new(self.basis_belief(), self.target, &self.memory, self.n_moves)
+        let (belief, air) = (self.basis_belief(), &self.airspace);
+        Outlook::new(belief, air, self.target, &self.memory, self.n_moves)
     }
 
     /// The belief that paths are planned on.
@@ -182,7 +192,7 @@ impl Agent {
         let mut plans: Vec<Plan> = Vec::with_capacity(robots.len());
         for (index, &robot) in robots.iter().enumerate() {
             if let Some(last) = plans.last() {
-                let visited = fly(outlook.shape(), robots[index - 1], &last.moves).visited;
+                let visited = self.airspace.fly(robots[index - 1], &last.moves).visited;
                 outlook = outlook.without(&visited);
             }
             plans.push(self.plan_option(&outlook, robot));
@@ -209,7 +219,8 @@ impl Agent {
     /// As [`Self::plan`], paths of random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();
-        let values = self.policy.objective.values(self.estimator.belief());
+        let belief = self.estimator.belief();
+        let values = self.policy.objective.values_in(belief, &self.airspace);
         let (planner, random) = (&mut RandomWalk, (self.seed, step));
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }

@@ -26,6 +26,8 @@ fn damaged() -> Vec<u8> {
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        airspace: None,
+        zones: None,
         recorded_world: None,
         burn_in: 0,
         max_steps: 0,

@@ -3,12 +3,14 @@
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot, cells};
+use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::MAX_CLIENTS;
 use emberwatch_protocol::control::{
-    LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus,
-    parse,
+    AirspaceInfo, LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed,
+    WorldStatus, ZonesInfo, parse,
 };
 use emberwatch_protocol::message::{Status, VERSION, WorldResult};
+use emberwatch_protocol::model::CellMap;
 use emberwatch_protocol::program::pid_namespace;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
@@ -248,15 +250,13 @@ impl Simulator {
             n_moves: config.moves,
             n_worlds: config.worlds,
             n_robots: config.robots,
-            n_observations: file.observations.len(),
-            observations: file
-                .observations
-                .iter()
-                .map(|observation| observation.name.clone())
-                .collect(),
+            n_observations: self.checked.model.n_observations(),
+            observations: self.checked.model.observation_names(),
             model: (config.reveal_model && recorded.is_none())
                 .then(|| toml::to_string(file).expect("invariant: model files serialise")),
             task: self.checked.task.clone(),
+            airspace: airspace_info(&self.checked.model),
+            zones: zones_info(&self.checked.model),
             recorded_world: recorded.as_ref().map(|states| RecordedWorld {
                 description: config.reveal_model.then(|| states.description.clone()),
                 n_sequences: states.recorded.n_sequences(),
@@ -291,6 +291,30 @@ impl Simulator {
             worlds: self.worlds().map(world_status).collect(),
         }
     }
+}
+
+/// What differs from a grid that is open everywhere, with a sensor of the path.
+fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
+    let file = model.file();
+    let sensor = file.sensor.clone().unwrap_or_default();
+    let info = AirspaceInfo {
+        radius: sensor.radius,
+        n_rings: model.n_rings(),
+        pays: sensor.pays,
+        no_fly: file.no_fly.as_ref().and_then(CellMap::rows),
+    };
+    (info.radius > 0 || info.no_fly.is_some()).then_some(info)
+}
+
+/// The zones, if there are any and learners are told.
+fn zones_info(model: &Model) -> Option<ZonesInfo> {
+    let file = model.file();
+    let map = file.zone_map.as_ref().filter(|_| file.zones_public)?;
+    Some(ZonesInfo {
+        names: file.zones.iter().map(|zone| zone.name.clone()).collect(),
+        colors: file.zones.iter().map(|zone| zone.color.clone()).collect(),
+        map: map.rows()?,
+    })
 }
 
 /// The request in a message of this version.

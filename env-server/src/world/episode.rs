@@ -7,10 +7,10 @@ use super::flown::Flown;
 use super::hidden::World;
 use super::history::{History, PastStep};
 use super::reward::pay;
-use super::robot::Robot;
+use super::robot::{Robot, Scratch};
 use super::rules::Rules;
 use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
-use super::sensor::Sensor;
+use super::sensor::{Sensor, path_cells};
 use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::path::path_from_bytes;
 use emberwatch_protocol::{Coverage, Frame, Grid};
@@ -25,8 +25,7 @@ pub struct Episode {
     result: WorldResult,
     /// A 0 for each cell, for [`pay`].
     counts: Vec<u8>,
-    /// Scratch of flights.
-    seen: Vec<u64>,
+    scratch: Scratch,
     history: History,
 }
 
@@ -60,7 +59,8 @@ impl Episode {
                 Coverage::Empty => &[],
                 _ => &flown.moves[r * n_moves..][..n_moves],
             };
-            robot.fly(rules.shape, path, flown.coverage(r), &mut self.seen);
+            let coverage = flown.coverage(r);
+            robot.fly(&rules.airspace, path, coverage, &mut self.scratch);
         }
         self.world.advance();
         self.observe(rules);
@@ -150,7 +150,7 @@ impl Episode {
                 states,
             )
         };
-        let mut kept = History::new(rules.history, rules.n_robots, rules.n_moves);
+        let mut kept = History::new(rules.history, rules.n_robots, rules.most_seen());
         history.into_iter().for_each(|past| kept.keep(past));
         let robots = robots.into_iter().map(|robot| restored(rules, &robot));
         Ok(Self {
@@ -159,13 +159,13 @@ impl Episode {
             robots: robots.collect::<Result<_, _>>()?,
             result,
             counts: vec![0; rules.shape.n_cells()],
-            seen: Vec::new(),
+            scratch: Scratch::default(),
             history: kept,
         })
     }
 
     fn beginning(rules: &Rules, world: World, episode: u64) -> Self {
-        let start = |robot| Robot::at(rules.shape, rules.start_cell(world.seed(), robot));
+        let start = |robot| Robot::at(&rules.airspace, rules.start_cell(world.seed(), robot));
         let robots: Vec<Robot> = (0..rules.n_robots).map(start).collect();
         let result = WorldResult {
             seed: world.seed(),
@@ -173,7 +173,7 @@ impl Episode {
             n_target_cells: count(world.states(), rules.target_state),
             ..WorldResult::default()
         };
-        let mut history = History::new(rules.history, rules.n_robots, rules.n_moves);
+        let mut history = History::new(rules.history, rules.n_robots, rules.most_seen());
         history.push(&result, &robots);
         Self {
             beginning: world.clone(),
@@ -181,7 +181,7 @@ impl Episode {
             robots,
             result,
             counts: vec![0; rules.shape.n_cells()],
-            seen: Vec::new(),
+            scratch: Scratch::default(),
             history,
         }
     }
@@ -192,14 +192,14 @@ impl Episode {
         for Robot {
             result,
             frame,
-            visited,
+            seen,
             ..
         } in &mut self.robots
         {
             if result.coverage == Coverage::Full as u32 {
-                sensor.observe(key, states, 0..rules.shape.n_cells(), frame);
+                sensor.observe(key, states, path_cells(0..rules.shape.n_cells()), frame);
             } else {
-                sensor.observe(key, states, visited.iter().copied(), frame);
+                sensor.observe(key, states, seen.iter().copied(), frame);
             }
         }
     }
@@ -212,6 +212,8 @@ fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
         frame: frame.map_err(|error| InvalidWorld(error.to_string()))?,
         path: path_from_bytes(&saved.path).map_err(|error| InvalidWorld(error.to_string()))?,
         visited: Vec::new(),
+        seen: Vec::new(),
+        paying: None,
     })
 }
 

@@ -39,10 +39,11 @@ pub struct PastRobot {
 }
 
 impl History {
-    /// Room for the frames of `n_steps` steps of `n_robots` paths each, at least for the present one.
-    pub fn new(n_steps: usize, n_robots: usize, n_moves: usize) -> Self {
+    /// Room for the frames of `n_steps` steps of `n_robots` paths each, from which so many cells are seen; at least for
+    /// the present one.
+    pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
-        let of_robot = size_of::<PastRobot>() + 5 * n_moves;
+        let of_robot = size_of::<PastRobot>() + 5 * most_seen;
         let of_step = size_of::<PastStep>() + n_robots * of_robot;
         Self {
             n_steps,
@@ -123,19 +124,21 @@ impl PastRobot {
             self.values.extend_from_slice(bytes);
             return;
         }
-        let visited = robot.visited.iter();
-        self.cells.extend(visited.clone().map(|&cell| cell as u32));
-        self.values.extend(visited.map(|&cell| bytes[cell]));
+        let seen = robot.seen.iter();
+        self.cells.extend(seen.clone().map(|it| it.cell as u32));
+        self.values.extend(seen.map(|it| bytes[it.cell]));
     }
 
-    /// Writes what was observed over `frame`, one byte per cell; leaves the other cells as they are.
+    /// Writes what was observed over `frame`, one byte per cell; leaves the other cells as they are, and those that
+    /// another robot saw from a ring further in.
     pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);
             return;
         }
         for (&cell, &value) in self.cells.iter().zip(&self.values) {
-            frame[cell as usize] = value;
+            let frame = &mut frame[cell as usize];
+            *frame = value.min(*frame);
         }
     }
 }

@@ -1,13 +1,14 @@
-//! What a step pays: a cell that several robots visit pays once.
+//! What a step pays: a cell that several robots visit pays once, or see where seeing pays.
 
 use super::robot::Robot;
 use super::rules::Rules;
 use emberwatch_protocol::message::WorldResult;
+use emberwatch_protocol::model::Pays;
 
 /// Set in the count of a cell that the team was paid for.
 const PAID: u8 = 0x80;
 
-/// Counts the cells that robots visited in `states`, X_{k+1}: for each its share and its marginal reward, for the
+/// Counts the paying cells of robots in `states`, X_{k+1}: for each its share and its marginal reward, for the
 /// world the team's. `counts` has a 0 for each cell, before and after.
 pub(super) fn pay(
     rules: &Rules,
@@ -18,13 +19,16 @@ pub(super) fn pay(
 ) {
     (team.reward, team.n_visited, team.n_hits) = (0.0, 0, 0);
     for robot in &*robots {
-        robot.visited.iter().for_each(|&cell| counts[cell] += 1);
+        robot.paying().iter().for_each(|&cell| counts[cell] += 1);
     }
     for Robot {
-        visited, result, ..
+        visited,
+        paying,
+        result,
+        ..
     } in &mut *robots
     {
-        for &cell in visited.iter() {
+        for &cell in paying.as_ref().unwrap_or(visited) {
             let reward = rules.reward[usize::from(states[cell])];
             let is_hit = u32::from(states[cell] == rules.target_state);
             let n_visitors = counts[cell] & !PAID;
@@ -42,13 +46,29 @@ pub(super) fn pay(
         }
     }
     for robot in &*robots {
-        robot.visited.iter().for_each(|&cell| counts[cell] = 0);
+        robot.paying().iter().for_each(|&cell| counts[cell] = 0);
     }
+    if rules.airspace.pays() == Pays::Seen {
+        team.n_visited = n_distinct(robots, counts);
+    }
+}
+
+/// Distinct cells that any robot visited.
+fn n_distinct(robots: &[Robot], counts: &mut [u8]) -> u32 {
+    let mut n_visited = 0;
+    for &cell in robots.iter().flat_map(|robot| &robot.visited) {
+        n_visited += u32::from(counts[cell] == 0);
+        counts[cell] = 1;
+    }
+    let visited = robots.iter().flat_map(|robot| &robot.visited);
+    visited.for_each(|&cell| counts[cell] = 0);
+    n_visited
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::world::robot::Scratch;
     use emberwatch_protocol::randomness::split_mix;
     use emberwatch_protocol::task::Start;
     use emberwatch_protocol::{Coverage, Model, Move, Shape};
@@ -71,11 +91,16 @@ mod tests {
             let draw = |index: usize| split_mix(case, index as u64);
             let states: Vec<u8> = (0..20).map(|cell| (draw(cell) % 3) as u8).collect();
             let fly = |r: usize| {
-                let mut robot = Robot::at(shape, shape.cell(draw(100 + r) as usize % 20));
+                let mut robot = Robot::at(&rules.airspace, shape.cell(draw(100 + r) as usize % 20));
                 let n_moves = draw(200 + r) as usize % 8; // 0: it stays.
                 let moves = (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) >> 9));
                 let moves: Vec<Move> = moves.collect();
-                robot.fly(shape, &moves, Coverage::Path, &mut Vec::new());
+                robot.fly(
+                    &rules.airspace,
+                    &moves,
+                    Coverage::Path,
+                    &mut Scratch::default(),
+                );
                 robot
             };
             let mut robots: Vec<Robot> = (0..1 + case as usize % 6).map(fly).collect();

@@ -1,8 +1,8 @@
 //! One robot of a world: where it is, what it flew and what it saw.
 
 use emberwatch_protocol::message::RobotResult;
-use emberwatch_protocol::path::fly_into;
-use emberwatch_protocol::{Cell, Coverage, Frame, Move, Shape};
+use emberwatch_protocol::model::{Pays, SeenCell};
+use emberwatch_protocol::{Airspace, Cell, Coverage, Frame, Move};
 
 /// A robot after a step or a reset.
 #[derive(Debug, Clone)]
@@ -12,35 +12,51 @@ pub struct Robot {
     pub(super) path: Vec<Move>,
     /// The distinct cells of the path, row-major indices in the order of the first visit.
     pub(super) visited: Vec<usize>,
+    /// The cells in sight of these.
+    pub(super) seen: Vec<SeenCell>,
+    /// Row-major indices of the distinct cells that pay, where these are not the visited ones.
+    pub(super) paying: Option<Vec<usize>>,
+}
+
+/// Work space of flights, of any content.
+#[derive(Debug, Clone, Default)]
+pub struct Scratch {
+    visited: Vec<u64>,
+    rings: Vec<u8>,
 }
 
 impl Robot {
     /// A robot after a reset.
-    pub(super) fn at(shape: Shape, cell: Cell) -> Self {
+    pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {
         let mut robot = Self {
             result: RobotResult {
                 row: cell.row as u32,
                 col: cell.col as u32,
                 ..RobotResult::default()
             },
-            frame: Frame::empty(shape),
+            frame: Frame::empty(airspace.shape()),
             path: Vec::new(),
             visited: Vec::new(),
+            seen: Vec::new(),
+            paying: None,
         };
-        robot.fly(shape, &[], Coverage::Empty, &mut Vec::new());
+        robot.fly(airspace, &[], Coverage::Empty, &mut Scratch::default());
         robot
     }
 
-    /// Flies a path, or stays if it is empty; what the step pays is yet to be counted. `seen` is scratch.
+    /// Flies a path, or stays if it is empty; what the step pays is yet to be counted.
     pub(super) fn fly(
         &mut self,
-        shape: Shape,
+        airspace: &Airspace,
         path: &[Move],
         coverage: Coverage,
-        seen: &mut Vec<u64>,
+        scratch: &mut Scratch,
     ) {
         let start = self.cell();
-        let end = fly_into(shape, start, path, &mut self.visited, seen);
+        let end = airspace.fly_into(start, path, &mut self.visited, &mut scratch.visited);
+        airspace.see_into(&self.visited, &mut self.seen, &mut scratch.rings);
+        self.paying = (airspace.pays() == Pays::Seen)
+            .then(|| self.seen.iter().map(|seen| seen.cell).collect());
         self.path.clear();
         self.path.extend_from_slice(path);
         self.frame.clear();
@@ -59,6 +75,11 @@ impl Robot {
     /// What the last step gave it.
     pub fn result(&self) -> &RobotResult {
         &self.result
+    }
+
+    /// Row-major indices of the distinct cells that pay.
+    pub(super) fn paying(&self) -> &[usize] {
+        self.paying.as_ref().unwrap_or(&self.visited)
     }
 
     /// What it saw in the last step.

@@ -6,7 +6,7 @@ use super::sensor::Sensor;
 use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use emberwatch_protocol::task::Start;
-use emberwatch_protocol::{Cell, Dynamics, Model, Shape};
+use emberwatch_protocol::{Airspace, Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -15,7 +15,10 @@ use std::sync::atomic::AtomicBool;
 #[derive(Debug, Clone)]
 pub struct Rules {
     pub shape: Shape,
-    /// Reward for each distinct visited cell, by state.
+    pub airspace: Airspace,
+    /// Cells where random starts may be; `None`: all.
+    starts: Option<Arc<Vec<usize>>>,
+    /// Reward for each distinct cell that pays, by state.
     pub reward: Vec<f64>,
     /// The state that pays most.
     pub target_state: u8,
@@ -49,8 +52,11 @@ impl Rules {
         max_steps: u64,
         start: Start,
     ) -> Result<Self, ModelError> {
+        let airspace = model.airspace(shape)?;
         Ok(Self {
             shape,
+            starts: airspace.starts().map(Arc::new),
+            airspace,
             reward: model.reward().to_vec(),
             target_state: model.target_state() as u8,
             n_states: model.n_states(),
@@ -80,17 +86,59 @@ impl Rules {
     }
 
     pub(super) fn start_cell(&self, seed: u64, robot: usize) -> Cell {
-        match self.start {
-            Start::Corner => corner_or_side(self.shape, robot),
-            Start::Centre => self.shape.centre(),
-            Start::Random => {
-                let mut stream = stream(seed, Purpose::Start, robot as u64);
-                self.shape
-                    .cell(stream.random_range(0..self.shape.n_cells()))
+        fixed_start(self.start, self.shape, robot).unwrap_or_else(|| {
+            let mut stream = stream(seed, Purpose::Start, robot as u64);
+            let index = match &self.starts {
+                None => stream.random_range(0..self.shape.n_cells()),
+                Some(starts) => starts[stream.random_range(0..starts.len())],
+            };
+            self.shape.cell(index)
+        })
+    }
+
+    /// Most cells that a robot sees in a step.
+    pub(super) fn most_seen(&self) -> usize {
+        match self.airspace.radius() {
+            0 => self.n_moves,
+            radius => {
+                let side = 2 * radius + 1;
+                (side * (self.n_moves + side)).min(self.shape.n_cells())
             }
-            Start::At(cell) => cell,
         }
     }
+}
+
+/// Where a robot starts, unless that is random.
+fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Cell> {
+    match start {
+        Start::Corner => Some(corner_or_side(shape, robot)),
+        Start::Centre => Some(shape.centre()),
+        Start::Random => None,
+        Start::At(cell) => Some(cell),
+    }
+}
+
+/// Checks that so many robots can start in an airspace and leave their start.
+///
+/// # Errors
+/// What was expected of the start, and what was got.
+pub fn check_start(start: Start, airspace: &Airspace, n_robots: usize) -> Result<(), [String; 2]> {
+    if airspace.starts().is_some_and(|starts| starts.is_empty()) {
+        let got = "a no-fly map that leaves none".into();
+        return Err(["a cell that robots can leave".into(), got]);
+    }
+    let places = (0..n_robots).filter_map(|robot| fixed_start(start, airspace.shape(), robot));
+    for cell in places.filter(|_| !airspace.is_open()) {
+        if !airspace.is_free(cell) {
+            let got = format!("{cell}, a no-fly cell");
+            return Err(["a cell where robots may be".into(), got]);
+        }
+        if !airspace.has_way_out(cell) {
+            let got = format!("{cell}, which no-fly cells cut off");
+            return Err(["a cell that robots can leave".into(), got]);
+        }
+    }
+    Ok(())
 }
 
 /// A place at the edge, another one for each of eight robots.

@@ -118,6 +118,8 @@ impl SavedRobot {
             let cell = Cell { row, col };
             let expected = format!("a cell of {}", rules.shape);
             expect(what, rules.shape.contains(cell), &expected, &cell)?;
+            let is_free = rules.airspace.is_free(cell);
+            expect(what, is_free, &"a cell where robots may be", &cell)?;
         }
         let fine = Coverage::try_from(result.coverage).is_ok();
         expect("coverage", fine, &"0, 1 or 2", &result.coverage)?;

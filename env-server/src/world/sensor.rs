@@ -1,9 +1,10 @@
 //! Observation noise: what a sensor reads where it looks (paper eq. 1).
 //!
-//! The reading at (seed, step, cell) is a pure function, so two agents that look at one cell at one
-//! step see the same. One ChaCha8 draw keys the step, SplitMix64 of that key gives each cell's
+//! The reading at (seed, step, cell, ring) is a pure function, so two agents that look at one cell at one
+//! step from one ring see the same. One ChaCha8 draw keys the step, SplitMix64 of that key gives each cell's
 //! number: constant work per cell looked at, nothing for the others.
 
+use emberwatch_protocol::model::SeenCell;
 use emberwatch_protocol::randomness::{Purpose, split_mix, stream};
 use emberwatch_protocol::{Frame, Grid, Model};
 use rand_chacha::rand_core::Rng;
@@ -11,15 +12,18 @@ use rand_chacha::rand_core::Rng;
 /// `P(y | x)` as thresholds on a 32-bit number.
 #[derive(Debug, Clone)]
 pub struct Sensor {
-    /// `thresholds[x * n_observations + y]`: upper end of `y`'s share, of 2^32.
+    /// `thresholds[(x * n_rings + ring) * n_named + y]`: upper end of `y`'s share, of 2^32.
     thresholds: Vec<u64>,
-    n_observations: usize,
+    n_rings: usize,
+    /// Observations without regard to the ring.
+    n_named: usize,
 }
 
 impl Sensor {
     /// The sensor of a model.
     pub fn new(model: &Model) -> Self {
-        let cumulative = |row: ndarray::ArrayView1<'_, f64>| {
+        let (n_rings, n_named) = (model.n_rings(), model.n_observations() / model.n_rings());
+        let cumulative = |row: &[f64]| {
             let mut sum = 0.0;
             let mut thresholds: Vec<u64> = row
                 .iter()
@@ -33,15 +37,13 @@ impl Sensor {
             thresholds[last..].fill(1 << 32);
             thresholds
         };
-        let thresholds = model
-            .likelihood()
-            .rows()
-            .into_iter()
-            .flat_map(cumulative)
-            .collect();
+        let likelihood = model.likelihood().as_standard_layout();
+        let of_rings = likelihood.as_slice().expect("invariant: row-major");
+        let of_rings = of_rings.chunks_exact(n_named);
         Self {
-            thresholds,
-            n_observations: model.n_observations(),
+            thresholds: of_rings.flat_map(cumulative).collect(),
+            n_rings,
+            n_named,
         }
     }
 
@@ -50,25 +52,30 @@ impl Sensor {
         stream(seed, Purpose::Sensor, absolute_step).next_u64()
     }
 
-    /// Looks at cells (row-major indices) and records the readings in the frame; `key` is the step's.
+    /// Looks at cells and records the readings in the frame; `key` is the step's.
     pub fn observe(
         &self,
         key: u64,
         states: &Grid<u8>,
-        cells: impl IntoIterator<Item = usize>,
+        cells: impl IntoIterator<Item = SeenCell>,
         frame: &mut Frame,
     ) {
         let states = states.as_slice().expect("invariant: states are row-major");
-        for cell in cells {
+        for SeenCell { cell, ring } in cells {
             let number = split_mix(key, cell as u64) >> 32;
-            let of_state = &self.thresholds[usize::from(states[cell]) * self.n_observations..]
-                [..self.n_observations];
+            let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
+            let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
             // All of them, in order or not: stopping at the first mispredicts at every latent cell.
             let passed = of_state.iter().filter(|threshold| number >= **threshold);
-            let reading = passed.count();
+            let reading = passed.count() + usize::from(ring) * self.n_named;
             frame.observe(cell, reading as u8);
         }
     }
+}
+
+/// Cells that are seen from themselves.
+pub(super) fn path_cells(cells: impl Iterator<Item = usize>) -> impl Iterator<Item = SeenCell> {
+    cells.map(|cell| SeenCell { cell, ring: 0 })
 }
 
 #[cfg(test)]
@@ -97,7 +104,7 @@ mod tests {
                 sensor.observe(
                     Sensor::key(7, step),
                     &states,
-                    0..shape.n_cells(),
+                    path_cells(0..shape.n_cells()),
                     &mut frame,
                 );
                 frame
@@ -126,7 +133,7 @@ mod tests {
             sensor.observe(
                 Sensor::key(1, 2),
                 &states,
-                cells.iter().copied(),
+                path_cells(cells.iter().copied()),
                 &mut frame,
             );
             frame

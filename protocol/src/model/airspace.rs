@@ -2,7 +2,7 @@
 
 use super::file::Pays;
 use super::grid::{Cell, Grid, Shape};
-use super::path::{Flight, Move};
+use super::path::{Flight, Move, fly_by};
 use std::sync::Arc;
 
 /// Where robots may fly, and what their sensor sees from there.
@@ -95,6 +95,26 @@ impl Airspace {
         if self.is_free(next) { next } else { cell }
     }
 
+    /// A move, or the next in [`Move::ALL`] if it leads into a no-fly cell: one that a planner may plan.
+    #[inline]
+    pub fn around(&self, step: Move, cell: Cell) -> Move {
+        let may_be = |step: &Move| self.is_free(step.apply(cell, self.shape));
+        let mut steps = (0..4).map(|turn| Move::from_low_bits(step as u64 + turn));
+        steps.find(may_be).unwrap_or(step)
+    }
+
+    /// Replaces the moves of a path that lead into no-fly cells, as [`Self::around`].
+    pub fn fly_around(&self, start: Cell, path: &mut [Move]) {
+        if self.is_open() {
+            return;
+        }
+        let mut cell = start;
+        for step in path {
+            *step = self.around(*step, cell);
+            cell = self.after(*step, cell);
+        }
+    }
+
     /// Whether a robot can leave a cell: a start from which it cannot is none.
     pub fn has_way_out(&self, cell: Cell) -> bool {
         Move::ALL.iter().any(|step| self.after(*step, cell) != cell)
@@ -166,37 +186,19 @@ impl Airspace {
         seen.iter_mut().for_each(|it| it.ring = rings[it.cell]);
     }
 
+    /// The distinct cells that pay on a path, by row-major index.
+    pub fn paying(&self, start: Cell, path: &[Move]) -> Vec<usize> {
+        let visited = self.fly(start, path).visited;
+        match self.pays {
+            Pays::Visited => visited,
+            Pays::Seen => self.see(&visited).iter().map(|it| it.cell).collect(),
+        }
+    }
+
     /// [`Self::see_into`] with new memory.
     pub fn see(&self, visited: &[usize]) -> Vec<SeenCell> {
         let mut seen = Vec::new();
         self.see_into(visited, &mut seen, &mut Vec::new());
         seen
     }
-}
-
-/// Flies a path where `after` tells what a move leads to; the visited cells go to the first vector, the second is
-/// scratch.
-#[inline]
-pub(super) fn fly_by(
-    after: impl Fn(Move, Cell) -> Cell,
-    shape: Shape,
-    start: Cell,
-    path: &[Move],
-    (visited, seen): (&mut Vec<usize>, &mut Vec<u64>),
-) -> Cell {
-    seen.clear();
-    seen.resize(shape.n_cells().div_ceil(64), 0);
-    visited.resize(path.len(), 0);
-    let (mut n_visited, mut cell) = (0, start);
-    for &step in path {
-        cell = after(step, cell);
-        let index = shape.index(cell);
-        // Branch-free: whether a random path has been here before is not predictable either.
-        let (word, bit) = (&mut seen[index / 64], index % 64);
-        visited[n_visited] = index;
-        n_visited += usize::from(*word >> bit & 1 == 0);
-        *word |= 1 << bit;
-    }
-    visited.truncate(n_visited);
-    cell
 }

@@ -27,6 +27,14 @@ pub enum CellMap {
 }
 
 impl CellMap {
+    /// The numbers row by row, unless they are in a file that was not read.
+    pub fn rows(&self) -> Option<Vec<Vec<u8>>> {
+        match self {
+            Self::Rows(rows) => Some(rows.clone()),
+            Self::File(_) => None,
+        }
+    }
+
     /// The numbers, shape `[H, W]`.
     ///
     /// # Errors

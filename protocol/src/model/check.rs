@@ -204,7 +204,7 @@ impl Checker<'_> {
         }
     }
 
-    /// Where no robot may be, if there is such a cell.
+    /// Where no robot may be, if the file says so.
     pub fn no_fly(&self, file: &ModelFile) -> Result<Option<Grid<bool>>, ModelError> {
         let Some(map) = &file.no_fly else {
             return Ok(None);
@@ -216,8 +216,7 @@ impl Checker<'_> {
         if map.iter().all(|&flag| flag == 1) {
             return self.wrong("no_fly".into(), "a cell where robots may be", "none");
         }
-        let any = map.iter().any(|&flag| flag == 1);
-        Ok(any.then(|| map.mapv(|flag| flag == 1)))
+        Ok(Some(map.mapv(|flag| flag == 1)))
     }
 
     fn map(&self, what: &str, map: &CellMap) -> Result<Grid<u8>, ModelError> {

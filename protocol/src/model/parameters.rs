@@ -5,7 +5,7 @@
 
 use super::airspace::Airspace;
 use super::check::Checker;
-use super::file::{LEAST_SHARE, ModelError, ModelFile, Pays};
+use super::file::{LEAST_SHARE, ModelError, ModelFile};
 use super::grid::{Cell, Grid, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
@@ -83,23 +83,18 @@ impl Model {
         Self::new(ModelFile::read(path)?)
     }
 
-    /// The same with a sensor that sees so many cells far, which `pays`, where they are given.
+    /// The same with a sensor that sees so many rows and columns beyond each cell of the path.
     ///
     /// # Errors
     /// If the radius is over 8.
-    pub fn with_sensor(
-        self,
-        radius: Option<usize>,
-        pays: Option<Pays>,
-    ) -> Result<Self, ModelError> {
-        if radius.is_none() && pays.is_none() {
-            return Ok(self);
-        }
+    pub fn with_radius(self, radius: usize) -> Result<Self, ModelError> {
         let mut file = self.file;
+        if radius == 0 && file.sensor.is_none() {
+            return Self::new(file);
+        }
         let sensor = file.sensor.get_or_insert_default();
-        sensor.radius = radius.unwrap_or(sensor.radius);
-        sensor.pays = pays.unwrap_or(sensor.pays);
-        sensor.rings.truncate(sensor.radius);
+        sensor.radius = radius;
+        sensor.rings.truncate(radius);
         Self::new(file)
     }
 

@@ -1,6 +1,5 @@
 //! A robot's path: [`Move`]s from a start cell to the cells flown over (paper eq. 12).
 
-use super::airspace::Airspace;
 use super::grid::{Cell, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -103,9 +102,39 @@ pub fn path_to_bytes(path: &[Move]) -> Vec<u8> {
     path.iter().map(|&m| m as u8).collect()
 }
 
-/// Flies a path from `start` over a grid without no-fly cells, as [`Airspace::fly`].
+/// Flies a path from `start` over a grid without no-fly cells (paper eq. 12).
 pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
-    Airspace::open(shape).fly(start, path)
+    let mut visited = Vec::new();
+    let after = |step: Move, cell| step.apply(cell, shape);
+    let end = fly_by(after, shape, start, path, (&mut visited, &mut Vec::new()));
+    Flight { visited, end }
+}
+
+/// Flies a path where `after` tells what a move leads to; the visited cells go to the first vector, the second is
+/// scratch.
+#[inline]
+pub(super) fn fly_by(
+    after: impl Fn(Move, Cell) -> Cell,
+    shape: Shape,
+    start: Cell,
+    path: &[Move],
+    (visited, seen): (&mut Vec<usize>, &mut Vec<u64>),
+) -> Cell {
+    seen.clear();
+    seen.resize(shape.n_cells().div_ceil(64), 0);
+    visited.resize(path.len(), 0);
+    let (mut n_visited, mut cell) = (0, start);
+    for &step in path {
+        cell = after(step, cell);
+        let index = shape.index(cell);
+        // Branch-free: whether a random path has been here before is not predictable either.
+        let (word, bit) = (&mut seen[index / 64], index % 64);
+        visited[n_visited] = index;
+        n_visited += usize::from(*word >> bit & 1 == 0);
+        *word |= 1 << bit;
+    }
+    visited.truncate(n_visited);
+    cell
 }
 
 #[cfg(test)]

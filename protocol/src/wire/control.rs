@@ -6,6 +6,7 @@ use crate::model::grid::{Shape, ShapeError};
 use serde::{Deserialize, Serialize};
 
 pub use super::json::{MAX_CONTROL_BYTES, parse};
+pub use super::land::{AirspaceInfo, ZonesInfo};
 
 /// Most bytes of a belief in one message, before they are written in base64.
 pub const MAX_BELIEF_PART: usize = 1 << 19;
@@ -195,6 +196,12 @@ pub struct ServerInfo {
     /// The task that the worlds are, by its name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
+    /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub airspace: Option<AirspaceInfo>,
+    /// Which land each cell is, where lands differ and learners are told.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zones: Option<ZonesInfo>,
     /// What worlds show whose hidden states were recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_world: Option<RecordedWorld>,

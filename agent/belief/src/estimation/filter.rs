@@ -143,7 +143,8 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let kernels: Vec<_> = tables.kernel.chunks_exact(n_weights).map(kernel).collect();
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
-    let transition = Transition::of_weights(&kernels, &vec![0.0; n_states], belief.shape());
+    let bias = vec![0.0; n_states];
+    let transition = Transition::of_weights(&kernels, &bias, belief.shape(), (None, 1));
     (transition, likelihood, checksum)
 }
 

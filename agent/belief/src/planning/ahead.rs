@@ -45,7 +45,7 @@ impl Planner for Ahead {
 /// The best of all cells from each cell, where every move of the way there leaves a share; shape `[H, W]`. A search
 /// over equal cells has no direction without it.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
-    let mut promise = values.value().mapv(|value| value.max(0.0));
+    let mut promise = values.worth().mapv(|value| value.max(0.0));
     let (height, width) = promise.dim();
     let cells = (0..height).flat_map(|row| (0..width).map(move |col| (row, col)));
     let mut spread = |(row, col): (usize, usize), from: [(usize, usize); 2]| {

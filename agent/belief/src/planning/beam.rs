@@ -37,6 +37,9 @@ pub struct BeamSearch {
     /// For each state of the beam, one bit per cell of the reach.
     visited: Vec<u64>,
     next_visited: Vec<u64>,
+    /// The same for the cells in sight, where sight counts.
+    seen_cells: Vec<u64>,
+    next_seen_cells: Vec<u64>,
     candidates: Vec<Candidate>,
     /// Rank of each candidate and its index.
     ranking: Vec<(u64, u32)>,
@@ -90,6 +93,8 @@ impl BeamSearch {
             next_beam: Vec::new(),
             visited: Vec::new(),
             next_visited: Vec::new(),
+            seen_cells: Vec::new(),
+            next_seen_cells: Vec::new(),
             candidates: Vec::with_capacity(4 * width),
             ranking: Vec::with_capacity(4 * width),
             seen: SeenStates::new(4 * width),
@@ -130,12 +135,13 @@ impl BeamSearch {
         stops: &mut impl FnMut() -> bool,
     ) -> Option<Plan> {
         self.begin(width);
-        for _ in 0..n_moves {
+        for index in 0..n_moves {
             if stops() {
                 return None;
             }
-            self.expand();
-            self.select(width);
+            // Of the start nothing is seen.
+            self.expand(index > 0);
+            self.select(width, index > 0);
             self.weight *= self.discount;
         }
         let rank = |state: &State| (ordered_bits(state.score), !state.hash);
@@ -163,6 +169,11 @@ impl BeamSearch {
         self.visited.resize(width * n_words, 0);
         self.next_visited.clear();
         self.next_visited.resize(width * n_words, 0);
+        let n_seen = width * self.seen_words_per_state();
+        self.seen_cells.clear();
+        self.seen_cells.resize(n_seen, 0);
+        self.next_seen_cells.clear();
+        self.next_seen_cells.resize(n_seen, 0);
         self.history.clear();
         self.weight = 1.0;
         self.beam.clear();
@@ -178,13 +189,25 @@ impl BeamSearch {
         self.reach.n_cells().div_ceil(64)
     }
 
+    fn seen_words_per_state(&self) -> usize {
+        let sight = self.reach.sight.as_ref();
+        sight.map_or(0, |sight| sight.n_cells().div_ceil(64))
+    }
+
     /// Lists the states one move on from the beam, each once with its best score.
-    fn expand(&mut self) {
+    fn expand(&mut self, was_seen: bool) {
         self.candidates.clear();
         self.seen.clear();
         for index in 0..self.beam.len() {
             for step in Move::ALL {
-                let (candidate, key) = self.successor(index, step);
+                let (mut candidate, key) = self.successor(index, step);
+                if let Some(sight) = &self.reach.sight {
+                    let n_words = self.seen_words_per_state();
+                    let seen = &self.seen_cells[index * n_words..][..n_words];
+                    let (before, now) = (self.beam[index], &mut candidate.state);
+                    let (from, to) = ((before.row, before.col), (now.row, now.col));
+                    now.score += self.weight * sight.gain(seen, from, to, was_seen);
+                }
                 match self.seen.find_or_insert(key, self.candidates.len()) {
                     None => self.candidates.push(candidate),
                     Some(twin) if self.candidates[twin].state.score < candidate.state.score => {
@@ -236,9 +259,9 @@ impl BeamSearch {
     }
 
     /// Makes the best candidates the beam.
-    fn select(&mut self, width: usize) {
+    fn select(&mut self, width: usize, was_seen: bool) {
         self.rank(width);
-        let n_words = self.words_per_state();
+        let (n_words, n_seen) = (self.words_per_state(), self.seen_words_per_state());
         self.next_beam.clear();
         let visited = self.next_visited.chunks_exact_mut(n_words);
         for (&(_, index), visited) in self.ranking.iter().zip(visited) {
@@ -247,6 +270,13 @@ impl BeamSearch {
             visited.copy_from_slice(&self.visited[before..][..n_words]);
             let cell = self.reach.index(state.row, state.col);
             visited[cell / 64] |= 1 << (cell % 64);
+            if let Some(sight) = &self.reach.sight {
+                let from = self.beam[origin.state as usize];
+                let seen = &mut self.next_seen_cells[self.next_beam.len() * n_seen..][..n_seen];
+                let before = origin.state as usize * n_seen;
+                seen.copy_from_slice(&self.seen_cells[before..][..n_seen]);
+                sight.mark(seen, (from.row, from.col), (state.row, state.col), was_seen);
+            }
             self.next_beam.push(state);
             self.history.push(origin);
         }
@@ -260,6 +290,7 @@ impl BeamSearch {
         self.history.extend(nowhere);
         std::mem::swap(&mut self.beam, &mut self.next_beam);
         std::mem::swap(&mut self.visited, &mut self.next_visited);
+        std::mem::swap(&mut self.seen_cells, &mut self.next_seen_cells);
     }
 
     /// The moves that led to a state of the last beam.

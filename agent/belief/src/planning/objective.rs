@@ -3,6 +3,7 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use emberwatch_protocol::grid::{Cell, Grid, Shape};
+use emberwatch_protocol::model::{Airspace, Pays};
 use emberwatch_protocol::path::Move;
 use ndarray::ArrayView2;
 use serde::{Deserialize, Serialize};
@@ -61,10 +62,13 @@ pub struct Objective {
 /// What each cell of the grid is worth to a planner. All numbers are finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellValues {
+    /// On the path.
     value: Grid<f32>,
     coverage_bonus: f32,
     revisits: bool,
-    shape: Shape,
+    /// In sight of the path, where the sensor sees beyond it.
+    in_sight: Option<Grid<f32>>,
+    airspace: Airspace,
 }
 
 impl Objective {
@@ -89,18 +93,33 @@ impl Objective {
         }
     }
 
-    /// What the cells are worth under a belief.
+    /// What the cells are worth under a belief, on a grid that is open everywhere with a sensor of the path.
     pub fn values(&self, belief: &Belief) -> CellValues {
+        self.values_in(belief, &Airspace::open(belief.shape()))
+    }
+
+    /// What the cells are worth under a belief. Entropy counts where it is seen, all else where it pays.
+    ///
+    /// # Panics
+    /// If the airspace is of another grid.
+    pub fn values_in(&self, belief: &Belief, airspace: &Airspace) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),
             Target::Entropy => belief.entropy(self.entropy),
             Target::Coverage => Grid::zeros(belief.shape().dim()),
         };
-        CellValues {
-            value,
-            coverage_bonus: self.coverage_bonus,
+        let values = CellValues {
             revisits: self.revisits,
-            shape: belief.shape(),
+            ..CellValues::new(value, self.coverage_bonus)
+        };
+        let counts_in_sight = self.target == Target::Entropy || airspace.pays() == Pays::Seen;
+        let in_sight = counts_in_sight.then(|| values.value.mapv(|it| it + self.coverage_bonus));
+        match in_sight {
+            Some(in_sight) if airspace.radius() > 0 => {
+                let nothing = CellValues::new(Grid::zeros(belief.shape().dim()), 0.0);
+                nothing.within(airspace, Some(in_sight))
+            }
+            _ => values.within(airspace, None),
         }
     }
 }
@@ -109,16 +128,53 @@ impl CellValues {
     /// Values of shape `[H, W]`, finite, and what each distinct cell is worth besides.
     pub fn new(value: Grid<f32>, coverage_bonus: f32) -> Self {
         let (height, width) = value.dim();
+        let shape = Shape::new(height, width).expect("invariant: a grid of cells");
         Self {
-            shape: Shape::new(height, width).expect("invariant: a grid of cells"),
+            airspace: Airspace::open(shape),
             value,
             coverage_bonus,
             revisits: false,
+            in_sight: None,
+        }
+    }
+
+    /// The same where robots fly and see as an airspace has it; `in_sight`: what each distinct cell in sight of the path
+    /// is worth beside that, shape `[H, W]`, finite.
+    ///
+    /// # Panics
+    /// If the airspace is of another grid.
+    pub fn within(self, airspace: &Airspace, in_sight: Option<Grid<f32>>) -> Self {
+        assert_eq!(
+            airspace.shape(),
+            self.shape(),
+            "airspace: expected the grid"
+        );
+        Self {
+            airspace: airspace.clone(),
+            in_sight,
+            ..self
         }
     }
 
     pub fn shape(&self) -> Shape {
-        self.shape
+        self.airspace.shape()
+    }
+
+    pub fn airspace(&self) -> &Airspace {
+        &self.airspace
+    }
+
+    /// What each distinct cell in sight of the path is worth, where sight counts.
+    pub fn in_sight(&self) -> Option<&Grid<f32>> {
+        self.in_sight.as_ref()
+    }
+
+    /// Value of each cell without the bonus, on the path and in sight of it together, shape `[H, W]`.
+    pub fn worth(&self) -> Grid<f32> {
+        match &self.in_sight {
+            None => self.value.clone(),
+            Some(in_sight) => &self.value + in_sight,
+        }
     }
 
     /// Value of each cell without the bonus, shape `[H, W]`.
@@ -131,14 +187,21 @@ impl CellValues {
         self.value.scaled_add(weight, layer);
     }
 
-    /// The same, with nothing left to gain at some cells, by their row-major indices, which may be named more than
-    /// once. Where each visit counts, a teammate's takes nothing away.
-    pub fn without(&self, taken: impl Iterator<Item = usize>) -> Self {
+    /// The same, with nothing left to gain at cells that a teammate visits or sees, by the row-major indices of those
+    /// visited, which may be named more than once. Where each visit counts, a teammate's takes nothing away.
+    pub fn without(&self, visited: &[usize]) -> Self {
         let mut left = self.clone();
         if !left.revisits {
             let value = left.value.as_slice_mut();
             let value = value.expect("invariant: grids are row-major");
-            taken.for_each(|cell| value[cell] = -left.coverage_bonus);
+            let taken = visited.iter();
+            taken.for_each(|&cell| value[cell] = -left.coverage_bonus);
+        }
+        if let Some(in_sight) = &mut left.in_sight {
+            let in_sight = in_sight.as_slice_mut();
+            let in_sight = in_sight.expect("invariant: grids are row-major");
+            let seen = self.airspace.see(visited);
+            seen.iter().for_each(|it| in_sight[it.cell] = 0.0);
         }
         left
     }
@@ -152,15 +215,16 @@ impl CellValues {
         self.revisits
     }
 
-    /// Score of the path flown from `start` by [`emberwatch_protocol::path::fly`]'s rules.
+    /// Score of the path flown from `start` by [`Airspace::fly`]'s rules.
     pub fn score(&self, start: Cell, moves: &[Move]) -> f32 {
-        let mut seen = vec![false; self.shape.n_cells()];
+        let shape = self.shape();
+        let mut visited = vec![false; shape.n_cells()];
         let mut cell = start;
-        let mut score = 0.0;
+        let mut score = self.seen_score(start, moves);
         for step in moves {
-            cell = step.apply(cell, self.shape);
+            cell = self.airspace.after(*step, cell);
             let value = self.value[[cell.row, cell.col]];
-            let first = !std::mem::replace(&mut seen[self.shape.index(cell)], true);
+            let first = !std::mem::replace(&mut visited[shape.index(cell)], true);
             score += match (first, self.revisits) {
                 (true, _) => value + self.coverage_bonus,
                 (false, true) => value,
@@ -168,5 +232,17 @@ impl CellValues {
             };
         }
         score
+    }
+
+    /// The part of a path's score that is seen.
+    fn seen_score(&self, start: Cell, moves: &[Move]) -> f32 {
+        let Some(in_sight) = &self.in_sight else {
+            return 0.0;
+        };
+        let in_sight = in_sight.as_slice();
+        let in_sight = in_sight.expect("invariant: grids are row-major");
+        let visited = self.airspace.fly(start, moves).visited;
+        let seen = self.airspace.see(&visited);
+        seen.iter().map(|it| in_sight[it.cell]).sum()
     }
 }

@@ -7,7 +7,6 @@ use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::path::fly;
 use emberwatch_protocol::{Cell, Grid};
 
 /// What a path is for.
@@ -156,9 +155,20 @@ impl PathOption {
     /// What the cells are worth on the way to a goal.
     fn values(&self, outlook: &Outlook, goal: Option<Cell>) -> CellValues {
         let [bonus, probability, entropy, novelty] = self.worth;
-        let mut value: Grid<f32> = outlook.layer(Layer::Probability) * probability;
-        for (weight, layer) in [(entropy, Layer::Entropy), (novelty, Layer::Novelty)] {
-            if weight != 0.0 {
+        let mut value: Grid<f32> = Grid::zeros(outlook.shape().dim());
+        let mut in_sight: Option<Grid<f32>> = None;
+        for (weight, layer) in [
+            (probability, Layer::Probability),
+            (entropy, Layer::Entropy),
+            (novelty, Layer::Novelty),
+        ] {
+            if weight == 0.0 {
+                continue;
+            }
+            if outlook.counts_in_sight(layer) {
+                let in_sight = in_sight.get_or_insert_with(|| Grid::zeros(value.dim()));
+                in_sight.scaled_add(weight, outlook.layer(layer));
+            } else {
                 value.scaled_add(weight, outlook.layer(layer));
             }
         }
@@ -170,7 +180,7 @@ impl PathOption {
                 *value += SLOPE * (height + width - away) as f32;
             }
         }
-        CellValues::new(value, bonus)
+        CellValues::new(value, bonus).within(outlook.airspace(), in_sight)
     }
 }
 
@@ -199,11 +209,16 @@ fn features(
     (plan, goal): (&Plan, Option<Cell>),
     facts: &[f32; 6],
 ) -> [f32; N_FEATURES] {
-    let flight = fly(outlook.shape(), robot, &plan.moves);
+    let flight = outlook.airspace().fly(robot, &plan.moves);
+    let seen = outlook.airspace().see(&flight.visited);
     let on_path = [Layer::Probability, Layer::Entropy, Layer::Novelty].map(|layer| {
         let cells = outlook.layer(layer).as_slice();
         let cells = cells.expect("invariant: grids are row-major");
-        let sum: f32 = flight.visited.iter().map(|&cell| cells[cell]).sum();
+        let sum: f32 = if outlook.counts_in_sight(layer) {
+            seen.iter().map(|it| cells[it.cell]).sum()
+        } else {
+            flight.visited.iter().map(|&cell| cells[cell]).sum()
+        };
         sum / outlook.n_moves as f32
     });
     let goal = goal.unwrap_or(flight.end);
@@ -265,8 +280,9 @@ mod tests {
     use super::*;
     use crate::estimation::belief::Belief;
     use crate::planning::memory::Memory;
+    use emberwatch_protocol::path::fly;
     use emberwatch_protocol::randomness::split_mix;
-    use emberwatch_protocol::{Frame, Move, Probabilities, Shape};
+    use emberwatch_protocol::{Airspace, Frame, Move, Probabilities, Shape};
 
     fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");
@@ -287,7 +303,7 @@ mod tests {
             .for_each(|cell| frame.observe(cell, 0));
         memory.see(&frame);
         memory.earn(3.0, n_moves);
-        Outlook::new(&belief, 1, &memory, n_moves)
+        Outlook::new(&belief, &Airspace::open(shape), 1, &memory, n_moves)
     }
 
     /// The best score of all paths.
@@ -380,7 +396,7 @@ mod tests {
             let mut states = Grid::zeros((40, 40));
             states[[row, 5]] = 1;
             let belief = Belief::from_states(&states, 2).expect("valid states");
-            let outlook = Outlook::new(&belief, 1, &Memory::new(shape), 6);
+            let outlook = Outlook::new(&belief, &Airspace::open(shape), 1, &Memory::new(shape), 6);
             choose_by_rule(&outlook, Cell { row: 3, col: 5 }).name
         };
         assert_eq!([choice(4), choice(35)], ["exploit", "best_region"]);

@@ -2,7 +2,8 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::planning::memory::{Memory, Recent};
-use emberwatch_protocol::{Cell, Grid, Shape};
+use emberwatch_protocol::model::Pays;
+use emberwatch_protocol::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
 
 /// A region is the cells within so many rows and columns of its centre, cut at the grid's edge.
@@ -39,7 +40,7 @@ impl Layer {
 /// The layers of a moment, with their sums over regions.
 #[derive(Debug, Clone)]
 pub struct Outlook {
-    shape: Shape,
+    airspace: Airspace,
     layers: [Grid<f32>; 4],
     sums: [Sums; 4],
     /// Paths are this long.
@@ -54,14 +55,28 @@ struct Sums(Grid<f64>);
 
 impl Outlook {
     /// `target`: the state that pays most.
-    pub fn new(belief: &Belief, target: usize, memory: &Memory, n_moves: usize) -> Self {
+    ///
+    /// # Panics
+    /// If the airspace is of another grid than the belief.
+    pub fn new(
+        belief: &Belief,
+        airspace: &Airspace,
+        target: usize,
+        memory: &Memory,
+        n_moves: usize,
+    ) -> Self {
+        assert_eq!(
+            airspace.shape(),
+            belief.shape(),
+            "airspace: expected the grid"
+        );
         let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
         let probability = belief.probability(target).to_owned();
         let surplus = probability.mapv(|p| (p - LIKELY).max(0.0));
         let entropy = belief.entropy(EntropyKind::Sum) / greatest;
         let layers = [probability, surplus, entropy, memory.novelty()];
         Self {
-            shape: belief.shape(),
+            airspace: airspace.clone(),
             sums: layers.each_ref().map(Sums::of),
             layers,
             n_moves,
@@ -69,19 +84,36 @@ impl Outlook {
         }
     }
 
-    /// The same, with nothing to gain at cells that another robot visits.
-    pub fn without(mut self, taken: &[usize]) -> Self {
-        for layer in &mut self.layers {
-            let cells = layer.as_slice_mut();
+    /// The same, with nothing to gain at cells that another robot visits, and nothing to learn at those that it sees.
+    pub fn without(mut self, visited: &[usize]) -> Self {
+        let seen = self.airspace.see(visited);
+        for layer in Layer::ALL {
+            let counts_in_sight = self.counts_in_sight(layer);
+            let cells = self.layers[layer as usize].as_slice_mut();
             let cells = cells.expect("invariant: grids are row-major");
-            taken.iter().for_each(|&cell| cells[cell] = 0.0);
+            if counts_in_sight {
+                seen.iter().for_each(|it| cells[it.cell] = 0.0);
+            } else {
+                visited.iter().for_each(|&cell| cells[cell] = 0.0);
+            }
         }
         self.sums = self.layers.each_ref().map(Sums::of);
         self
     }
 
     pub fn shape(&self) -> Shape {
-        self.shape
+        self.airspace.shape()
+    }
+
+    pub fn airspace(&self) -> &Airspace {
+        &self.airspace
+    }
+
+    /// Whether a layer counts where it is seen, not only on the path.
+    pub fn counts_in_sight(&self, layer: Layer) -> bool {
+        let pays_in_sight = self.airspace.pays() == Pays::Seen;
+        self.airspace.radius() > 0
+            && (pays_in_sight || matches!(layer, Layer::Entropy | Layer::Novelty))
     }
 
     /// A layer's cells, shape `[H, W]`.
@@ -91,13 +123,13 @@ impl Outlook {
 
     /// The sum of a layer over the grid.
     pub fn total(&self, layer: Layer) -> f32 {
-        let (height, width) = self.shape.dim();
+        let (height, width) = self.shape().dim();
         self.sums[layer as usize].0[[height, width]] as f32
     }
 
     /// The sum of a layer over the region around a cell.
     pub fn around(&self, layer: Layer, centre: Cell) -> f32 {
-        let (height, width) = self.shape.dim();
+        let (height, width) = self.shape().dim();
         let first = |at: usize| at.saturating_sub(REGION_RADIUS);
         let end = |at: usize, side: usize| (at + REGION_RADIUS + 1).min(side);
         let (top, left) = (first(centre.row), first(centre.col));
@@ -109,7 +141,7 @@ impl Outlook {
 
     /// Centres of the regions that are compared.
     pub fn centres(&self) -> impl Iterator<Item = Cell> + use<> {
-        let (height, width) = self.shape.dim();
+        let (height, width) = self.shape().dim();
         let along = |side: usize| ((CENTRE_STRIDE / 2).min(side - 1)..side).step_by(CENTRE_STRIDE);
         along(height).flat_map(move |row| along(width).map(move |col| Cell { row, col }))
     }
@@ -170,7 +202,7 @@ mod tests {
         };
         let states = Grid::from_shape_fn((height, width), random);
         let belief = Belief::from_states(&states, 3).expect("valid states");
-        Outlook::new(&belief, 2, &Memory::new(shape), 12)
+        Outlook::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12)
     }
 
     #[test]
@@ -203,7 +235,7 @@ mod tests {
             states[[row, col]] = 2;
         }
         let belief = Belief::from_states(&states, 3).expect("valid states");
-        let outlook = Outlook::new(&belief, 2, &Memory::new(shape), 12);
+        let outlook = Outlook::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12);
         let robot = Cell { row: 2, col: 2 };
         let best = |kept| outlook.best_region(Layer::Surplus, robot, kept);
         assert!(distance(best(1.0), Cell { row: 40, col: 50 }) <= 12);

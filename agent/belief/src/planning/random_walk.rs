@@ -5,7 +5,7 @@ use emberwatch_protocol::path::Move;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 
-/// Moves drawn uniformly and independently, whatever the cells are worth.
+/// Moves drawn uniformly and independently, whatever the cells are worth; around no-fly cells.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RandomWalk;
 
@@ -13,7 +13,11 @@ impl Planner for RandomWalk {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
         let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
         let random_move = |_| Move::from_low_bits(rng.next_u64() >> 62);
-        let moves: Vec<Move> = (0..problem.n_moves).map(random_move).collect();
+        let mut moves: Vec<Move> = (0..problem.n_moves).map(random_move).collect();
+        problem
+            .values
+            .airspace()
+            .fly_around(problem.start, &mut moves);
         let score = problem.values.score(problem.start, &moves);
         Plan { moves, score }
     }

@@ -4,6 +4,7 @@
 use crate::planning::planner::PlanningProblem;
 use emberwatch_protocol::grid::Cell;
 use emberwatch_protocol::path::Move;
+use std::ops::Range;
 
 /// The rectangle of cells within T rows and T columns of the start, with what they are worth.
 ///
@@ -15,8 +16,21 @@ pub(super) struct Reach {
     pub cols: usize,
     /// Where the robot starts, in reach coordinates.
     pub start: (usize, usize),
-    /// Score of the first visit of each cell, and of each later visit; row-major.
+    /// Score of the first visit of each cell, and of each later visit; row-major. No-fly cells have minus infinity.
     pub gains: Vec<[f32; 2]>,
+    /// What is in sight, where that counts.
+    pub sight: Option<Sight>,
+}
+
+/// The cells in sight of a [`Reach`], with what each is worth to the first who sees it.
+#[derive(Debug)]
+pub(super) struct Sight {
+    radius: usize,
+    rows: usize,
+    cols: usize,
+    /// Where the reach begins.
+    first: (usize, usize),
+    values: Vec<f32>,
 }
 
 impl Reach {
@@ -42,6 +56,26 @@ impl Reach {
         let gains = |&value: &f32| [value + bonus, again * value];
         self.gains.clear();
         self.gains.extend(cells.iter().map(gains));
+        if let Some(map) = values.airspace().no_fly() {
+            let blocked = map.slice(ndarray::s![top..bottom, left..right]);
+            let all = self.gains.iter_mut().zip(blocked);
+            let blocked = all.filter(|(_, blocked)| **blocked);
+            blocked.for_each(|(gains, _)| *gains = [f32::NEG_INFINITY; 2]);
+        }
+        let radius = values.airspace().radius();
+        self.sight = values.in_sight().map(|in_sight| {
+            let (above, before) = (top.saturating_sub(radius), left.saturating_sub(radius));
+            let below = (bottom + radius).min(shape.height());
+            let behind = (right + radius).min(shape.width());
+            let cells = in_sight.slice(ndarray::s![above..below, before..behind]);
+            Sight {
+                radius,
+                rows: below - above,
+                cols: behind - before,
+                first: (top - above, left - before),
+                values: cells.iter().copied().collect(),
+            }
+        });
     }
 
     pub fn n_cells(&self) -> usize {
@@ -61,6 +95,59 @@ impl Reach {
             Move::Down => ((row + 1).min(self.rows as u32 - 1), col),
             Move::Left => (row, col.saturating_sub(1)),
             Move::Right => (row, (col + 1).min(self.cols as u32 - 1)),
+        }
+    }
+}
+
+impl Sight {
+    pub fn n_cells(&self) -> usize {
+        self.rows * self.cols
+    }
+
+    /// The rows and columns that a robot may see anew which came by a move from a cell whose surroundings are seen, if
+    /// that `was_seen`, to another; both are cells of the reach.
+    #[inline]
+    fn anew(&self, from: (u32, u32), to: (u32, u32), was_seen: bool) -> [Range<usize>; 2] {
+        let around = |at: u32, first: usize, side: usize| {
+            let at = at as usize + first;
+            at.saturating_sub(self.radius)..(at + self.radius + 1).min(side)
+        };
+        let rows = |row| around(row, self.first.0, self.rows);
+        let cols = |col| around(col, self.first.1, self.cols);
+        let (now, mut anew) = ([rows(to.0), cols(to.1)], [rows(to.0), cols(to.1)]);
+        if was_seen {
+            let (rows, cols) = (rows(from.0), cols(from.1));
+            anew = match to.0.cmp(&from.0) {
+                std::cmp::Ordering::Less => [now[0].start..rows.start, cols],
+                std::cmp::Ordering::Greater => [rows.end..now[0].end, cols],
+                std::cmp::Ordering::Equal if to.1 < from.1 => [rows, now[1].start..cols.start],
+                std::cmp::Ordering::Equal => [rows, cols.end..now[1].end],
+            };
+        }
+        anew
+    }
+
+    /// What a move shows for the first time is worth, given a bit for each cell that was seen.
+    #[inline]
+    pub fn gain(&self, seen: &[u64], from: (u32, u32), to: (u32, u32), was_seen: bool) -> f32 {
+        let [rows, cols] = self.anew(from, to, was_seen);
+        let mut gain = 0.0;
+        for row in rows {
+            for cell in row * self.cols + cols.start..row * self.cols + cols.end {
+                let is_new = seen[cell / 64] >> (cell % 64) & 1 == 0;
+                gain += if is_new { self.values[cell] } else { 0.0 };
+            }
+        }
+        gain
+    }
+
+    /// Marks what a move shows as seen.
+    pub fn mark(&self, seen: &mut [u64], from: (u32, u32), to: (u32, u32), was_seen: bool) {
+        let [rows, cols] = self.anew(from, to, was_seen);
+        for row in rows {
+            for cell in row * self.cols + cols.start..row * self.cols + cols.end {
+                seen[cell / 64] |= 1 << (cell % 64);
+            }
         }
     }
 }

@@ -187,8 +187,36 @@ impl Shooting {
     }
 }
 
+/// The same where no-fly cells or sight count: moves that lead into no-fly cells are replaced, each move is clamped,
+/// and each path is scored by itself.
+fn best_of_flown(problem: &PlanningProblem<'_>, n_samples: usize) -> Plan {
+    let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
+    let n_words = problem.n_moves.div_ceil(MOVES_PER_WORD);
+    let sample = |_| {
+        let words: Vec<u64> = (0..n_words).map(|_| rng.next_u64()).collect();
+        let bits = |t: usize| words[t / MOVES_PER_WORD] >> (2 * (t % MOVES_PER_WORD));
+        let moves = (0..problem.n_moves).map(|t| Move::from_low_bits(bits(t)));
+        let mut moves: Vec<Move> = moves.collect();
+        problem
+            .values
+            .airspace()
+            .fly_around(problem.start, &mut moves);
+        let score = problem.values.score(problem.start, &moves);
+        Plan { moves, score }
+    };
+    let plans = (0..n_samples).map(sample);
+    let better = |best: Plan, plan: Plan| if plan.score > best.score { plan } else { best };
+    plans
+        .reduce(better)
+        .expect("invariant: at least one sample")
+}
+
 impl Planner for Shooting {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
+        let values = problem.values;
+        if !values.airspace().is_open() || values.in_sight().is_some() {
+            return best_of_flown(problem, self.n_samples);
+        }
         self.prepare(problem);
         let (words, score) = match self.integration {
             Integration::ClampEachMove => self.best::<false>(problem),

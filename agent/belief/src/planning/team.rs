@@ -6,7 +6,6 @@
 use crate::planning::objective::CellValues;
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_protocol::Cell;
-use emberwatch_protocol::path::fly;
 use emberwatch_protocol::randomness::split_mix;
 
 /// How often each robot answers the others' paths.
@@ -35,7 +34,8 @@ pub fn plan_team(
         }
         let robot = turn % n_robots;
         let others = visited.iter().enumerate().filter(|it| it.0 != robot);
-        let free = values.without(others.flat_map(|it| it.1.iter().copied()));
+        let others: Vec<usize> = others.flat_map(|it| it.1.iter().copied()).collect();
+        let free = values.without(&others);
         let plan = planner.plan(&PlanningProblem {
             start: starts[robot],
             n_moves,
@@ -49,7 +49,7 @@ pub fn plan_team(
             continue;
         }
         n_unchanged = 0;
-        let cells = fly(values.shape(), starts[robot], &plan.moves).visited;
+        let cells = values.airspace().fly(starts[robot], &plan.moves).visited;
         if turn < n_robots {
             plans.push(plan);
             visited.push(cells);

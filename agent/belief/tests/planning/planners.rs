@@ -10,7 +10,7 @@ use emberwatch_belief::planning::{
 use emberwatch_protocol::frame::{Frame, UNOBSERVED};
 use emberwatch_protocol::path::fly;
 use emberwatch_protocol::randomness::{Purpose, split_mix, stream};
-use emberwatch_protocol::{Cell, Grid, Model, Move, Probabilities, Shape};
+use emberwatch_protocol::{Airspace, Cell, Grid, Model, Move, Probabilities, Shape};
 use proptest::prelude::*;
 use rand_chacha::rand_core::Rng;
 
@@ -76,7 +76,10 @@ proptest! {
     ) {
         let n_moves = n_moves.max(1);
         let memory = Memory::new(belief.shape());
-        let outlook = Outlook::new(&belief, belief.n_states() - 1, &memory, n_moves);
+        let outlook = {
+            let airspace = Airspace::open(belief.shape());
+            Outlook::new(&belief, &airspace, belief.n_states() - 1, &memory, n_moves)
+        };
         for proposal in OptionPlanner::new(4).propose(&outlook, robot) {
             prop_assert_eq!(proposal.plan.moves.len(), n_moves);
             prop_assert!(proposal.features.iter().all(|number| (0.0..=10.0).contains(number)));

@@ -9,7 +9,7 @@ use crate::learning::learners::neural::NeuralModel;
 use anyhow::Result;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape, NeuralBelief};
 use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Grid};
+use emberwatch_protocol::{Airspace, Cell, Frame, Grid};
 use std::sync::Arc;
 
 const N_MOVES: usize = 6;
@@ -46,7 +46,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 /// A network that never learned, with the first seed whose DQN suits.
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> Progress {
     let worlds = Worlds {
-        shape: shape(),
+        airspace: Airspace::open(shape()),
         n_observations: 3,
         n_moves: N_MOVES,
         numbers: 0..1,

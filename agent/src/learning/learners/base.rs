@@ -12,14 +12,15 @@ use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Rollout, Seen};
 use emberwatch_belief::planning::Target;
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::{Move, Shape};
+use emberwatch_protocol::{Airspace, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
 /// The robots to fly, as far as a learner is told.
 #[derive(Debug, Clone)]
 pub struct Worlds {
-    pub shape: Shape,
+    /// Where robots may fly and what they see.
+    pub airspace: Airspace,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     pub n_moves: usize,
@@ -27,6 +28,10 @@ pub struct Worlds {
 }
 
 impl Worlds {
+    pub fn shape(&self) -> Shape {
+        self.airspace.shape()
+    }
+
     /// One of them before it takes in what its world shows.
     pub(super) fn rollout(
         &self,
@@ -38,6 +43,7 @@ impl Worlds {
     ) -> Rollout {
         let objective = config.objective(policy);
         let setup = Setup {
+            airspace: self.airspace.clone(),
             basis: config.objective.belief,
             beam_width: config.decisions.beam_width,
             state_names,

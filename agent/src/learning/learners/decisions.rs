@@ -165,7 +165,7 @@ impl DecisionsLearner {
         self.left = saved.worlds;
         let n_states = self.base.state_names.len();
         let mut left = self.left.values();
-        left.try_for_each(|left| left.check(n_states, self.worlds.shape))
+        left.try_for_each(|left| left.check(n_states, self.worlds.shape()))
     }
 }
 

@@ -20,8 +20,8 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{Plan, Target};
+use emberwatch_protocol::Move;
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::{Move, path};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
@@ -43,7 +43,7 @@ pub struct FilterLearner {
 impl FilterLearner {
     /// A learner before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let fit = FilterFit::new(dimensions, worlds.shape, config);
+        let fit = FilterFit::new(dimensions, worlds.shape(), config);
         Self::of(fit, BTreeMap::new(), worlds, config)
     }
 
@@ -58,10 +58,10 @@ impl FilterLearner {
             worlds: mut left,
         } = contents.state()?;
         let shape = fit.optimiser.shape;
-        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape, config)?;
+        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape(), config)?;
         let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
-        if shape != worlds.shape {
+        if shape != worlds.shape() {
             left.clear();
         }
         Ok(Self::of(fit, left, worlds, config))
@@ -90,7 +90,7 @@ impl FilterLearner {
     /// A robot before it takes in what its world shows.
     fn rollout_at(&self, observation: Observation) -> Rollout {
         let tables = &self.learned.tables;
-        let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
+        let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
         let names = numbered_states(tables.dimensions.n_states);
         let (policy, config) = (self.policy(), &self.config);
         let worlds = &self.worlds;
@@ -200,10 +200,11 @@ impl Learner for FilterLearner {
         {
             let (belief, observation) = (rollout.agent.belief(), rollout.observation());
             let reward = observation.robot.reward;
-            let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &plan.moves);
+            let start = turn.before.robot.cell();
+            let paying = self.worlds.airspace.paying(start, &plan.moves);
             self.fit
                 .see(world, &observation.frame, Some(predictor), &self.learned);
-            self.fit.reward(belief, &flight.visited, reward);
+            self.fit.reward(belief, &paying, reward);
             tick.reward += reward;
             tick.score += turn.score.unwrap_or_default();
         }

@@ -22,8 +22,8 @@ use crate::policy::{Policy, numbered_states};
 use crate::rollout::{Rollout, predict_all, see_all};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_network::{Transition, Window};
+use emberwatch_protocol::Move;
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::{Move, path};
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "autoencoder";
@@ -217,9 +217,9 @@ impl Learner for NetworkLearner {
         let (turn, rollout) = (&turns[0], self.at_world());
         let path = self.decision.as_ref().map(|decision| &*decision.path);
         let start = turn.before.robot.cell();
-        let flight = path::fly(self.worlds.shape, start, path.unwrap_or_default());
+        let paying = self.worlds.airspace.paying(start, path.unwrap_or_default());
         let (met, observation) = (
-            met(rollout.agent.belief(), flight.visited.iter().copied()),
+            met(rollout.agent.belief(), paying.into_iter()),
             rollout.observation().clone(),
         );
         let position = &mut self.progress.position;

@@ -25,9 +25,9 @@ use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Target;
 use emberwatch_network::{Device, NeuralBelief};
+use emberwatch_protocol::Move;
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::randomness::{Purpose, stream};
-use emberwatch_protocol::{Move, path};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -109,7 +109,7 @@ impl NeuralLearner {
     /// A robot before it takes in what its world shows.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let filter = self.filter.as_deref();
-        let estimator = estimator(&self.network, filter, self.worlds.shape)?;
+        let estimator = estimator(&self.network, filter, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, config) = (self.policy(), &self.config);
         let estimator = Box::new(estimator);
@@ -121,7 +121,7 @@ impl NeuralLearner {
     /// A robot that has taken in what its world shows, with a track that begins there.
     fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
         let mut rollout = self.rollout_at(observation)?;
-        self.replay.begin(robot, self.worlds.shape);
+        self.replay.begin(robot, self.worlds.shape());
         let base = rollout.agent.estimator().base();
         self.replay.push(robot, &rollout.observation().frame, base);
         rollout.correct()?;
@@ -150,7 +150,7 @@ impl NeuralLearner {
         check(got == expected, "n_observations", expected, got)?;
         saved.load_into(&mut self.network, contents)?;
         self.filter = saved.filter(contents)?;
-        let shape = self.worlds.shape;
+        let shape = self.worlds.shape();
         if saved.shape == shape {
             saved.check_worlds()?;
             self.replay.resume(saved.replay.into_owned());
@@ -224,13 +224,16 @@ impl Learner for NeuralLearner {
             let agent = &mut run.rollout.agent;
             let mut rng = stream(seed, Purpose::Exploration, step + index as u64);
             let behaviour =
-                Behaviour::next(run.behaviour, is_exploring, self.worlds.shape, &mut rng);
+                Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
             let plans = if is_frozen {
                 agent.plan_for(objective, &cells, k)
             } else {
                 let seen = || self.replay.present(first + index as u32);
                 match behaviour.values(objective, target, agent.basis_belief(), seen, &mut rng) {
-                    Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
+                    Some(values) => {
+                        let values = values.within(&self.worlds.airspace, None);
+                        agent.plan_values(&values, behaviour.label(), &cells, k)
+                    }
                     None => agent.walk(&cells, k),
                 }
             };
@@ -254,9 +257,9 @@ impl Learner for NeuralLearner {
         for ((robot, run), turn) in runs.zip(turns) {
             let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
             let reward = observation.robot.reward;
-            let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &run.path);
-            self.reward
-                .add(&met(belief, flight.visited.iter().copied()), reward);
+            let start = turn.before.robot.cell();
+            let paying = self.worlds.airspace.paying(start, &run.path);
+            self.reward.add(&met(belief, paying.into_iter()), reward);
             let base = run.rollout.agent.estimator().base();
             self.replay.push(robot, &observation.frame, base);
             tick.reward += reward;
@@ -322,7 +325,7 @@ impl Learner for NeuralLearner {
         let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
         let state = SavedNeural {
-            shape: self.worlds.shape,
+            shape: self.worlds.shape(),
             n_observations: self.worlds.n_observations,
             n_updates: self.n_updates(),
             world_steps: self.world_steps,

@@ -20,13 +20,13 @@ use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_protocol::{Airspace, Cell, Frame, Model, Move, Shape};
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
 fn worlds() -> Worlds {
     Worlds {
-        shape: Shape::new(8, 9).expect("test shape"),
+        airspace: Airspace::open(Shape::new(8, 9).expect("test shape")),
         n_observations: 3,
         n_moves: 6,
         numbers: 0..1,
@@ -44,8 +44,8 @@ fn config(belief: BasisKind) -> AgentConfig {
 }
 
 fn observation(step: u64) -> Observation {
-    let mut frame = Frame::empty(worlds().shape);
-    for cell in 0..worlds().shape.n_cells() {
+    let mut frame = Frame::empty(worlds().shape());
+    for cell in 0..worlds().shape().n_cells() {
         let bits = split_mix(step, cell as u64);
         if bits.is_multiple_of(4) {
             frame.observe(cell, (bits >> 32) as u8 % 3);
@@ -161,12 +161,13 @@ fn learners_plan_on_the_belief_that_settings_say() {
         let learner = NeuralLearner::new(None, None, worlds(), config, &Device::Cpu);
         check(learner.expect("a network"), basis, beam);
         let model = Model::wildfire();
-        let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
+        let filter =
+            BayesFilter::known(&model, Belief::uniform(3, worlds().shape())).expect("valid");
         let base = Base::known(EstimatorKind::KNOWN, filter, &model);
         let learner = DecisionsLearner::new(base, None, worlds(), config).expect("new");
         // The robot remembers what every step showed, and never earns.
         let memory = |step: u64| {
-            let mut memory = Memory::new(worlds().shape);
+            let mut memory = Memory::new(worlds().shape());
             (0..step).for_each(|step| {
                 memory.see(&observation(step).frame);
                 if step > 0 {
@@ -176,7 +177,16 @@ fn learners_plan_on_the_belief_that_settings_say() {
             memory
         };
         check(learner, basis, |belief, target, step| {
-            let outlook = Outlook::new(belief, target, &memory(step + 1), worlds().n_moves);
+            let outlook = {
+                let airspace = worlds().airspace;
+                Outlook::new(
+                    belief,
+                    &airspace,
+                    target,
+                    &memory(step + 1),
+                    worlds().n_moves,
+                )
+            };
             let mut planner = OptionPlanner::new(config.decisions.beam_width);
             let paths = planner.propose(&outlook, ROBOT).into_iter();
             paths.map(|proposal| proposal.plan.moves).collect()
@@ -201,7 +211,7 @@ fn learned_filter(sees_own_state: bool) -> LearnedModel {
         kernel: (3, 3),
         sees_own_state,
     };
-    FilterFit::new(dimensions, worlds().shape, &config(BasisKind::Estimate)).learned()
+    FilterFit::new(dimensions, worlds().shape(), &config(BasisKind::Estimate)).learned()
 }
 
 #[test]
@@ -233,11 +243,11 @@ fn decisions_resume_bit_for_bit() {
         (EstimatorKind::Neural, neural(None)),
         (EstimatorKind::Neural, neural(Some(filter(false)))),
     ] {
-        let base = Base::learned(kind, belief, worlds().shape);
+        let base = Base::learned(kind, belief, worlds().shape());
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");
         let left = learn(&mut learner, 1..20);
-        let base = Base::saved(&left, worlds().shape, &Device::Cpu)
+        let base = Base::saved(&left, worlds().shape(), &Device::Cpu)
             .expect("whole")
             .expect("a belief");
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);

@@ -25,7 +25,7 @@ pub fn learner(
 ) -> Result<Box<dyn Learner>> {
     let (info, config) = (client.info(), &spec.config);
     let worlds = Worlds {
-        shape: client.shape(),
+        airspace: info.airspace().map_err(anyhow::Error::msg)?,
         n_observations: info.n_observations,
         n_moves: info.n_moves,
         numbers: client.robots(),
@@ -58,10 +58,11 @@ pub fn learner(
             Box::new(NetworkLearner::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
-            let saved = contents.map(|contents| Base::saved(contents, worlds.shape, &spec.device));
+            let saved =
+                contents.map(|contents| Base::saved(contents, worlds.shape(), &spec.device));
             let base = match saved.transpose().with_context(of_file)?.flatten() {
                 Some(base) => base,
-                None => base(spec, info, worlds.shape)?,
+                None => base(spec, info, worlds.shape())?,
             };
             same_observations(worlds.n_observations, base.n_observations())?;
             let learner = DecisionsLearner::new(base, contents, worlds, config);

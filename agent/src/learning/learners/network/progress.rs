@@ -16,7 +16,7 @@ use emberwatch_network::{
     Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
 };
 use emberwatch_protocol::model::MAX_VALUES;
-use emberwatch_protocol::{Frame, Shape};
+use emberwatch_protocol::{Airspace, Frame, Shape};
 use serde::{Deserialize, Serialize};
 
 /// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
@@ -68,7 +68,7 @@ impl Progress {
         config: &AgentConfig,
         device: &Device,
     ) -> Result<Self, NetworkError> {
-        let shape = network_shape(worlds.shape, worlds.n_observations, config);
+        let shape = network_shape(worlds.shape(), worlds.n_observations, config);
         let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
         let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
         let n_actions = Policy::network_choices(n_states).len();
@@ -133,7 +133,7 @@ impl Progress {
         let prediction = saved.position.follower.prediction();
         check_belief("prediction", prediction, sizes.n_states, shape)?;
         let worlds = Worlds {
-            shape,
+            airspace: Airspace::open(shape),
             n_observations,
             n_moves: 0,
             numbers: 0..1,

@@ -1,0 +1,94 @@
+//! What the answer to `hello` says of airspace and land.
+
+use super::control::ServerInfo;
+use crate::model::grid::{Grid, Shape};
+use crate::model::{Airspace, MAX_RADIUS, Pays};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Where robots may fly and what they see.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AirspaceInfo {
+    /// Rows and columns that robots see beyond each cell of their path, 0 to 8.
+    pub radius: usize,
+    /// Observation matrices: of the path, then of each ring around it; the last holds for the rings beyond. An
+    /// observation of matrix m has the number `m * n_observations / n_rings` plus that which it would have on the path.
+    pub n_rings: usize,
+    /// Which distinct cells pay.
+    pub pays: Pays,
+    /// 1 for each cell where no robot may be, row by row.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub no_fly: Option<Vec<Vec<u8>>>,
+}
+
+/// Zones of land, which differ in how states change.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ZonesInfo {
+    /// The name of each zone.
+    pub names: Vec<String>,
+    /// Its colour in pictures, `#rrggbb`.
+    pub colors: Vec<String>,
+    /// The zone of each cell, row by row.
+    pub map: Vec<Vec<u8>>,
+}
+
+impl ServerInfo {
+    /// Where robots may fly and what they see.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or out of range; the error says what was expected.
+    pub fn airspace(&self) -> Result<Airspace, String> {
+        let shape = self.shape().map_err(|error| error.to_string())?;
+        let Some(info) = &self.airspace else {
+            return Ok(Airspace::open(shape));
+        };
+        let n_rings = info.n_rings;
+        if info.radius > MAX_RADIUS || !(1..=info.radius + 1).contains(&n_rings) {
+            let got = format!("{} and {n_rings}", info.radius);
+            let expected = format!("a radius up to {MAX_RADIUS} and 1 to radius + 1 rings");
+            return Err(format!("airspace: expected {expected}, got {got}"));
+        }
+        let no_fly = info.no_fly.as_ref();
+        let no_fly = no_fly
+            .map(|rows| of_grid("no_fly", shape, rows))
+            .transpose()?;
+        let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));
+        Ok(Airspace::new(
+            shape,
+            no_fly,
+            info.radius,
+            n_rings,
+            info.pays,
+        ))
+    }
+
+    /// The zone of each cell, shape `[H, W]`, where learners are told.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or a zone has no name; the error says what was expected.
+    pub fn zone_map(&self) -> Result<Option<Grid<u8>>, String> {
+        let shape = self.shape().map_err(|error| error.to_string())?;
+        let Some(zones) = &self.zones else {
+            return Ok(None);
+        };
+        let map = of_grid("zones", shape, &zones.map)?;
+        let n_zones = zones.names.len();
+        match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
+            None => Ok(Some(map)),
+            Some(got) => Err(format!("zones: expected values below {n_zones}, got {got}")),
+        }
+    }
+}
+
+/// The numbers of a map, if it is of a grid.
+fn of_grid(what: &str, shape: Shape, rows: &[Vec<u8>]) -> Result<Grid<u8>, String> {
+    let fits = rows.len() == shape.height() && rows.iter().all(|row| row.len() == shape.width());
+    if !fits {
+        let got = format!("{} x {:?}", rows.len(), rows.first().map(Vec::len));
+        return Err(format!(
+            "{what}: expected a map of the {shape} grid, got {got}"
+        ));
+    }
+    let map = Grid::from_shape_vec(shape.dim(), rows.concat());
+    Ok(map.expect("invariant: as many numbers as cells"))
+}
