@@ -27,11 +27,11 @@ pub struct ServerFlags {
     #[arg(long, value_name = "MILLIS")]
     pub deadline_ms: Option<u64>,
     /// Worlds of this task, which decides model or states, grid, moves, robots, burn-in, start and episodes: `wildfire`,
-    /// `small`, `sparse`, `latent`, `burnout`, `road-ice`, `team`, `jacksboro` or the path of a task file
+    /// `small`, `sparse`, `latent`, `burnout`, `terrain`, `road-ice`, `team`, `jacksboro` or the path of a task file
     #[arg(long, value_name = "NAME|FILE")]
     pub task: Option<String>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `road-ice` or the path of
-    /// a model file [default: wildfire]
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `wildfire-terrain`,
+    /// `road-ice` or the path of a model file [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
     /// Rows and columns that robots see beyond each cell of their path, 0 to 8 [default: as the model says]

@@ -15,12 +15,13 @@ pub const MAX_SEEDS: u64 = 100_000;
 pub const BUILT_IN_STATES: [&str; 1] = ["jacksboro"];
 
 /// The built-in tasks by name.
-const BUILT_IN: [(&str, &str); 8] = [
+const BUILT_IN: [(&str, &str); 9] = [
     ("wildfire", include_str!("../tasks/wildfire.toml")),
     ("small", include_str!("../tasks/small.toml")),
     ("sparse", include_str!("../tasks/sparse.toml")),
     ("latent", include_str!("../tasks/latent.toml")),
     ("burnout", include_str!("../tasks/burnout.toml")),
+    ("terrain", include_str!("../tasks/terrain.toml")),
     ("road-ice", include_str!("../tasks/road-ice.toml")),
     ("team", include_str!("../tasks/team.toml")),
     ("jacksboro", include_str!("../tasks/jacksboro.toml")),

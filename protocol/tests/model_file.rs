@@ -26,6 +26,7 @@ fn keys(of: &str, table: &Table) -> BTreeSet<String> {
     for (key, value) in table {
         found.insert(format!("{of}{key}"));
         let entries = value.as_array().into_iter().flatten();
+        let entries = entries.chain(value.is_table().then_some(value));
         for entry in entries.filter_map(Value::as_table) {
             found.extend(keys(&format!("{key} "), entry));
         }
@@ -41,6 +42,9 @@ fn documented() -> BTreeSet<String> {
         if let Some(rest) = line.strip_prefix("Of each of the `") {
             let (name, _) = rest.split_once('`').expect("a name");
             of = format!("{name} ");
+        } else if let Some(rest) = line.strip_prefix("Of `") {
+            let (name, _) = rest.split_once('`').expect("a name");
+            of = format!("{name} ");
         } else if let Some(rest) = line.strip_prefix("| `") {
             let (key, _) = rest.split_once('`').expect("a key");
             assert!(found.insert(format!("{of}{key}")), "{key} twice");
@@ -54,7 +58,8 @@ fn the_examples_are_models_that_use_every_key() {
     let mut used = BTreeSet::new();
     for example in examples() {
         let model = Model::from_toml(example).expect("a model");
-        let shape = Shape::new(64, 64).expect("test shape");
+        let (height, width) = model.zone_map().map_or((64, 64), |map| map.dim());
+        let shape = Shape::new(height, width).expect("test shape");
         assert_eq!(model.check_on(shape), Ok(()));
         used.extend(keys("", &example.parse().expect("TOML")));
     }
@@ -75,8 +80,10 @@ fn the_example_of_recorded_worlds_is_a_description_with_every_key() {
 #[test]
 fn every_key_of_the_parser_is_on_the_page() {
     let mut parsed = BTreeSet::new();
-    for name in ["wildfire", "wildfire-burnout"] {
-        let model = Model::built_in(name).expect("a built-in model");
+    let names = ["wildfire", "wildfire-burnout"].into_iter();
+    let models = names.map(|name| Model::built_in(name).expect("a built-in model"));
+    let of_page = examples().into_iter().map(Model::from_toml);
+    for model in models.chain(of_page.map(|model| model.expect("a model"))) {
         let file = Table::try_from(model.file().clone()).expect("models serialise");
         parsed.extend(keys("", &file));
     }

@@ -1,5 +1,6 @@
 //! What holds for planners and teams on random problems, and for filters and summaries.
 
+mod airspace;
 mod fields;
 mod planners;
 mod team;

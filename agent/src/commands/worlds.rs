@@ -46,14 +46,18 @@ pub struct WorldFlags {
 #[derive(Debug, Args)]
 pub struct GridFlags {
     /// The task whose worlds the server that is started has: `wildfire`, `small`, `sparse`, `latent`, `burnout`,
-    /// `road-ice`, `team`, `jacksboro` or a task file
+    /// `terrain`, `road-ice`, `team`, `jacksboro` or a task file
     #[arg(long, value_name = "NAME|FILE", value_parser = Task::named,
         conflicts_with_all = ["instance", "model", "height", "width", "moves", "states"])]
     pub task: Option<Task>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `road-ice` or a model
-    /// file, for the server that is started
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `wildfire-terrain`,
+    /// `road-ice` or a model file, for the server that is started
     #[arg(long, default_value = "wildfire", conflicts_with = "instance")]
     model: String,
+    /// Rows and columns that robots see beyond each cell of their path, 0 to 8, for the server that is started [default:
+    /// as the model says]
+    #[arg(long, value_parser = clap::value_parser!(u8).range(0..=8), conflicts_with_all = ["instance", "task"])]
+    sensor_radius: Option<u8>,
     /// Grid height in cells, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     height: usize,
@@ -209,7 +213,10 @@ impl GridFlags {
                 ("--burn-in", burn_in.to_string()),
             ],
         };
-        let pairs = settings.into_iter().chain(of_worlds);
+        let radius = self
+            .sensor_radius
+            .map(|it| ("--sensor-radius", it.to_string()));
+        let pairs = settings.into_iter().chain(of_worlds).chain(radius);
         pairs
             .flat_map(|(flag, value)| [flag.to_owned(), value])
             .collect()

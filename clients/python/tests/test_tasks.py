@@ -29,6 +29,7 @@ PREFIXES = {
     "sparse": "WildfireSparse",
     "latent": "WildfireLatent",
     "burnout": "WildfireBurnout",
+    "terrain": "WildfireTerrain",
     "road-ice": "RoadIce",
     "team": "WildfireTeam",
     "jacksboro": "Jacksboro",

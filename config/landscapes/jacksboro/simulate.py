@@ -10,15 +10,10 @@ from pathlib import Path
 import numpy as np
 import rasterio
 import torch
-from matplotlib import cbook
 from pytorchfire import WildfireModel
 from pytorchfire.utils import calculate_slope
-from rasterio.transform import from_bounds
-from rasterio.warp import Resampling, calculate_default_transform, reproject
+from terrain import CELL, PROJECTION, projected_terrain
 
-CELL = 180.0  # metres: twice the 3 arc seconds of the terrain
-PROJECTION = "EPSG:32616"
-MARGIN = 6  # cells that lie outside the terrain after its projection
 N_STEPS = 400
 #: Of each fire: where it begins (share of rows and columns), wind in m/s, where it blows to in
 #: degrees from the east towards the north, seed.
@@ -49,28 +44,6 @@ def main(raw: Path) -> None:
         shape = {"count": n_steps, "height": height, "width": width}
         with rasterio.open(folder / "fire.tif", "w", **profile, **shape) as file:
             file.write(states)
-
-
-def projected_terrain() -> tuple[np.ndarray, rasterio.Affine]:
-    """Elevation in metres on square cells, and where they are."""
-    file = cbook.get_sample_data("jacksboro_fault_dem.npz")
-    elevation = file["elevation"].astype(np.float32)
-    # The file has the northern edge as `ymin`.
-    west, north, east, south = (float(file[key]) for key in ("xmin", "ymin", "xmax", "ymax"))
-    rows, columns = elevation.shape
-    bounds = (west, south, east, north)
-    source = {
-        "src_crs": "EPSG:4326",
-        "src_transform": from_bounds(*bounds, columns, rows),
-    }
-    transform, width, height = calculate_default_transform(
-        "EPSG:4326", PROJECTION, columns, rows, *bounds, resolution=CELL
-    )
-    terrain = np.zeros((height, width), np.float32)
-    target = {"dst_crs": PROJECTION, "dst_transform": transform}
-    reproject(elevation, terrain, **source, **target, resampling=Resampling.bilinear)
-    inner = terrain[MARGIN:-MARGIN, MARGIN:-MARGIN].copy()
-    return inner, transform * rasterio.Affine.translation(MARGIN, MARGIN)
 
 
 def simulated(

@@ -64,6 +64,11 @@ impl Airspace {
         self.radius
     }
 
+    /// Observation matrices: of the path, then of the rings around it.
+    pub fn n_rings(&self) -> usize {
+        self.n_rings
+    }
+
     /// Which distinct cells pay.
     pub fn pays(&self) -> Pays {
         self.pays

@@ -1,14 +1,13 @@
 //! Maps in a model file: a number for each cell, written out or in a file beside it.
 
-use super::file::{ModelError, ModelFile};
 use super::grid::{Grid, Shape};
-use crate::program::{MAX_TEXT_BYTES, read_text};
+use crate::program::MAX_TEXT_BYTES;
 use ndarray::Array2;
 use ndarray_npy::ReadNpyExt;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{Cursor, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
 const MAX_HEADER_BYTES: u16 = 512;
@@ -58,37 +57,18 @@ impl CellMap {
         Ok(grid.expect("invariant: as many numbers as cells"))
     }
 
-    /// Reads the file, if it names one, and puts its rows here.
-    fn read_beside(&mut self, model: &Path) -> Result<(), ModelError> {
+    /// Reads the file beside a model file, if it names one, and puts its rows here.
+    ///
+    /// # Errors
+    /// The file, and why it was not read.
+    pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
         let Self::File(name) = &*self else {
             return Ok(());
         };
         let path = model.with_file_name(name);
-        let numbers = read_array(&path).map_err(|problem| ModelError::File {
-            path: path.display().to_string(),
-            problem,
-        })?;
+        let numbers = read_array(&path).map_err(|problem| (path, problem))?;
         *self = Self::Rows(numbers.outer_iter().map(|row| row.to_vec()).collect());
         Ok(())
-    }
-}
-
-impl ModelFile {
-    /// Reads a model file, and the maps that stand beside it.
-    ///
-    /// # Errors
-    /// If a file cannot be read or is not of its form. What it says is yet to be checked.
-    pub fn read(path: &Path) -> Result<Self, ModelError> {
-        let text = read_text(path).map_err(|error| ModelError::File {
-            path: path.display().to_string(),
-            problem: error.to_string(),
-        })?;
-        let mut file: Self =
-            toml::from_str(&text).map_err(|error| ModelError::Toml(error.to_string()))?;
-        for map in [&mut file.zone_map, &mut file.no_fly].into_iter().flatten() {
-            map.read_beside(path)?;
-        }
-        Ok(file)
     }
 }
 

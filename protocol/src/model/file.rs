@@ -2,7 +2,9 @@
 
 use super::cell_map::CellMap;
 use super::grid::{Cell, Shape};
+use crate::program::read_text;
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 use thiserror::Error;
 
 /// Most states, and most observations, of a model: 64.
@@ -238,6 +240,27 @@ pub enum ModelError {
         /// What its weights can sum to, as a share of the largest weight.
         share: f64,
     },
+}
+
+impl ModelFile {
+    /// Reads a model file, and the maps that stand beside it.
+    ///
+    /// # Errors
+    /// If a file cannot be read or is not of its form. What it says is yet to be checked.
+    pub fn read(path: &Path) -> Result<Self, ModelError> {
+        let failed = |path: &Path, problem: String| ModelError::File {
+            path: path.display().to_string(),
+            problem,
+        };
+        let text = read_text(path).map_err(|error| failed(path, error.to_string()))?;
+        let mut file: Self =
+            toml::from_str(&text).map_err(|error| ModelError::Toml(error.to_string()))?;
+        for map in [&mut file.zone_map, &mut file.no_fly].into_iter().flatten() {
+            let read = map.read_beside(path);
+            read.map_err(|(path, problem)| failed(&path, problem))?;
+        }
+        Ok(file)
+    }
 }
 
 impl KernelEntry {

@@ -12,7 +12,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// The built-in models by name.
-const BUILT_IN: [(&str, &str); 6] = [
+const BUILT_IN: [(&str, &str); 7] = [
     ("wildfire", include_str!("../../models/wildfire.toml")),
     (
         "wildfire-sparse",
@@ -29,6 +29,10 @@ const BUILT_IN: [(&str, &str); 6] = [
     (
         "wildfire-burnout",
         include_str!("../../models/wildfire-burnout.toml"),
+    ),
+    (
+        "wildfire-terrain",
+        include_str!("../../models/wildfire-terrain.toml"),
     ),
     ("road-ice", include_str!("../../models/road-ice.toml")),
 ];
@@ -54,7 +58,7 @@ impl Model {
     }
 
     /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`,
-    /// `wildfire-burnout` or `road-ice` (`config/models`).
+    /// `wildfire-burnout`, `wildfire-terrain` or `road-ice` (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
         let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);

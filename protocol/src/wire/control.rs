@@ -1,6 +1,7 @@
 //! The messages of the `control` channel: JSON text both ways, rare and readable.
 
 use super::codes::{Status, VERSION};
+use crate::model::Airspace;
 use crate::model::frame::Coverage;
 use crate::model::grid::{Shape, ShapeError};
 use serde::{Deserialize, Serialize};
@@ -228,6 +229,16 @@ impl ServerInfo {
     /// If a side is outside `1..=MAX_SIDE`.
     pub fn shape(&self) -> Result<Shape, ShapeError> {
         Shape::new(self.height, self.width)
+    }
+
+    /// Where robots may fly and what they see.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or out of range; the error says what was expected.
+    pub fn airspace(&self) -> Result<Airspace, String> {
+        let shape = self.shape().map_err(|error| error.to_string())?;
+        let airspace = self.airspace.as_ref();
+        airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
     }
 
     /// Steps of the shortest episode, if any is truncated.

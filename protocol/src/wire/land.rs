@@ -1,6 +1,5 @@
 //! What the answer to `hello` says of airspace and land.
 
-use super::control::ServerInfo;
 use crate::model::grid::{Grid, Shape};
 use crate::model::{Airspace, MAX_RADIUS, Pays};
 use serde::{Deserialize, Serialize};
@@ -32,49 +31,38 @@ pub struct ZonesInfo {
     pub map: Vec<Vec<u8>>,
 }
 
-impl ServerInfo {
-    /// Where robots may fly and what they see.
+impl AirspaceInfo {
+    /// Where robots of a grid may fly and what they see.
     ///
     /// # Errors
     /// If that is not of the grid, or out of range; the error says what was expected.
-    pub fn airspace(&self) -> Result<Airspace, String> {
-        let shape = self.shape().map_err(|error| error.to_string())?;
-        let Some(info) = &self.airspace else {
-            return Ok(Airspace::open(shape));
-        };
-        let n_rings = info.n_rings;
-        if info.radius > MAX_RADIUS || !(1..=info.radius + 1).contains(&n_rings) {
-            let got = format!("{} and {n_rings}", info.radius);
+    pub fn airspace(&self, shape: Shape) -> Result<Airspace, String> {
+        let (radius, n_rings) = (self.radius, self.n_rings);
+        if radius > MAX_RADIUS || !(1..=radius + 1).contains(&n_rings) {
             let expected = format!("a radius up to {MAX_RADIUS} and 1 to radius + 1 rings");
-            return Err(format!("airspace: expected {expected}, got {got}"));
+            return Err(format!(
+                "airspace: expected {expected}, got {radius} and {n_rings}"
+            ));
         }
-        let no_fly = info.no_fly.as_ref();
+        let no_fly = self.no_fly.as_ref();
         let no_fly = no_fly
             .map(|rows| of_grid("no_fly", shape, rows))
             .transpose()?;
         let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));
-        Ok(Airspace::new(
-            shape,
-            no_fly,
-            info.radius,
-            n_rings,
-            info.pays,
-        ))
+        Ok(Airspace::new(shape, no_fly, radius, n_rings, self.pays))
     }
+}
 
-    /// The zone of each cell, shape `[H, W]`, where learners are told.
+impl ZonesInfo {
+    /// The zone of each cell of a grid, shape `[H, W]`.
     ///
     /// # Errors
     /// If that is not of the grid, or a zone has no name; the error says what was expected.
-    pub fn zone_map(&self) -> Result<Option<Grid<u8>>, String> {
-        let shape = self.shape().map_err(|error| error.to_string())?;
-        let Some(zones) = &self.zones else {
-            return Ok(None);
-        };
-        let map = of_grid("zones", shape, &zones.map)?;
-        let n_zones = zones.names.len();
+    pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
+        let map = of_grid("zones", shape, &self.map)?;
+        let n_zones = self.names.len();
         match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
-            None => Ok(Some(map)),
+            None => Ok(map),
             Some(got) => Err(format!("zones: expected values below {n_zones}, got {got}")),
         }
     }

@@ -17,7 +17,7 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
-use emberwatch_protocol::{Dynamics, Frame, Model, Shape, Transition};
+use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape, Transition};
 use ndarray::{Array3, Axis};
 use std::collections::BTreeMap;
 
@@ -43,6 +43,7 @@ pub fn model(bytes: &[u8]) -> bool {
         if let (Ok(transition), Ok(dynamics)) = (transition, dynamics) {
             beliefs_stay_beliefs(&model, shape, transition);
             states_stay_states(&model, dynamics);
+            robots_stay_free(&model.airspace(shape).expect("it fits"));
         }
     }
     true
@@ -65,6 +66,19 @@ fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<
             "beliefs sum to {sums}"
         );
         assert!(next.iter().all(|p| (0.0..=1.001).contains(p)), "{next}");
+    }
+}
+
+/// From every cell where a robot may be.
+fn robots_stay_free(airspace: &Airspace) {
+    let shape = airspace.shape();
+    let cells = (0..shape.n_cells()).map(|index| shape.cell(index));
+    for start in cells.filter(|cell| airspace.is_free(*cell)) {
+        let flight = airspace.fly(start, &Move::ALL.repeat(2));
+        assert!(airspace.is_free(flight.end));
+        let seen = airspace.see(&flight.visited);
+        assert!(seen.len() >= flight.visited.len());
+        assert!(seen.iter().all(|seen| seen.cell < shape.n_cells()));
     }
 }
 
@@ -124,7 +138,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     }
     if learned.decisions.is_some() {
         let (_, contents) = decode(&[decisions::KIND], &bytes).expect("read before");
-        let base = Base::saved(&contents, worlds().shape, &Device::Cpu).expect("read before");
+        let base = Base::saved(&contents, worlds().shape(), &Device::Cpu).expect("read before");
         let base = base.unwrap_or_else(base_of_filter);
         if let Ok(learner) = DecisionsLearner::new(base, Some(&contents), worlds(), &config()) {
             learner.contents().expect("no device");
@@ -145,7 +159,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
 /// Worlds of three cells.
 fn worlds() -> Worlds {
     Worlds {
-        shape: Shape::new(1, 3).expect("a grid"),
+        airspace: Airspace::open(Shape::new(1, 3).expect("a grid")),
         n_observations: 2,
         n_moves: 2,
         numbers: 0..1,
@@ -172,9 +186,9 @@ fn decisions() -> Contents {
 }
 
 fn base_of_filter() -> Base {
-    let fit = FilterFit::new(dimensions(false), worlds().shape, &config());
+    let fit = FilterFit::new(dimensions(false), worlds().shape(), &config());
     let belief = LearnedBelief::Filter(Box::new(fit.learned()));
-    Base::learned(EstimatorKind::LEARNED, belief, worlds().shape)
+    Base::learned(EstimatorKind::LEARNED, belief, worlds().shape())
 }
 
 fn dqn() -> Dqn {
@@ -199,7 +213,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
-    let (shape, config) = (worlds().shape, config());
+    let (shape, config) = (worlds().shape(), config());
     let mut fit = FilterFit::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
     fit.begin(0);

@@ -118,6 +118,13 @@ pub fn outlook(bytes: &[u8]) -> bool {
 /// A reply on `control`.
 pub fn control_reply(bytes: &[u8]) -> bool {
     let reply = survives::<Reply>(bytes);
+    if let Some(Reply::Hello(info)) = &reply
+        && let Ok(shape) = info.shape()
+        && shape.n_cells() < 1 << 16
+    {
+        let zones = info.zones.as_ref();
+        let _ = (info.airspace(), zones.map(|zones| zones.zone_map(shape)));
+    }
     reply.is_some_and(|reply| reply.status() == Status::Ok)
 }
 

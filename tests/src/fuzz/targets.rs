@@ -95,7 +95,7 @@ mod tests {
                 assert!(is_read(&text), "{folder}/{name}: {text}");
             }
         };
-        check("control_reply", "hello lease status error", |text| {
+        check("control_reply", "hello land lease status error", |text| {
             parse::<Reply>(text.as_bytes()).is_ok()
         });
         check("decision", "decisions error", |text| {
@@ -104,7 +104,7 @@ mod tests {
         check("decision", "decide reset", |text| {
             parse::<decisions::Request>(text.as_bytes()).is_ok()
         });
-        let models = "burnout.toml line.toml sparse.toml wildfire.toml";
+        let models = "burnout.toml land.toml line.toml sparse.toml wildfire.toml";
         check("model", models, |text| Model::from_toml(text).is_ok());
         let requests = "acquire belief fork hello leave_belief release renew reset reset_none \
                         restore shutdown snapshot status takeover";

@@ -4,7 +4,7 @@
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
 use emberwatch_protocol::grid::{Probabilities, Shape};
-use emberwatch_protocol::model::Model;
+use emberwatch_protocol::model::{Model, ModelFile};
 use std::fs::OpenOptions;
 use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;
@@ -33,7 +33,13 @@ impl KeptBelief {
     /// `None` if there is no cache folder, or the belief is too large for it.
     pub fn new(prior: Prior, model: &Model, shape: Shape, seed: u64) -> Option<Self> {
         let version = env!("CARGO_PKG_VERSION");
-        let file = toml::to_string(model.file()).expect("invariant: model files serialise");
+        // What robots see changes no world.
+        let file = ModelFile {
+            sensor: None,
+            no_fly: None,
+            ..model.file().clone()
+        };
+        let file = toml::to_string(&file).expect("invariant: model files serialise");
         let key = format!("emberwatch {version}: {prior:?}, {shape}, seed {seed}\n{file}\n");
         let dim = (model.n_states(), shape.height(), shape.width());
         let name = format!("{:08x}.belief", crc32fast::hash(key.as_bytes()));

@@ -30,6 +30,16 @@ pub fn learner(
         n_moves: info.n_moves,
         numbers: client.robots(),
     };
+    let n_rings = worlds.airspace.n_rings();
+    let is_network = matches!(
+        config.learner,
+        LearnerKind::Neural | LearnerKind::Autoencoder
+    );
+    ensure!(
+        n_rings == 1 || !is_network,
+        "learner: expected one that learns several observation matrices, as this server's sensor has {n_rings}: filter, \
+         own_filter or decisions; got another"
+    );
     let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {
         LearnerKind::Filter | LearnerKind::OwnFilter => {

@@ -81,6 +81,7 @@ _PREFIXES = {
     "sparse": "WildfireSparse",
     "latent": "WildfireLatent",
     "burnout": "WildfireBurnout",
+    "terrain": "WildfireTerrain",
     "road-ice": "RoadIce",
     "team": "WildfireTeam",
     "jacksboro": "Jacksboro",

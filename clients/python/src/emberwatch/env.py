@@ -104,13 +104,14 @@ class WildfireEnv(WorldEnv):
     * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
     * `reward`: `"share"`, `"team"` or `"marginal"`.
     * `takeover`: take the world from its holder (False).
-    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"road-ice"`, `"team"`,
-      `"jacksboro"` or the path of a task file (`docs/environments/index.md`), which decides all
+    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"terrain"`, `"road-ice"`,
+      `"team"`, `"jacksboro"` or the path of a task file (`docs/environments/index.md`), which decides all
       keywords from `model` to `states_offset`, `robots` and the length of episodes: none of them
       may stand beside it. With `instance`: the name of the running server's.
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
       `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells), `"wildfire-burnout"` (what has
-      burnt doesn't burn again until it has regrown), `"road-ice"` or the path of a model file;
+      burnt doesn't burn again until it has regrown), `"wildfire-terrain"` (the same on real land),
+      `"road-ice"` or the path of a model file;
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.

@@ -11,7 +11,7 @@ fn built_in_models_have_their_names_and_fit_the_grid() {
         assert_eq!(model.check_on(shape), Ok(()), "{name}");
         n_models += 1;
     }
-    assert_eq!(n_models, 6);
+    assert_eq!(n_models, 7);
     assert_eq!(Model::built_in("wildfire-dense"), None);
 }
 

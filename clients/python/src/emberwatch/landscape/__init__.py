@@ -5,4 +5,7 @@ know CF) and `numpy_file` read them as `layers`; ``pip install emberwatch[landsc
 says when layers are, `grid` checks where their cells are and resamples, `fire` makes states of
 times, masks or codes, `world` writes what `emberwatch-server --states` reads, `picture` draws it,
 `__main__` reads flags.
+
+`python -m emberwatch.landscape land` makes model files with zones: `terrain` finds them and has the
+formula of slope and wind, `zoned` writes kernels for each, `land` reads flags.
 """

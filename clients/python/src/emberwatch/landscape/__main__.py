@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from contextlib import closing
 from datetime import datetime
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.landscape import land
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.inputs import read, stacks
@@ -33,6 +35,8 @@ examples:
   # A NetCDF variable with a time dimension, of codes 0, 1, 2:
   python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
       --out world.npz
+
+`python -m emberwatch.landscape land` makes a model file with zones of elevation and wind.
 """
 #: Flags that mean something for some kinds only.
 _ONLY_FOR: Final = {
@@ -45,7 +49,13 @@ _ONLY_FOR: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Imports what the flags name; else exits with code 2 and what is wrong."""
+    """Imports what the flags name; else exits with code 2 and what is wrong.
+
+    The first word `land` makes a model file instead; a folder of that name is `./land`.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["land"]:
+        return land.main(arguments[1:])
     parser = _parser()
     flags = parser.parse_args(arguments)
     try:

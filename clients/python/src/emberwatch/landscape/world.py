@@ -38,7 +38,7 @@ _RIGHT, _WRONG = 0.98, 0.01
 
 def description(name: str, step: str, begins: Sequence[datetime | None] = ()) -> str:
     """The text of the `.toml`; `begins`: when step 0 of each sequence is, where that is known."""
-    lines = [f"name = {_quoted(name)}", f"step = {_quoted(step)} # that one step lasts"]
+    lines = [f"name = {quoted(name)}", f"step = {quoted(step)} # that one step lasts"]
     for array, begin in zip(_arrays(len(begins)), begins, strict=True):
         if begin is not None:
             lines.append(f"# {array} begins at {begin:%Y-%m-%d %H:%M:%S} UTC")
@@ -57,7 +57,8 @@ def _arrays(n: int) -> list[str]:
     return [f"states_{number:0{digits}}" for number in range(n)]
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """The text as TOML has it."""
     # TOML has JSON's escapes, but neither surrogates nor a bare U+007F.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
@@ -69,10 +70,16 @@ def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
     if picture is not None and picture.suffix != ".png":
         raise invalid("--picture", "a .png", picture)
     for flag, file in (("out", out), ("out", out.with_suffix(".toml")), ("picture", picture)):
-        if file is not None and file.is_dir():
-            raise invalid(f"--{flag}", "a file", f"the folder {file}")
-        if file is not None and file.exists() and not force:
-            raise invalid(f"--{flag}", f"no {file}", "one; --force replaces it")
+        if file is not None:
+            check_new(f"--{flag}", file, force=force)
+
+
+def check_new(flag: str, file: Path, *, force: bool) -> None:
+    """Refuses a folder, and without `force` a file that is there already."""
+    if file.is_dir():
+        raise invalid(flag, "a file", f"the folder {file}")
+    if file.exists() and not force:
+        raise invalid(flag, f"no {file}", "one; --force replaces it")
 
 
 def arrays(sequences: Sequence[NDArray[np.uint8]]) -> Fill:

@@ -1,0 +1,280 @@
+"""`python -m emberwatch.landscape land`: a model file with zones from elevation and wind."""
+
+import argparse
+import math
+import tomllib
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.landscape.grid import MAX_SIDE, check_same, check_square
+from emberwatch.landscape.inputs import read, stacks
+from emberwatch.landscape.layers import Choice, Layer
+from emberwatch.landscape.terrain import Zone, gradient, zones
+from emberwatch.landscape.world import Fill, check_new, write
+from emberwatch.landscape.zoned import Table, check_base, kernels, toml
+from emberwatch.model import Model
+from emberwatch.paths import shown, utf8
+
+_NAME: Final = "python -m emberwatch.landscape land"
+_EXAMPLES: Final = """
+examples:
+  # Fire climbs, and follows a wind of 5 m/s to the east-north-east:
+  python -m emberwatch.landscape land dem.tif --wind-speed 5 --wind-towards 20 --out hills.toml
+  # Zones of your own, of which 7 and 8 are rivers, and where robots may not be:
+  python -m emberwatch.landscape land --zones fuel.tif --unburnable 7,8 --no-fly towns.tif \\
+      --out fuels.toml
+"""
+#: Larger maps are in a `.npy` file beside the model file, which may have 16 MiB.
+_MOST_INLINE: Final = 1 << 16
+_METRES: Final = ("", "1", "m", "meter", "meters", "metre", "metres")
+_MOST_WIND: Final = 100.0  # m/s: more than any hurricane
+_HEIGHTS: Final = (-1000.0, 10_000.0)  # metres: all land, and not -9999
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Makes what the flags name; else exits with code 2 and what is wrong."""
+    parser = _parser()
+    flags = parser.parse_args(arguments)
+    try:
+        _make(flags)
+    except (EmberwatchError, OSError) as error:
+        parser.exit(2, f"{_NAME}: {error}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_NAME,
+        description="Make a model file with zones of rasters: GeoTIFF (.tif), ESRI ASCII grid "
+        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md has all rules, "
+        "docs/model-file.md the formula.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of metres")
+    add("--out", type=Path, required=True, metavar="FILE.toml", help="the model file")
+    add("--cell", type=float, metavar="METRES", help="side of a cell [as the raster says]")
+    add("--oblong", action="store_true", help="take cells that are not square as squares")
+    add("--slope-step", type=float, metavar="DEGREES", help="of the classes of slope [5]")
+    add("--wind-speed", type=float, default=0.0, metavar="M/S", help="[0: no wind]")
+    add(
+        "--wind-towards",
+        type=float,
+        metavar="DEGREES",
+        help="where the wind blows to, from the east towards the north: 0 is to the east, 90 to "
+        "the north; a weather report's direction D, where it comes from, is 270 - D here",
+    )
+    add("--zones", type=Path, metavar="RASTER", help="whole numbers: each is a zone of its own")
+    add("--unburnable", type=_values, metavar="N,N", help="values of --zones that never burn")
+    add("--no-fly", type=Path, metavar="RASTER", help="other than 0 where robots may not be")
+    add(
+        "--model",
+        default="wildfire-burnout",
+        metavar="NAME|FILE",
+        help="the model whose kernels each zone gets [wildfire-burnout]",
+    )
+    add("--state", metavar="NAME", help="the state that spreads [the one that pays most]")
+    add(
+        "--base-wind",
+        action="store_true",
+        help="keep the model's own directions; else ELEVATION or wind take their place: "
+        "neighbours at one distance first get the mean of their weights",
+    )
+    add("--variable", metavar="NAME", help="of NetCDF or .npz files that have several")
+    add("--band", type=int, metavar="N", help="of rasters that have several")
+    add("--nodata", type=float, action="append", metavar="X", help="a number for no value")
+    add("--name", help="of the model [the output's]")
+    add("--force", action="store_true", help="replace the output")
+    return parser
+
+
+def _make(flags: argparse.Namespace) -> None:
+    _check_flags(flags)
+    name = utf8("--name", flags.name or flags.out.stem)
+    check_new("--out", flags.out, force=flags.force)
+    base, layers = _base(flags), _layers(flags)
+    cells, found = _zones(flags, layers)
+    is_changed = flags.elevation is not None or flags.wind_speed > 0.0
+    check_base(base, found, flags.state, is_changed=is_changed)
+    maps = {"zone_map": cells} | _no_fly(layers)
+    contents = dict[Path, Fill]()
+    model: Table = {"name": name, "kernel_size": base["kernel_size"]}
+    model |= {key: _map(key, array, flags, contents) for key, array in maps.items()}
+    model |= {"zones": [{"name": zone.name, "color": zone.color} for zone in found]}
+    model |= {key: value for key, value in base.items() if key not in ("name", "kernel")}
+    wind, is_even = (flags.wind_speed, flags.wind_towards), is_changed and not flags.base_wind
+    entries = [kernels(base, zone, flags.state, *wind, is_even=is_even) for zone in found]
+    model |= {"kernel": [entry for some in entries for entry in some]}
+    text = f"{_origin(flags, layers)}\n{toml(model)}".encode()
+    contents[flags.out] = lambda file: file.write(text)
+    write(contents)
+    height, width = cells.shape
+    print(shown(f"{flags.out}: {height} x {width} cells, zones: {len(found)}"))
+
+
+def _check_flags(flags: argparse.Namespace) -> None:
+    if flags.out.suffix != ".toml":
+        raise invalid("--out", "a .toml", flags.out)
+    if (flags.elevation, flags.zones, flags.no_fly) == (None, None, None):
+        raise InvalidArgumentError("rasters: expected ELEVATION, --zones or --no-fly, got none")
+    needs = dict.fromkeys(("cell", "oblong", "slope_step"), "elevation") | {"unburnable": "zones"}
+    for flag, needed in needs.items():
+        if getattr(flags, flag) not in (None, False) and getattr(flags, needed) is None:
+            word = "ELEVATION" if needed == "elevation" else "--zones"
+            raise invalid(f"--{flag.replace('_', '-')}", f"{word} beside it", "none")
+    flags.slope_step = 5.0 if flags.slope_step is None else flags.slope_step
+    if not 0.1 <= flags.slope_step <= 90.0:
+        raise invalid("--slope-step", "0.1 to 90 degrees", flags.slope_step)
+    if flags.cell is not None and not 1e-3 <= flags.cell < math.inf:
+        raise invalid("--cell", "at least 0.001 metres", flags.cell)
+    if not 0.0 <= flags.wind_speed <= _MOST_WIND:
+        raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
+    if (flags.wind_speed > 0.0) != (flags.wind_towards is not None):
+        raise InvalidArgumentError(
+            "wind: expected a --wind-speed above 0 and --wind-towards, or neither, got one of them"
+        )
+    flags.wind_towards = flags.wind_towards or 0.0
+    if not -360.0 <= flags.wind_towards <= 360.0:
+        raise invalid("--wind-towards", "-360 to 360 degrees", flags.wind_towards)
+
+
+def _base(flags: argparse.Namespace) -> Table:
+    """The model whose kernels the zones get; also finds the state that spreads."""
+    model = Model.named(flags.model)
+    if flags.state is None:
+        flags.state = model.state_names[model.target_state]
+        if not model.reward.max() > 0.0:
+            raise invalid("--state", "the state that spreads, as no state pays", "none")
+    return tomllib.loads(model.toml)
+
+
+def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
+    """The rasters by their flags, of one grid."""
+    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
+    layers = dict[str, Layer]()
+    for key in ("elevation", "zones", "no_fly"):
+        file = getattr(flags, key)
+        if file is not None:
+            layers[key] = layer = _layer(file, choice)
+            _check_grid(layer, next(iter(layers.values())))
+    return layers
+
+
+def _check_grid(layer: Layer, first: Layer) -> None:
+    (height, width), (rows, columns) = first.place.shape, layer.place.shape
+    if (height, width) != (rows, columns):
+        expected = f"{height} x {width} cells as in {first.name}"
+        raise invalid(layer.name, expected, f"{rows} x {columns}")
+    # NumPy's files do not say where their cells are.
+    if layer.place.corner is not None and first.place.corner is not None:
+        check_same(layer.place, layer.name, first.place, first.name)
+
+
+def _zones(
+    flags: argparse.Namespace, layers: dict[str, Layer]
+) -> tuple[NDArray[np.uint8], list[Zone]]:
+    """The zone of each cell, and the zones."""
+    rise, values = None, None
+    if "elevation" in layers:
+        rise = gradient(layers["elevation"].values, _cell(layers["elevation"], flags))
+    if "zones" in layers:
+        values = _whole(layers["zones"])
+    unburnable = flags.unburnable or ()
+    missing = set(unburnable).difference(() if values is None else values.flat)
+    if missing:
+        raise invalid("--unburnable", f"values that are in {flags.zones}", min(missing))
+    shape = next(iter(layers.values())).place.shape
+    return zones(rise, values, shape=shape, step=flags.slope_step, unburnable=unburnable)
+
+
+def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
+    if "no_fly" not in layers:
+        return {}
+    cells = layers["no_fly"].values != 0.0
+    if cells.all():
+        raise invalid(layers["no_fly"].name, "a cell of 0, where robots may be", "none")
+    return {"no_fly": cells.astype(np.uint8)}
+
+
+def _layer(file: Path, choice: Choice) -> Layer:
+    (files,) = stacks([file], one_file_each=False)
+    with closing(read(files, choice)) as layers:
+        found = list(islice(layers, 2))
+    if len(found) != 1:
+        raise invalid(file, "one layer", "several; choose with --band" if found else "none")
+    (layer,) = found
+    height, width = layer.place.shape
+    if max(height, width) > MAX_SIDE:
+        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes"
+        raise invalid(layer.name, most, f"{height} x {width}")
+    missing = np.argwhere(~np.isfinite(layer.values))
+    if missing.size:
+        (row, column), value = missing[0], layer.values[tuple(missing[0])]
+        got = f"{value} in row {row}, column {column}"
+        raise invalid(layer.name, "a number in each cell", got)
+    return layer
+
+
+def _cell(layer: Layer, flags: argparse.Namespace) -> float:
+    """The side of a cell of elevation, in metres."""
+    place, unit = layer.place, layer.clock.words.strip()
+    if min(place.shape) < 2:
+        got = f"{place.shape[0]} x {place.shape[1]}"
+        raise invalid(layer.name, "at least 2 x 2 cells, as slopes are between cells", got)
+    if unit.lower() not in _METRES:
+        raise invalid(layer.name, "elevation in metres", f"it in '{unit}'")
+    wrong = layer.values[(layer.values < _HEIGHTS[0]) | (layer.values > _HEIGHTS[1])]
+    if wrong.size:
+        expected = f"elevations of {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} metres"
+        raise invalid(layer.name, expected, f"{wrong[0]:g}; if it means no value, fill it")
+    if not flags.oblong:
+        check_square(place, layer.name)
+    if place.corner is not None and not place.is_in_degrees:
+        if flags.cell is not None:
+            side = f"{place.sides()[1] * place.metres:g} metres"
+            raise invalid("--cell", f"none, as {layer.name} says {side}", flags.cell)
+        return place.sides()[1] * place.metres
+    if flags.cell is None:
+        got = "cells in degrees" if place.is_in_degrees else "no place on the ground"
+        raise invalid(layer.name, "cells in metres", f"{got}; say --cell METRES, or reproject it")
+    return flags.cell
+
+
+def _whole(layer: Layer) -> NDArray[np.int64]:
+    wrong = layer.values[(layer.values % 1 != 0) | (np.abs(layer.values) > 1e15)]
+    if wrong.size:
+        raise invalid(layer.name, "whole numbers, each a zone", wrong[0])
+    return layer.values.astype(np.int64)
+
+
+def _map(
+    key: str, cells: NDArray[np.uint8], flags: argparse.Namespace, contents: dict[Path, Fill]
+) -> list[list[int]] | str:
+    """What stands in the model file; a large map is the name of a file, put into `contents`."""
+    if cells.size <= _MOST_INLINE:
+        return cells.tolist()
+    file = flags.out.with_suffix(f".{key}.npy")
+    check_new("--out", file, force=flags.force)
+    contents[file] = lambda opened: np.save(opened, cells)
+    return utf8("--out", file.name)
+
+
+def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
+    """A comment that says what the file was made of."""
+    files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
+    wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
+    return f"# {_NAME}: {files}; model {ascii(flags.model)}; wind of {wind}"
+
+
+def _values(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected whole numbers, got {text}") from None

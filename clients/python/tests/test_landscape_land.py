@@ -1,0 +1,347 @@
+"""Model files with zones from elevation, wind and other rasters."""
+
+import io
+import math
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rasters import ascii_grid, geotiff, netcdf
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.__main__ import main
+from emberwatch.landscape.terrain import factors, gradient, zones
+from emberwatch.landscape.zoned import check_base, toml
+
+CONFIG = Path(__file__).parents[3] / "config"
+BURNOUT = tomllib.loads((CONFIG / "models/wildfire-burnout.toml").read_text("utf-8"))
+#: Of the base's burning neighbours: beside the cell, and at its corners.
+SIDE, CORNER = (0.04 + 0.10 + 0.02 + 0.04) / 4, (0.06 + 0.02 + 0.06 + 0.02) / 4
+#: Metres: on cells of 30 m, 10 degrees up to the east.
+EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
+WIND = ("--wind-speed", 5, "--wind-towards", 20)
+
+
+def made(folder: Path, *flags: object) -> dict[str, Any]:
+    """The model file that the command writes."""
+    out = folder / "new" / "land.toml"
+    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
+    return tomllib.loads(out.read_text("utf-8"))
+
+
+def array(path: Path, values: Any) -> Path:
+    np.save(path, values)
+    return path
+
+
+def weights(model: dict[str, Any], zone: str, **states: str) -> np.ndarray:
+    """Of the one entry of these states; a key `from_` stands for `from`."""
+    wanted = {"zone": zone} | {key.strip("_"): name for key, name in states.items()}
+    (entry,) = (e for e in model["kernel"] if wanted.items() <= e.items())
+    return np.array(entry["weights"])
+
+
+def spread(model: dict[str, Any], zone: str) -> np.ndarray:
+    return weights(model, zone, own="unburnt", from_="burning", to="burning")
+
+
+def by_hand(row: int, col: int, rise: tuple[float, float], speed: float, towards: float) -> float:
+    """The factor of a neighbour so many rows below and columns to the right of the cell."""
+    distance = math.hypot(row, col)
+    # The fire comes from there: so many columns to the west, so many rows to the north.
+    east, north = -col / distance, row / distance
+    slope = math.degrees(math.atan(east * rise[0] + north * rise[1]))
+    angle = math.atan2(north, east) - math.radians(towards)
+    return math.exp(0.078 * slope) * math.exp(speed * (0.045 + 0.131 * (math.cos(angle) - 1)))
+
+
+@pytest.mark.parametrize("size", [(3, 3), (1, 5), (5, 3)])
+def test_factors_are_the_published_formula(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        rise, speed, towards = rng.normal(0, 0.4, 2), rng.uniform(0, 20), rng.uniform(-360, 360)
+        got = factors(rise, speed, towards, size)
+        for row, col in np.ndindex(*size):
+            down, right = row - size[0] // 2, col - size[1] // 2
+            expected = by_hand(down, right, tuple(rise), speed, towards) if down or right else 1
+            assert got[row, col] == pytest.approx(expected)
+
+
+def test_fire_climbs_and_follows_the_wind() -> None:
+    calm = factors(np.array([0.0, 0.2]), 0, 0, (3, 3))
+    assert calm[2, 1] > 1 > calm[0, 1]  # from below, fire goes north: up
+    assert calm[1, 0] == calm[1, 2] == 1
+    level = factors(np.zeros(2), 8, 90, (3, 3))
+    assert level[2, 1] == pytest.approx(math.exp(8 * 0.045))
+    assert level[0, 1] == pytest.approx(math.exp(8 * (0.045 - 0.262)))
+
+
+def test_the_gradient_points_up_in_metres_per_metre() -> None:
+    north = np.arange(4)[::-1, np.newaxis] * 3.0
+    east, up = gradient(north + np.arange(5) * 6.0, 30)
+    np.testing.assert_allclose(east, 0.2)
+    np.testing.assert_allclose(up, 0.1)
+
+
+def test_each_cell_is_in_the_zone_of_its_slope_and_aspect() -> None:
+    rng = np.random.default_rng(2)
+    rise = rng.normal(0, 0.2, (2, 9, 11))
+    cells, found = zones(rise, None, shape=(9, 11), step=5)
+    names = "east north-east north north-west west south-west south south-east".split()
+    for row, col in np.ndindex(9, 11):
+        east, north = rise[:, row, col]
+        degrees = 5 * round(math.degrees(math.atan(math.hypot(east, north))) / 5)
+        angle = math.degrees(math.atan2(north, east))
+        name = f"{degrees} degrees up to the {names[round(angle / 45) % 8]}"
+        assert found[cells[row, col]].name == (name if degrees else "flat")
+    assert cells.dtype == np.uint8 and set(cells.flat) == set(range(len(found)))
+    assert len({zone.name for zone in found}) == len(found)
+    for number, zone in enumerate(found):
+        np.testing.assert_allclose(zone.rise, rise[:, cells == number].mean(axis=1))
+
+
+def test_a_slope_is_one_zone_with_the_factors_on_burning_neighbours(tmp_path: Path) -> None:
+    model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), *WIND)
+    assert [zone["name"] for zone in model["zones"]] == ["10 degrees up to the east"]
+    assert model["name"] == "land" and model["zone_map"] == np.zeros((4, 5)).tolist()
+    name, rise = model["zones"][0]["name"], math.tan(math.radians(10))
+    got = spread(model, name)
+    for row, col in np.ndindex(3, 3):
+        if (row, col) == (1, 1):
+            assert got[1, 1] == 0
+            continue
+        base = SIDE if 1 in (row, col) else CORNER
+        expected = base * by_hand(row - 1, col - 1, (rise, 0.0), 5, 20)
+        assert got[row, col] == pytest.approx(expected, rel=1e-5)
+    around = np.array([[CORNER, SIDE, CORNER], [SIDE, 0, SIDE], [CORNER, SIDE, CORNER]])
+    burnt = weights(model, name, own="unburnt", from_="burnt", to="unburnt")
+    np.testing.assert_allclose(burnt, around)
+    assert weights(model, name, own="burning", from_="burning", to="burning")[1, 1] == 0.96
+    assert len(model["kernel"]) == len(BURNOUT["kernel"])
+    for key in ("states", "observations", "kernel_size"):
+        assert model[key] == BURNOUT[key]
+
+
+def test_the_base_keeps_its_wind_if_asked(tmp_path: Path) -> None:
+    model = made(tmp_path, array(tmp_path / "a.npy", np.zeros((2, 3))), "--cell=9", "--base-wind")
+    assert spread(model, "flat").tolist() == BURNOUT["kernel"][2]["weights"]
+
+
+def test_elevation_is_the_same_from_each_format(tmp_path: Path) -> None:
+    files = [
+        (geotiff(tmp_path / "a.tif", EASTWARD),),
+        (geotiff(tmp_path / "up.tif", EASTWARD[::-1], cell=(30, -30)),),
+        (ascii_grid(tmp_path / "a.asc", EASTWARD.astype("f4")),),
+        (netcdf(tmp_path / "a.nc", z=EASTWARD, unit="m"),),
+        (netcdf(tmp_path / "b.nc", z=EASTWARD, y2=EASTWARD, unit="m"), "--variable", "z"),
+        (array(tmp_path / "a.npy", EASTWARD), "--cell", 30),
+        (geotiff(tmp_path / "km.tif", EASTWARD, crs="EPSG:2263", cell=(98.425, 98.425)),),
+    ]
+    first, *others = (made(tmp_path, *flags) for flags in files)
+    for other in others:
+        assert other["zones"] == first["zones"] and other["zone_map"] == first["zone_map"]
+        np.testing.assert_allclose(spread(other, other["zones"][0]["name"]),
+                                   spread(first, first["zones"][0]["name"]), rtol=1e-4)  # fmt: skip
+
+
+def test_zones_of_a_raster_have_the_base_s_kernels(tmp_path: Path) -> None:
+    values, towns = [[3, 3, -1], [8, 3, 8]], [[0, 0, 2.5], [0, 0, -1]]
+    flags = ("--zones", geotiff(tmp_path / "fuel.tif", values, nodata=None), "--unburnable", 8)
+    model = made(tmp_path, *flags, "--no-fly", array(tmp_path / "no.npy", towns))
+    names = [zone["name"] for zone in model["zones"]]
+    assert names == ["zone -1", "zone 3", "zone 8, never burns"]
+    assert model["zone_map"] == [[1, 1, 0], [2, 1, 2]]
+    assert model["no_fly"] == [[0, 0, 1], [0, 0, 1]]
+    for name in names[:2]:
+        entries = [dict(entry) for entry in model["kernel"] if entry["zone"] == name]
+        assert all(entry.pop("zone") for entry in entries)
+        assert entries == BURNOUT["kernel"]
+    river = [entry for entry in model["kernel"] if entry["zone"] == names[2]]
+    centre = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
+    states = ["unburnt", "burning", "burnt"]
+    assert [(e["own"], e["from"], e["to"], e["weights"]) for e in river] == [
+        (state, state, "unburnt", centre) for state in states
+    ]
+
+
+def test_slopes_divide_zones_but_of_what_never_burns(tmp_path: Path) -> None:
+    step = np.where(np.arange(6) < 3, 0.0, 100.0) * np.ones((2, 1))
+    values = array(tmp_path / "z.npy", [[1] * 6, [2] * 6])
+    dem = geotiff(tmp_path / "dem.tif", step)
+    model = made(tmp_path, dem, "--zones", values, "--unburnable", 2, "--slope-step", 30)
+    names = [zone["name"] for zone in model["zones"]]
+    assert names == ["zone 1, flat", "zone 1, 60 degrees up to the east", "zone 2, never burns"]
+    assert model["zone_map"] == [[0, 0, 1, 1, 0, 0], [2] * 6]
+
+
+def test_kernels_that_do_not_see_the_cell_s_own_state_change_too(tmp_path: Path) -> None:
+    dem = geotiff(tmp_path / "dem.tif", EASTWARD)
+    model = made(tmp_path, dem, "--model", "wildfire", "--base-wind")
+    base = tomllib.loads((CONFIG / "models/wildfire.toml").read_text("utf-8"))
+    for entry, old in zip(model["kernel"], base["kernel"], strict=True):
+        expected = np.array(old["weights"])
+        if (old["from"], old["to"]) == ("fire", "fire"):
+            expected = expected * factors(np.array([math.tan(math.radians(10)), 0]), 0, 0, (3, 3))
+        np.testing.assert_allclose(entry["weights"], expected, rtol=1e-5)
+        assert entry.get("scale") == old.get("scale")
+
+
+def test_large_maps_are_in_files_beside_the_model(tmp_path: Path) -> None:
+    values = np.arange(300 * 300).reshape(300, 300) // 30_000
+    rasters = ("--zones", array(tmp_path / "z.npy", values))
+    model = made(tmp_path, *rasters, "--no-fly", array(tmp_path / "n.npy", values == 1))
+    for key, expected in (("zone_map", values), ("no_fly", values == 1)):
+        assert model[key] == f"land.{key}.npy"
+        cells = np.load(tmp_path / "new" / model[key])
+        assert cells.dtype == np.uint8
+        np.testing.assert_array_equal(cells, expected)
+
+
+def test_the_text_has_maps_before_tables_and_any_string() -> None:
+    model: dict[str, Any] = {"name": 'a "\\ \x7f\n', "sensor": {"radius": 2, "on": True}}
+    model |= {"states": [{"x": 1e-05}, {"x": [[1, 2.5]]}], "kernel": [], "zone_map": [[0], [1]]}
+    model |= {"rings": {"rings": [{"a": 1, "b": "c"}]}}
+    assert tomllib.loads(toml(model)) == model
+
+
+def test_the_command_says_what_it_made(tmp_path: Path) -> None:
+    dem, out = geotiff(tmp_path / "dem.tif", EASTWARD), tmp_path / "hill.toml"
+    command = [sys.executable, "-m", "emberwatch.landscape", "land", dem, "--out", out]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{out}: 4 x 5 cells, zones: 1\n"
+    assert out.read_text().startswith("# python -m emberwatch.landscape land: 'dem.tif'; model ")
+
+
+def test_the_shipped_land_has_all_kernels_of_each_zone() -> None:
+    file = (CONFIG / "models/wildfire-terrain.toml").read_bytes()
+    model = tomllib.loads(file.decode())
+    names = [zone["name"] for zone in model["zones"]]
+    zone_map = np.array(model["zone_map"])
+    assert zone_map.shape == (64, 64) and set(zone_map.flat) == set(range(len(names)))
+    assert len(model["kernel"]) == len(names) * len(BURNOUT["kernel"])
+    # Level ground: the wind alone, as `flat` has a mean slope of less than a quarter degree.
+    around = np.array([[CORNER, SIDE, CORNER], [SIDE, 0, SIDE], [CORNER, SIDE, CORNER]])
+    expected = around * factors(np.zeros(2), 5, 20, (3, 3))
+    np.testing.assert_allclose(spread(model, "flat"), expected, rtol=0.02)
+    uphill = spread(model, "15 degrees up to the north")
+    assert uphill[2, 1] > 2 * spread(model, "flat")[2, 1] > 8 * uphill[0, 1]
+
+
+DEM = "dem.tif"
+FUEL = np.array([[1, 2], [3, 4]])
+
+
+def refusals(f: Path) -> dict[str, tuple[object, ...]]:
+    """Flags by what is said of them."""
+    dem, npy = geotiff(f / DEM, EASTWARD), array(f / "dem.npy", EASTWARD)
+    fuel = array(f / "fuel.npy", FUEL)
+    hole = EASTWARD.copy()
+    hole[1, 2] = np.nan
+    low = np.where(EASTWARD > 20, -9999.0, EASTWARD)
+    zoned = f / "zoned.toml"
+    zoned.write_text((CONFIG / "models/wildfire.toml").read_text() + "\n")
+    unpaid = f / "unpaid.toml"
+    unpaid.write_text(zoned.read_text().replace("reward = 1.0", ""))
+    biased = f / "biased.toml"
+    biased.write_text(zoned.read_text().replace("reward = 1.0", "reward = 1.0\nbias = 0.1"))
+    many = array(f / "many.npy", np.arange(300).reshape(15, 20))
+    return {
+        "rasters: expected ELEVATION, --zones or --no-fly, got none": (),
+        f"{f}/none.tif: expected a file or folder, got none": (f / "none.tif",),
+        f"{f}/a.png: expected one of .tif, ": (array(f / "a.npy", FUEL).rename(f / "a.png"),),
+        f"{npy}: expected cells in metres, got no place on the ground; say --cell METRES": (npy,),
+        "degrees.tif: expected cells in metres, got cells in degrees; say --cell METRES": (
+            geotiff(f / "degrees.tif", EASTWARD, crs="EPSG:4326", corner=(10, 1), cell=(0.1, 0.1)),
+        ),
+        "--cell: expected none, as ": (dem, "--cell=30"),
+        "--cell: expected at least 0.001 metres, got 0.0": (npy, "--cell=0"),
+        "--cell: expected ELEVATION beside it, got none": ("--zones", fuel, "--cell=30"),
+        "--oblong: expected ELEVATION beside it": ("--zones", fuel, "--oblong"),
+        "--unburnable: expected --zones beside it": (dem, "--unburnable=3"),
+        f"--unburnable: expected values that are in {fuel}, got 9": (
+            "--zones", fuel, "--unburnable=1,9",
+        ),
+        "--slope-step: expected 0.1 to 90 degrees, got 0.0": (dem, "--slope-step=0"),
+        "--wind-speed: expected 0 to 100 m/s, got nan": (dem, "--wind-speed=nan"),
+        "wind: expected a --wind-speed above 0 and --wind-towards, or neither": (
+            dem, "--wind-speed=3",
+        ),
+        "or neither, got one of them": (dem, "--wind-towards=3"),
+        "--wind-towards: expected -360 to 360 degrees, got inf": (
+            dem, "--wind-speed=3", "--wind-towards=inf",
+        ),
+        "hole.tif: expected a number in each cell, got nan in row 1, column 2": (
+            geotiff(f / "hole.tif", hole),
+        ),
+        "expected elevations of -1000 to 10000 metres, got -9999; if it means no value": (
+            array(f / "low.npy", low), "--cell=30",
+        ),
+        "expected at least 2 x 2 cells, as slopes are between cells, got 1 x 1": (
+            array(f / "one.npy", [[1.0]]), "--cell=30",
+        ),
+        "expected elevation in metres, got it in 'ft'": (
+            netcdf(f / "ft.nc", z=EASTWARD, unit="ft"),
+        ),
+        "expected square cells, got 30 x 60": (geotiff(f / "ob.tif", EASTWARD, cell=(30, 60)),),
+        "two.tif: expected one layer, got several; choose with --band": (
+            geotiff(f / "two.tif", EASTWARD, EASTWARD),
+        ),
+        "fuel.npy: expected 4 x 5 cells as in ": (dem, "--zones", fuel),
+        "other.tif: expected the extent of ": (
+            dem, "--no-fly", geotiff(f / "other.tif", EASTWARD, corner=(0, 0)),
+        ),
+        "half.npy: expected whole numbers, each a zone, got 0.5": (
+            "--zones", array(f / "half.npy", [[0.5, 1.0]]),
+        ),
+        "zones: expected at most 256, got 300": ("--zones", many),
+        "ones.npy: expected a cell of 0, where robots may be, got none": (
+            "--zones", fuel, "--no-fly", array(f / "ones.npy", np.ones((2, 2))),
+        ),
+        "expected at most 4096 x 4096 cells": ("--zones", array(f / "l.npy", np.ones((1, 4097)))),
+        "model file ash: No such file": (dem, "--model=ash"),
+        "--state: expected one of unburnt, burning, burnt, got 'ash'": (dem, "--state=ash"),
+        "expected a kernel by which 'burnt' spreads to neighbours": (dem, "--state=burnt"),
+        "--state: expected the state that spreads, as no state pays": (dem, "--model", unpaid),
+        "--unburnable: expected no bias but of 'normal', got one of 'fire'": (
+            "--zones", fuel, "--unburnable=1", "--model", biased,
+        ),
+    }  # fmt: skip
+
+
+def test_refusals_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out" / "land.toml"
+    for words, flags in refusals(tmp_path).items():
+        said = io.StringIO()
+        monkeypatch.setattr(sys, "stderr", said)
+        with pytest.raises(SystemExit) as stopped:
+            main(["land", *map(str, flags), "--out", str(out)])
+        assert stopped.value.code == 2
+        lines = said.getvalue().splitlines()
+        assert len(lines) == 1 and words in lines[0], (words, lines)
+        assert lines[0].startswith("python -m emberwatch.landscape land: ")
+        assert not out.parent.exists()
+
+
+def test_nothing_is_replaced_unless_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem, out = geotiff(tmp_path / DEM, EASTWARD), tmp_path / "land.toml"
+    out.write_text("mine")
+    for wrong, words in ((out, "one; --force replaces it"), (tmp_path / "a.txt", "a .toml")):
+        with pytest.raises(SystemExit):
+            main(["land", str(dem), "--out", str(wrong)])
+        assert words in capsys.readouterr().err
+    assert out.read_text() == "mine"
+
+
+def test_a_base_has_no_zones_of_its_own(tmp_path: Path) -> None:
+    for key in ("zones", "zone_map", "no_fly"):
+        with pytest.raises(
+            InvalidArgumentError, match=f'model "wildfire-burnout": expected no {key}'
+        ):
+            check_base(BURNOUT | {key: []}, [], "burning", is_changed=True)
