@@ -21,6 +21,7 @@ mod frames;
 mod handover;
 mod hostile;
 mod kills;
+mod land;
 mod lease;
 mod places;
 mod python;
