@@ -88,7 +88,7 @@ fn random_land(key: u64, n_states: usize, n_zones: u64, own: bool, side: (usize,
     let mut file = zoned(&models, key, side).file().clone();
     // Some weights are the same in all zones.
     let n_entries = models[0].file().kernel.len();
-    for at in (0..file.kernel.len()).filter(|at| at % n_entries % 3 == 0) {
+    for at in (0..file.kernel.len()).filter(|at| (at % n_entries).is_multiple_of(3)) {
         file.kernel[at].weights = file.kernel[at % n_entries].weights.clone();
     }
     Model::new(file).expect("test models are valid")
