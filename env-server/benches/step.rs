@@ -32,12 +32,18 @@ struct Session {
 impl Session {
     /// Worlds at k = 0, on grids of 64 x 64, with paths of 64 moves.
     fn new(n_worlds: u32, team: u32) -> Self {
-        let n_robots = n_worlds * team;
-        let config = ServerConfig {
+        Self::of(ServerConfig {
             worlds: n_worlds,
             robots: team,
-            burn_in: 2_000,
             ..ServerConfig::default()
+        })
+    }
+
+    fn of(config: ServerConfig) -> Self {
+        let (n_worlds, n_robots) = (config.worlds, config.worlds * config.robots);
+        let config = ServerConfig {
+            burn_in: 2_000,
+            ..config
         };
         let n_moves = config.moves as u32;
         let checked = config.check().expect("bench settings");
@@ -113,6 +119,33 @@ fn simulator_step(criterion: &mut Criterion) {
         let mut session = Session::new(n_worlds, team);
         group.throughput(Throughput::Elements(n_worlds.into()));
         group.bench_function(format!("{n_worlds} x {team}"), |bencher| {
+            bencher.iter(|| session.step());
+        });
+    }
+    let default = ServerConfig::default;
+    let models = ["wildfire-burnout", "wildfire-terrain"];
+    let models = models.map(|model| {
+        (
+            model.to_owned(),
+            ServerConfig {
+                model: model.into(),
+                ..default()
+            },
+        )
+    });
+    let radii = [1, 2, 8].map(|sensor_radius| {
+        (
+            format!("radius {sensor_radius}"),
+            ServerConfig {
+                sensor_radius,
+                ..default()
+            },
+        )
+    });
+    for (name, config) in models.into_iter().chain(radii) {
+        let mut session = Session::of(config);
+        group.throughput(Throughput::Elements(1));
+        group.bench_function(name, |bencher| {
             bencher.iter(|| session.step());
         });
     }

@@ -13,16 +13,21 @@ fn square(side: usize) -> Shape {
     Shape::new(side, side).expect("bench shape")
 }
 
-/// The default model, and one whose kernels see the cell's own state.
-fn models() -> [(Model, &'static str); 2] {
-    let burnout = Model::built_in("wildfire-burnout").expect("bench model");
-    [(Model::wildfire(), ""), (burnout, "_burnout")]
+/// The default model, one whose kernels see the cell's own state, and that on land of 35 zones, which has 64 x 64 cells.
+fn models(side: usize) -> impl Iterator<Item = (Model, &'static str)> {
+    let named = |name| Model::built_in(name).expect("bench model");
+    let all = [
+        (Model::wildfire(), ""),
+        (named("wildfire-burnout"), "_burnout"),
+        (named("wildfire-terrain"), "_terrain"),
+    ];
+    all.into_iter().take(if side == 64 { 3 } else { 2 })
 }
 
 fn product<const N: usize>(
     sides: [usize; N],
 ) -> impl Iterator<Item = (usize, (Model, &'static str))> {
-    let with_models = |side| models().into_iter().map(move |model| (side, model));
+    let with_models = |side| models(side).map(move |model| (side, model));
     sides.into_iter().flat_map(with_models)
 }
 

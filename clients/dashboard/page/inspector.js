@@ -2,7 +2,7 @@
 
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
-import { cellsOf, shapeOf } from "/wire.js";
+import { cellsOf, hasLand, shapeOf } from "/wire.js";
 import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
@@ -54,6 +54,7 @@ function rowsOf(picture, { row, col }) {
   const at = row * shapeOf(picture).width + col;
   const rows = [];
   if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
+  if (hasLand(picture)) rows.push({ name: "land", value: landText(picture, at), kind: "land" });
   if (arrays.seen) rows.push(seenRow(picture, arrays.seen[at]));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
   const cells = cellsOf(picture);
@@ -81,13 +82,19 @@ function ageText(age) {
   return age === 255 ? "255+ steps" : `${age} step${age === 1 ? "" : "s"}`;
 }
 
+function landText({ arrays, info }, at) {
+  const parts = [info.zones?.[arrays.zones?.[at]], arrays.no_fly?.[at] && "no-fly"];
+  return parts.filter(Boolean).join(", ") || "free";
+}
+
 function entropyRow(value, states) {
   const share = value / 255;
   return { name: "entropy", value: `${(share * Math.log(Math.max(states, 2))).toFixed(2)} nats`, share, ramp: "entropy" };
 }
 
-function rowElement({ name, value, color, share, ramp }, palette) {
-  const row = make("div");
+function rowElement({ name, value, color, share, ramp, kind }, palette) {
+  const row = make("div", kind && `of-${kind}`);
+  if (kind) row.title = value;
   const term = make("dt", "", {}, name);
   const answer = make("dd");
   if (color) answer.append(swatch(palette[color[0]][color[1]]));

@@ -1,6 +1,7 @@
 // What colours and marks mean.
 
 import { make, swatch } from "/elements.js";
+import { MOST_ZONES } from "/land.js";
 import { rampStops } from "/palette.js";
 import { beliefNames, observationNames, stateNames } from "/words.js";
 
@@ -13,14 +14,15 @@ export function createLegend(list, ramps) {
   return {
     draw(picture, palette) {
       const states = stateNames(picture);
-      const observations = observationNames(picture);
+      const observations = observationNames(picture).slice(0, picture.info.n_named);
       const believed = beliefNames(picture).length;
       const { theme } = palette;
-      const { state_colours: ofStates, observation_colours: ofObservations } = picture.info;
-      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations]);
+      const { state_colours: ofStates, observation_colours: ofObservations, zones, zone_colours: ofZones } = picture.info;
+      const hasNoFly = Boolean(picture.arrays.no_fly);
+      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations, zones, ofZones, hasNoFly]);
       if (key === drawn) return false;
       drawn = key;
-      list.replaceChildren(...values(states, observations, palette), ...marks(palette));
+      list.replaceChildren(...values(states, observations, palette), ...marks(palette, zones, hasNoFly));
       ramps.replaceChildren(...(believed ? [
         ramp("belief", theme, "belief: probability of the state", ["0", "0.25", "0.5", "0.75", "1"]),
         ramp("entropy", theme, "entropy of a cell, nats", entropyTicks(believed)),
@@ -51,8 +53,14 @@ function word(text) {
   return make("li", "word", {}, text);
 }
 
-function marks(palette) {
-  return [value("not observed", palette.unseen), mark("path"), mark("start"), mark("robot")];
+function marks(palette, zones, hasNoFly) {
+  return [...unobserved(palette, zones), ...(hasNoFly ? [mark("no-fly")] : []), mark("path"), mark("start"), mark("robot")];
+}
+
+function unobserved({ unseen, unseenZones }, zones) {
+  if (!zones) return [value("not observed", unseen)];
+  if (zones.length > MOST_ZONES) return [word(`not observed: ${zones.length} zones`)];
+  return [word("not observed"), ...named(zones, unseenZones)];
 }
 
 function mark(name) {

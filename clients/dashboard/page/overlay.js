@@ -3,6 +3,7 @@
 // light one has the robot's colour.
 
 import { prepare } from "/elements.js";
+import { drawFootprint, drawLand } from "/land.js";
 import { robotColor } from "/palette.js";
 import { shapeOf } from "/wire.js";
 import { isTeam } from "/words.js";
@@ -17,7 +18,11 @@ export function drawMarks(canvas, picture, { cell, hasPaths }) {
   const shape = shapeOf(picture);
   const ink = getComputedStyle(canvas).getPropertyValue("--ink");
   const frame = { ...drawn, ink, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
-  if (hasPaths && picture.shown) drawRobots(frame, picture.shown);
+  drawLand(frame, picture);
+  if (hasPaths && picture.shown) {
+    drawFootprint(frame, picture);
+    drawRobots(frame, picture.shown);
+  }
   if (cell) drawCross(frame, cell);
 }
 

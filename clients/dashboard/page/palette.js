@@ -48,19 +48,24 @@ export const NEVER = 255;
 const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
+// The share of its zone's colour in a cell that was not observed: states and observations, in full colours, stay apart.
+const ZONE_SHARE = 0.4;
+
 /**
  * The colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by any byte,
  * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by
- * `value * 256 + age`, `rampTable(name)` by value 0..255.
+ * `value * 256 + age`, `rampTable(name)` by value 0..255. Of what was not observed `unseenZones` and `zoneTable` by zone.
  */
 export function paletteOf(picture, theme) {
-  const { state_colours: states, observation_colours: observations } = picture.info ?? {};
-  return remembered([theme, states, observations], () => make(states, observations, theme));
+  const { state_colours: states, observation_colours: observations, n_named: named, zone_colours: zones } = picture.info ?? {};
+  return remembered([theme, states, observations, named, zones], () => make({ states, observations, named, zones, theme }));
 }
 
-function make(ownStates, ownObservations, theme) {
+function make({ states: ownStates, observations: ownObservations, named, zones, theme }) {
   const states = colorsOf(ownStates);
-  const observations = colorsOf(ownObservations);
+  const colors = colorsOf(ownObservations);
+  // Those of a sensor's outer rings have the colours of the first.
+  const observations = colors.map((color, at) => colors[at % (named || colors.length)]);
   const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
   const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at]);
   const seen = value(observations);
@@ -69,6 +74,8 @@ function make(ownStates, ownObservations, theme) {
     states,
     observations,
     unseen,
+    unseenZones: zones?.map((color) => `#${mixed(unseen, color).map(hexadecimal).join("")}`),
+    zoneTable: table(256, (at) => mixed(unseen, zones?.[at] ?? unseen)),
     stateTable: table(256, value(states)),
     frameTable: table(256, seen),
     seenTable: table(65536, (at) => faded(seen(at >> 8), channels(unseen), at & 255)),
@@ -121,7 +128,11 @@ function generated(at) {
     const turn = (shift + (at * HUE_STEP) / 30) % 12;
     return Math.round(255 * (lightness - reach * Math.max(-1, Math.min(turn - 3, 9 - turn, 1))));
   };
-  return `#${[0, 8, 4].map((shift) => channel(shift).toString(16).padStart(2, "0")).join("")}`;
+  return `#${[0, 8, 4].map((shift) => hexadecimal(channel(shift))).join("")}`;
+}
+
+function hexadecimal(channel) {
+  return channel.toString(16).padStart(2, "0");
 }
 
 /** The first grey that is well apart from all colours, else the one furthest from them. */
@@ -134,6 +145,10 @@ function unlike(colors, greys) {
 function distance(one, other) {
   const [a, b] = [channels(one), channels(other)];
   return a.reduce((sum, channel, i) => sum + (channel - b[i]) ** 2, 0);
+}
+
+function mixed(unseen, zone) {
+  return blend(channels(unseen), channels(zone), ZONE_SHARE);
 }
 
 // An observation made `age` steps ago.

@@ -2,8 +2,9 @@
 
 import { make, write } from "/elements.js";
 import { drawMarks } from "/overlay.js";
+import { NEVER } from "/palette.js";
 import { beliefAge, beliefNames, panelSentence, seenSince, stateNames } from "/words.js";
-import { cellsOf, shapeOf } from "/wire.js";
+import { cellsOf, hasLand, shapeOf } from "/wire.js";
 
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
@@ -14,7 +15,7 @@ const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of th
 
 /** The panels in `parent`, and the inspector among them; `byKey(cell)` hears of cells that keys go to, or null. */
 export function createPanels(parent, { pointer, byKey, inspector }) {
-  let built = { key: "", world: null, beliefs: [], panels: [] };
+  let built = { key: "", world: null, beliefs: [], panels: [], landLines: 0 };
   // The cell that keys went to; once the pointer moves over a panel, it counts again.
   let keyed = null;
   const hold = (cell) => { keyed = cell; byKey(cell); };
@@ -23,7 +24,8 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
   /** Builds panels again when their number, names or shape change. Tells whether it did. */
   function build(picture) {
     const beliefs = namesOf(picture);
-    const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);
+    const landLines = hasLand(picture) ? 1 : 0;
+    const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length, landLines]);
     if (key === built.key) return false;
     const add = (panel) => element(panel, picture, { hold, release });
     const panels = OBSERVED.map(add);
@@ -33,7 +35,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
     const row = believed.map((panel) => panel.figure);
     parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief(picture)]));
     release();
-    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed] };
+    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed], landLines };
     return true;
   }
 
@@ -49,7 +51,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
     /** For the layout: panels, lines of the inspector, whether a note stands for beliefs, columns that hold those in one row. */
     places: () => ({
       panels: built.panels.length,
-      lines: OBSERVED.length + (built.beliefs.length && built.beliefs.length + 1),
+      lines: OBSERVED.length + built.landLines + (built.beliefs.length && built.beliefs.length + 1),
       isBare: built.beliefs.length === 0,
       regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
     }),
@@ -102,6 +104,7 @@ function paint(panel, picture, cell, palette) {
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
     fill(pixels, values, panel, picture, palette);
+    if (picture.arrays.zones && ["seen", "frame"].includes(panel.kind)) fillZones(pixels, values, picture.arrays, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
   drawMarks(panel.marks, picture, { cell, hasPaths: panel.kind === "frame" && Boolean(values) });
@@ -115,6 +118,10 @@ function fill(pixels, values, { kind }, { arrays }, palette) {
   }
   const table = tableOf(kind, palette);
   for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[values[i]];
+}
+
+function fillZones(pixels, values, { zones }, { zoneTable }) {
+  for (let i = 0; i < pixels.length; i += 1) if (values[i] === NEVER) pixels[i] = zoneTable[zones[i]];
 }
 
 function tableOf(kind, palette) {

@@ -39,6 +39,11 @@ export function cellsOf(picture) {
   return shape && shape.height * shape.width;
 }
 
+/** Whether it tells of zones or no-fly cells. */
+export function hasLand({ arrays }) {
+  return Boolean(arrays.zones ?? arrays.no_fly);
+}
+
 function header(buffer) {
   if (buffer.byteLength < 4) throw new Error(`picture: expected 4 bytes or more, got ${buffer.byteLength}`);
   const length = new DataView(buffer).getUint32(0, true);
@@ -53,7 +58,7 @@ function header(buffer) {
 function checkGrids(picture, arrays) {
   const cells = cellsOf(picture);
   if (!cells) return;
-  for (const name of ["truth", "frame", "seen", "age", "entropy"]) {
+  for (const name of ["truth", "frame", "seen", "age", "entropy", "zones", "no_fly"]) {
     if (arrays[name] && arrays[name].length !== cells) {
       throw new Error(`array ${name}: expected ${cells} cells, got ${arrays[name].length}`);
     }

@@ -18,7 +18,7 @@ macro_rules! assets {
 }
 
 /// Every file of the page.
-pub const ASSETS: [Asset; 22] = assets![
+pub const ASSETS: [Asset; 23] = assets![
     "/" "index.html" "text/html",
     "/page.css" "page.css" "text/css",
     "/icon.svg" "icon.svg" "image/svg+xml",
@@ -27,6 +27,7 @@ pub const ASSETS: [Asset; 22] = assets![
     "/elements.js" "elements.js" "text/javascript",
     "/facts.js" "facts.js" "text/javascript",
     "/inspector.js" "inspector.js" "text/javascript",
+    "/land.js" "land.js" "text/javascript",
     "/layout.js" "layout.js" "text/javascript",
     "/legend.js" "legend.js" "text/javascript",
     "/main.js" "main.js" "text/javascript",

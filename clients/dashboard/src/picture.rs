@@ -8,6 +8,7 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use crate::memory::Memory;
 use crate::scene::{Info, Lost, Player, Scene};
+use emberwatch_protocol::Grid;
 use emberwatch_protocol::control::ServerStatus;
 use emberwatch_protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
@@ -154,6 +155,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     let (mut objectives, mut series, mut since) = (Vec::new(), None, 0);
     if let (Some(strip), Some((serial, entry))) = (strip, chosen) {
         since = arrays.add_grids(strip, serial, entry);
+        arrays.add_land(scene.info.as_ref(), entry);
         arrays.add_belief(believed);
         (objectives, series) = arrays.add_series(strip, ask.bins.clamp(BINS.0, BINS.1));
     }
@@ -233,6 +235,17 @@ impl Arrays {
         self.add_bytes("seen", &memory.seen);
         self.add_bytes("age", &memory.age);
         memory.since
+    }
+
+    /// What lies on the grid; nothing where it is another than the server's.
+    fn add_land(&mut self, info: Option<&Info>, entry: &Entry) {
+        let of_grid = |map: &&Grid<u8>| map.dim() == entry.shape.dim();
+        let maps = info.map(|info| [("zones", &info.zone_map), ("no_fly", &info.no_fly)]);
+        for (name, map) in maps.into_iter().flatten() {
+            if let Some(map) = map.as_ref().filter(of_grid) {
+                self.add_bytes(name, &map.iter().copied().collect::<Vec<_>>());
+            }
+        }
     }
 
     fn add_belief(&mut self, believed: Option<&Entry>) {

@@ -2,9 +2,9 @@
 
 use crate::album::Album;
 use crate::entry::States;
-use emberwatch_protocol::Model;
 use emberwatch_protocol::control::{CoverageRule, ServerInfo, ServerStatus};
 use emberwatch_protocol::model::Description;
+use emberwatch_protocol::{Airspace, Grid, Model};
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
@@ -69,6 +69,18 @@ pub struct Info {
     target_state: Option<usize>,
     observations: Vec<String>,
     observation_colours: Option<Vec<String>>,
+    /// Observations of the path; those of each ring around it follow, in the same colours.
+    n_named: usize,
+    /// Rows and columns that robots see beyond their path.
+    radius: usize,
+    zones: Option<Vec<String>>,
+    zone_colours: Option<Vec<String>>,
+    /// The zone of each cell.
+    #[serde(skip)]
+    pub zone_map: Option<Grid<u8>>,
+    /// 1 for each cell where no robot may be.
+    #[serde(skip)]
+    pub no_fly: Option<Grid<u8>>,
     burn_in: u64,
     max_steps: u64,
     coverage: CoverageRule,
@@ -123,7 +135,13 @@ impl Info {
         let names = |of: fn(&emberwatch_protocol::model::StateEntry) -> &String| {
             file.map(|file| file.states.iter().map(of).cloned().collect())
         };
-        let colours = file.map(|file| file.observations.iter());
+        let airspace = info.airspace().ok();
+        let zones = info.zones.as_ref();
+        let zone_map = zones.and_then(|zones| zones.zone_map(info.shape().ok()?).ok());
+        let zones = zones.filter(|_| zone_map.is_some());
+        let n_rings = airspace.as_ref().map_or(1, Airspace::n_rings);
+        let colours = file.map(|file| file.observations.iter().map(|one| one.color.clone()));
+        let no_fly = airspace.as_ref().and_then(Airspace::no_fly);
         Self {
             pid: info.pid,
             height: info.height,
@@ -136,7 +154,13 @@ impl Info {
             state_colours: names(|state| &state.color),
             target_state: model.as_ref().map(Model::target_state),
             observations: info.observations.clone(),
-            observation_colours: colours.map(|all| all.map(|one| one.color.clone()).collect()),
+            observation_colours: colours.map(|all| all.cycle().take(info.n_observations).collect()),
+            n_named: info.n_observations / n_rings,
+            radius: airspace.as_ref().map_or(0, Airspace::radius),
+            zones: zones.map(|zones| zones.names.clone()),
+            zone_colours: zones.map(|zones| zones.colors.clone()),
+            zone_map,
+            no_fly: no_fly.map(|map| map.mapv(u8::from)),
             burn_in: info.burn_in,
             max_steps: info.max_steps,
             coverage: info.coverage,

@@ -102,6 +102,12 @@ fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
                 got,
             )
         }
+        ModelError::Value {
+            what,
+            expected,
+            got,
+            ..
+        } => invalid(py, format!("model: {what}"), expected, got),
         other => invalid(py, "model", "weights that keep their precision", other),
     }
 }

@@ -1,10 +1,12 @@
 //! Paths flown move by move by many robots, in rows: where they are, what they have visited.
 
+use crate::airspace::Given;
 use crate::detached::detached;
 use crate::model::shape_of;
 use crate::refusal::invalid;
+use emberwatch_protocol::model::{Pays, SeenCell};
 use emberwatch_protocol::path::{MAX_MOVES, Move};
-use emberwatch_protocol::{Cell, Shape};
+use emberwatch_protocol::{Airspace, Cell, Shape};
 use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
@@ -14,14 +16,24 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyType;
 
-type Arguments = (usize, usize, usize, usize, Option<Vec<f64>>);
+type Arguments = (
+    usize,
+    usize,
+    usize,
+    usize,
+    Option<Vec<f64>>,
+    Option<Py<PyAny>>,
+);
 
 /// The present path of each robot, as far as it is flown.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
+    airspace: Airspace,
+    /// Python's, which it was made of.
+    given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// What each hidden state pays when its cell is first visited; `None`: nothing.
+    /// What each hidden state pays when its cell is first visited, or seen where that pays; `None`: nothing.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -29,11 +41,16 @@ pub struct Flights {
     states: Vec<u8>,
     moves: Vec<u8>,
     paid: Vec<f64>,
+    /// Which cells have paid.
+    has_paid: Vec<bool>,
+    /// Work space.
+    sight: (Vec<SeenCell>, Vec<u8>),
 }
 
 #[pymethods]
 impl Flights {
     #[new]
+    #[pyo3(signature = (n_rows, height, width, n_moves, reward, airspace=None))]
     fn new(
         py: Python<'_>,
         n_rows: usize,
@@ -41,14 +58,21 @@ impl Flights {
         width: usize,
         n_moves: usize,
         reward: Option<Vec<f64>>,
+        airspace: Option<Py<PyAny>>,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
+        let within = match &airspace {
+            None => Airspace::open(shape),
+            Some(given) => given.extract::<Given<'_>>(py)?.on_grid(py, shape)?,
+        };
         if !(1..=MAX_MOVES).contains(&n_moves) {
             let expected = format!("an integer within 1 to {MAX_MOVES}");
             return Err(invalid(py, "n_moves", expected, n_moves));
         }
         Ok(Self {
             shape,
+            airspace: within,
+            given: airspace,
             n_moves,
             reward,
             cells: vec![Cell { row: 0, col: 0 }; n_rows],
@@ -57,6 +81,8 @@ impl Flights {
             states: vec![0; n_rows * shape.n_cells()],
             moves: vec![0; n_rows * n_moves],
             paid: vec![0.0; n_rows],
+            has_paid: vec![false; n_rows * shape.n_cells()],
+            sight: Default::default(),
         })
     }
 
@@ -65,7 +91,8 @@ impl Flights {
         let this = slf.borrow();
         let (height, width) = this.shape.dim();
         let reward = this.reward.clone();
-        let arguments = (this.cells.len(), height, width, this.n_moves, reward);
+        let given = this.given.as_ref().map(|it| it.clone_ref(slf.py()));
+        let arguments = (this.cells.len(), height, width, this.n_moves, reward, given);
         (slf.get_type(), arguments)
     }
 
@@ -95,6 +122,16 @@ impl Flights {
     #[getter]
     fn paid<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_slice(py, &self.paid)
+    }
+
+    /// Whether each move takes a robot to another cell, `[n_rows, 4]`; all of them, where none does.
+    #[getter]
+    fn masks<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<bool>>> {
+        let of_robot = |&cell: &Cell| {
+            let is_stuck = !self.airspace.has_way_out(cell);
+            Move::ALL.map(|step| is_stuck || self.airspace.after(step, cell) != cell)
+        };
+        PyArray1::from_iter(py, self.cells.iter().flat_map(of_robot)).reshape([self.cells.len(), 4])
     }
 
     /// Begins some paths; `robots` and hidden `states` are those of all rows.
@@ -193,6 +230,7 @@ impl Flights {
         for row in (0..begun.len()).filter(|&row| begun[row]) {
             let cells = row * n_cells..(row + 1) * n_cells;
             self.visited[cells.clone()].fill(0);
+            self.has_paid[cells.clone()].fill(false);
             if let Some(states) = states {
                 let own = states.index_axis_move(Axis(0), row);
                 let kept = self.states[cells].iter_mut();
@@ -204,14 +242,38 @@ impl Flights {
     fn fly(&mut self, row: usize, action: u8) -> f64 {
         self.moves[row * self.n_moves + self.n_made[row]] = action;
         self.n_made[row] += 1;
-        let cell = Move::from_low_bits(action.into()).apply(self.cells[row], self.shape);
+        let step = Move::from_low_bits(action.into());
+        let cell = self.airspace.after(step, self.cells[row]);
         self.cells[row] = cell;
-        let at = row * self.shape.n_cells() + self.shape.index(cell);
-        let is_new = std::mem::replace(&mut self.visited[at], 255) == 0;
-        let reward = self.reward.as_ref().filter(|_| is_new);
-        let paid = reward.and_then(|reward| reward.get(usize::from(self.states[at])));
-        let paid = paid.copied().unwrap_or_default();
+        let (first, index) = (row * self.shape.n_cells(), self.shape.index(cell));
+        let is_new = std::mem::replace(&mut self.visited[first + index], 255) == 0;
+        let paid = if is_new { self.pay(first, index) } else { 0.0 };
         self.paid[row] += paid;
+        paid
+    }
+
+    /// What the first visit of a cell pays; `first` is the first cell of its row.
+    fn pay(&mut self, first: usize, index: usize) -> f64 {
+        let Some(reward) = &self.reward else {
+            return 0.0;
+        };
+        let (sight, rings) = &mut self.sight;
+        if self.airspace.pays() == Pays::Seen {
+            self.airspace.see_into(&[index], sight, rings);
+        } else {
+            sight.clear();
+            sight.push(SeenCell {
+                cell: index,
+                ring: 0,
+            });
+        }
+        let mut paid = 0.0;
+        for at in sight.iter().map(|it| first + it.cell) {
+            if !std::mem::replace(&mut self.has_paid[at], true) {
+                let of_state = reward.get(usize::from(self.states[at]));
+                paid += of_state.copied().unwrap_or_default();
+            }
+        }
         paid
     }
 }

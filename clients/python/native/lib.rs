@@ -1,5 +1,6 @@
 //! What Python calls of Rust: the module `emberwatch._native`, whose types are in `_native.pyi`.
 
+mod airspace;
 mod backend;
 mod belief;
 mod connection;
@@ -58,6 +59,10 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
+    module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;
+    module.add_function(wrap_pyfunction!(model::grid_of_maps, module)?)?;
+    module.add_function(wrap_pyfunction!(model::model_text, module)?)?;
+    module.add_function(wrap_pyfunction!(model::model_with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;
     module.add_function(wrap_pyfunction!(planning::beam_search, module)?)

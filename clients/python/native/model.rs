@@ -2,12 +2,13 @@
 
 use crate::refusal::invalid;
 use emberwatch_protocol::grid::{MAX_SIDE, Shape};
-use emberwatch_protocol::model::{Description, Model, parse_color};
+use emberwatch_protocol::model::{CellMap, Description, Model, ModelFile, Pays, parse_color};
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
+use std::path::PathBuf;
 
 /// The fields of a model file's model by name.
 #[pyfunction]
@@ -19,7 +20,45 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     fields.set_item("kernels", kernels.to_pyarray(py))?;
     fields.set_item("bias", model.bias().to_pyarray(py))?;
     fields.set_item("initial", model.initial().to_pyarray(py))?;
+    let zones = model.file().zones.iter();
+    fields.set_item("zone_names", names(py, zones.clone().map(|it| &it.name))?)?;
+    fields.set_item("zone_colors", colors(py, zones.map(|it| &it.color))?)?;
+    let zone_map = model.zone_map().map(|map| map.to_pyarray(py));
+    fields.set_item("zone_map", zone_map)?;
     Ok(fields)
+}
+
+/// Height and width of the grid that a model file's maps are of; `None` if it has none, or is wrong.
+#[pyfunction]
+pub fn grid_of_maps(path: PathBuf) -> Option<(usize, usize)> {
+    let model = Model::read(&path).ok()?;
+    let file = model.file();
+    let map = file.zone_map.as_ref().or(file.no_fly.as_ref())?;
+    map.grid().ok().map(|map| map.dim())
+}
+
+/// The text of a model file with the maps that stand beside it.
+#[pyfunction]
+pub fn model_text(path: PathBuf) -> PyResult<String> {
+    let file = ModelFile::read(&path).map_err(refused)?;
+    toml::to_string(&file).map_err(refused)
+}
+
+/// The text of a model file whose sensor sees so many rows and columns beyond the path.
+#[pyfunction]
+pub fn model_with_radius(text: &str, radius: usize) -> PyResult<String> {
+    let model = model_of(text)?.with_radius(radius).map_err(refused)?;
+    toml::to_string(model.file()).map_err(refused)
+}
+
+/// The same of a description.
+#[pyfunction]
+pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
+    let mut description: Description = toml::from_str(text).map_err(refused)?;
+    let model = description.unchanging().map_err(refused)?;
+    let model = model.with_radius(radius).map_err(refused)?;
+    description.sensor = model.file().sensor.clone();
+    toml::to_string(&description).map_err(refused)
 }
 
 /// The fields of a description of recorded worlds by name.
@@ -48,21 +87,40 @@ fn refused(error: impl ToString) -> PyErr {
 fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
     let file = model.file();
     let states = file.states.iter();
-    let observations = file.observations.iter();
+    let of_rings = (0..model.n_rings()).flat_map(|_| &file.observations);
     let fields = PyDict::new(py);
     fields.set_item("name", model.name())?;
     fields.set_item("state_names", names(py, states.clone().map(|it| &it.name))?)?;
     fields.set_item("state_colors", colors(py, states.map(|it| &it.color))?)?;
     fields.set_item(
         "observation_names",
-        names(py, observations.clone().map(|it| &it.name))?,
+        PyTuple::new(py, model.observation_names())?,
     )?;
     fields.set_item(
         "observation_colors",
-        colors(py, observations.map(|it| &it.color))?,
+        colors(py, of_rings.map(|it| &it.color))?,
     )?;
     fields.set_item("observation_matrix", model.likelihood().to_pyarray(py))?;
     fields.set_item("reward", model.reward().to_pyarray(py))?;
+    fields.set_item("airspace", airspace(py, model)?)?;
+    Ok(fields)
+}
+
+/// The fields of Python's `Airspace`.
+fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
+    let sensor = model.file().sensor.clone().unwrap_or_default();
+    let fields = PyDict::new(py);
+    fields.set_item("radius", sensor.radius)?;
+    fields.set_item("n_rings", model.n_rings())?;
+    let pays = match sensor.pays {
+        Pays::Visited => "visited",
+        Pays::Seen => "seen",
+    };
+    fields.set_item("pays", pays)?;
+    let no_fly = model.file().no_fly.as_ref().map(CellMap::grid);
+    let no_fly = no_fly.map(|map| map.expect("invariant: a model's maps are checked"));
+    let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0).to_pyarray(py));
+    fields.set_item("no_fly", no_fly)?;
     Ok(fields)
 }
 

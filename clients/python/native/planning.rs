@@ -1,13 +1,15 @@
 //! Beam search in many worlds.
 
+use crate::airspace::Given;
 use crate::errors::{interrupted, raise_of_channel};
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_belief::planning::objective::CellValues;
 use emberwatch_belief::planning::{BeamSearch, PlanningProblem};
 use emberwatch_protocol::channels::ChannelError;
+use emberwatch_protocol::model::Pays;
 use emberwatch_protocol::path::{MAX_MOVES, path_to_bytes};
-use emberwatch_protocol::{Cell, Shape};
+use emberwatch_protocol::{Airspace, Cell, Grid};
 use numpy::ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -25,6 +27,7 @@ const LOOK: Duration = Duration::from_millis(20);
 /// A path for each world: `values` are finite, `[n, H, W]`, `robots` cells of the grid, `[n, 2]`; `keys`, `[n]`, break
 /// ties.
 #[pyfunction]
+#[pyo3(signature = (values, robots, keys, n_moves, width, airspace=None))]
 pub fn beam_search<'py>(
     py: Python<'py>,
     values: PyReadonlyArray3<'py, f32>,
@@ -32,10 +35,16 @@ pub fn beam_search<'py>(
     keys: PyReadonlyArray1<'py, u64>,
     n_moves: usize,
     width: usize,
+    airspace: Option<Given<'py>>,
 ) -> PyResult<Bound<'py, PyArray2<u8>>> {
     let (values, robots, keys) = (values.as_array(), robots.as_array(), keys.as_array());
     let (n_worlds, height, n_cols) = values.dim();
-    check(py, shape_of(py, height, n_cols)?, n_moves, width)?;
+    let shape = shape_of(py, height, n_cols)?;
+    let airspace = match airspace {
+        None => Airspace::open(shape),
+        Some(given) => given.on_grid(py, shape)?,
+    };
+    check(py, &airspace, n_moves, width)?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
     // More states than there are beginnings of paths are never kept.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
@@ -51,7 +60,7 @@ pub fn beam_search<'py>(
     let worlds = values.outer_iter().zip(robots.outer_iter()).zip(keys);
     for (((values, robot), &key), mut path) in worlds.zip(paths.outer_iter_mut()) {
         search.set_key(key);
-        let values = CellValues::new(values.to_owned(), 0.0);
+        let values = values_in(&airspace, values.to_owned());
         let start = Cell {
             row: robot[0] as usize,
             col: robot[1] as usize,
@@ -70,16 +79,30 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
+/// Values of the cells on the path, or of those in sight of it where these pay.
+fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
+    if airspace.pays() == Pays::Seen && airspace.radius() > 0 {
+        let nothing = CellValues::new(Grid::zeros(values.dim()), 0.0);
+        return nothing.within(airspace, Some(values));
+    }
+    CellValues::new(values, 0.0).within(airspace, None)
+}
+
 /// Refuses what takes more memory than there may be.
-fn check(py: Python<'_>, shape: Shape, n_moves: usize, width: usize) -> PyResult<()> {
+fn check(py: Python<'_>, airspace: &Airspace, n_moves: usize, width: usize) -> PyResult<()> {
     let within = |most: usize| format!("an integer within 1 to {most}");
     if !(1..=MAX_MOVES).contains(&n_moves) {
         return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
     }
-    let reach = |side: usize| side.min(2 * n_moves + 1);
-    let n_cells = reach(shape.height()) * reach(shape.width());
-    // Two sets of cells, and where the state after each move came from.
-    let state_bytes = n_cells.div_ceil(64) * 16 + n_moves * 8;
+    let (height, n_cols) = airspace.shape().dim();
+    let reach = |side: usize, radius: usize| side.min(2 * (n_moves + radius) + 1);
+    let set_bytes = |radius| (reach(height, radius) * reach(n_cols, radius)).div_ceil(64) * 8;
+    let sight_bytes = match airspace.pays() {
+        Pays::Visited => 0,
+        Pays::Seen => set_bytes(airspace.radius()),
+    };
+    // Sets of cells before and after a move, and where the state after each move came from.
+    let state_bytes = 2 * (set_bytes(0) + sight_bytes) + n_moves * 8;
     let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
     if !(1..=widest).contains(&width) {
         return Err(invalid(py, "width", within(widest), width));

@@ -12,12 +12,14 @@ Array = NDArray[np.float64]
 class Parameters(NamedTuple):
     """What a model file says."""
 
-    #: ``w[own, to, from, row, col]``; one kernel, or one by the cell's own state.
+    #: ``w[own, to, from, row, col]``; one kernel, or one by the cell's own state; as many by zone.
     kernels: Array
     bias: Array
-    #: ``P(observed value | state)``, a row for each state.
+    #: ``P(observed value | state)``, a row for each state, ring by ring.
     observed: Array
     initial: Array
+    #: The zone of each cell, if there are several.
+    zones: NDArray[np.uint8] | None
 
 
 def parameters(text: str) -> Parameters:
@@ -25,24 +27,34 @@ def parameters(text: str) -> Parameters:
     file: dict[str, Any] = tomllib.loads(text)
     states, entries = file["states"], file["kernel"]
     names = [state["name"] for state in states]
-    n_kernels = len(names) if any("own" in entry for entry in entries) else 1
+    zones = [zone["name"] for zone in file.get("zones", ())]
+    n_own = len(names) if any("own" in entry for entry in entries) else 1
+    n_kernels = n_own * max(1, len(zones))
     kernels = np.zeros((n_kernels, len(names), len(names), *file["kernel_size"]))
     for entry in entries:
         own = names.index(entry["own"]) if "own" in entry else 0
+        own += n_own * (zones.index(entry["zone"]) if zones else 0)
         weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
         kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
-    observed = np.array([state["observed_as"] for state in states], float)
+    rings = file.get("sensor", {}).get("rings", ())
+    matrices = [[state["observed_as"] for state in states], *(it["observed_as"] for it in rings)]
+    observed = [np.array(it, float) / np.sum(it, axis=1, keepdims=True) for it in matrices]
     initial = np.array([state["initial"] for state in states], float)
     return Parameters(
         kernels,
         np.array([state.get("bias", 0.0) for state in states]),
-        observed / observed.sum(axis=1, keepdims=True),
+        np.concatenate(observed, axis=1),
         initial / initial.sum(),
+        np.array(file["zone_map"], np.uint8) if zones else None,
     )
 
 
 def phi(model: Parameters, belief: Array) -> Array:
     """Eqs. 2-4; where the kernel is by the cell's own state, the mean over its belief."""
+    if model.zones is not None:
+        of_zones = np.split(model.kernels, int(model.zones.max()) + 1)
+        parts = [phi(model._replace(kernels=of, zones=None), belief) for of in of_zones]
+        return np.take_along_axis(np.stack(parts), model.zones[np.newaxis, np.newaxis], 0)[0]
     if len(model.kernels) == 1:
         return _phi_of(model.kernels[0], model.bias, belief)
     parts = (_phi_of(w, model.bias, belief, own) for own, w in enumerate(model.kernels))

@@ -21,7 +21,14 @@ from emberwatch import errors, wire
 from emberwatch.client import Client
 from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
-from emberwatch.replies import LeftBeliefInfo, ServerInfo, ServerStatus, WorldInfo, WorldStatus
+from emberwatch.replies import (
+    LeftBeliefInfo,
+    ServerInfo,
+    ServerStatus,
+    WorldInfo,
+    WorldStatus,
+    record,
+)
 
 LAYOUTS = document.layouts()
 #: What is in payloads: as bytes, as an array, as a tuple.
@@ -30,7 +37,9 @@ RESULTS = {
     "RobotResult": (wire.ROBOT, wire.ROBOT_DTYPE, wire.RobotResult),
 }
 EXAMPLES = document.examples()
-HELLO = next(message for message in EXAMPLES if message.get("reply") == "hello")
+HELLO, *HELLOS = (message for message in EXAMPLES if message.get("reply") == "hello")
+#: With all that land adds to it.
+LANDED = next(message for message in HELLOS if "airspace" in message)
 LEFT = next(message for message in EXAMPLES if message.get("reply") == "belief")
 
 #: Where the world stands in that example.
@@ -159,8 +168,8 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
         shown = " ".join("-" if cell == 255 else str(cell) for cell in cells)
         read.append((f"frame {robot} row {row}", shown))
     assert read == values
-    for record, result in zip(answer.results, (first, second), strict=True):
-        assert (tuple(record["world"]), tuple(record["robot"])) == (world, result)
+    for each, result in zip(answer.results, (first, second), strict=True):
+        assert (tuple(each["world"]), tuple(each["robot"])) == (world, result)
 
 
 def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnswer:
@@ -201,7 +210,8 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
 
     wired = Wired()
     lease = wired.lease
-    hello, *others = [message for message in EXAMPLES if "op" in message]
+    asked = [message for message in EXAMPLES if "op" in message]
+    others = [message for message in asked if message["op"] != "hello"]
     got = [
         sent(lambda: wired.client.acquire(0, 2, ttl=60), replies("lease")[0]),
         sent(lease.renew),
@@ -215,12 +225,13 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
         sent(lease.release),
         sent(wired.client.shutdown),
     ]
-    assert hello["op"] == "hello" and got == others
+    assert asked[0]["op"] == "hello" and got == others
 
 
 def test_the_documented_replies_become_records() -> None:
     wired = Wired()
     hello = dataclasses.asdict(wired.client.info)
+    assert hello.pop("zones") is None and hello.pop("airspace")["radius"] == 0
     assert HELLO | hello | {"observations": HELLO["observations"]} == HELLO | {
         "height": 3,
         "width": 5,
@@ -254,9 +265,50 @@ def test_unknown_keys_of_a_reply_are_ignored() -> None:
     assert Wired(colour="red").client.info.n_worlds == 1
 
 
+def test_the_documented_land_is_read() -> None:
+    info = record(ServerInfo, HELLO | LANDED)
+    air = info.airspace
+    assert (air.radius, air.n_rings, air.pays) == (2, 2, "visited")
+    assert air.no_fly is not None and air.no_fly.dtype == np.bool_
+    assert np.argwhere(air.no_fly).tolist() == [[0, 2]]
+    assert info.zones is not None and info.zones.map.dtype == np.uint8
+    assert (info.zones.names, info.zones.colors) == (("land", "water"), ("#b7a57a", "#6aa0c8"))
+    assert info.zones.map.tolist() == LANDED["zones"]["map"]
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("airspace", []),
+        ("airspace", {"radius": 9}),
+        ("airspace", {"radius": None}),
+        ("airspace", {"radius": 1.0}),
+        ("airspace", {"n_rings": 4}),
+        ("airspace", {"n_rings": 0}),
+        ("airspace", {"pays": "sold"}),
+        ("airspace", {"no_fly": [[0, 0, 2], [0, 0, 0]]}),
+        ("airspace", {"no_fly": [[0, 0, 1]]}),
+        ("airspace", {"no_fly": [[0, 0, 1], [0, 0]]}),
+        ("airspace", {"no_fly": [[0, 0, 0.5], [0, 0, 0]]}),
+        ("airspace", {"no_fly": "beside.npy"}),
+        ("zones", {"names": ["land"]}),
+        ("zones", {"names": None}),
+        ("zones", {"colors": ["#b7a57a", "blue"]}),
+        ("zones", {"map": [[0, 0, 0], [0, 1, 2]]}),
+        ("zones", {"map": [[0, 0, 0], [0, 1, -1]]}),
+        ("zones", {"map": [0, 0, 0]}),
+    ],
+    ids=str,
+)
+def test_land_that_no_grid_has_is_a_bad_answer(key: str, change: Any) -> None:
+    told = {**LANDED[key], **change} if change else change
+    with fails("bad_answer", "'airspace' and 'zones' of the grid"):
+        record(ServerInfo, HELLO | LANDED | {key: told})
+
+
 @pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus, LeftBeliefInfo])
 def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
-    messages = {ServerInfo: HELLO, ServerStatus: replies("status")[0]}
+    messages = {ServerInfo: HELLO | LANDED, ServerStatus: replies("status")[0]}
     messages |= {WorldInfo: replies("reset")[0]["worlds"][0]}
     messages |= {LeftBeliefInfo: LEFT}
     messages |= {WorldStatus: replies("status")[0]["worlds"][0]}

@@ -6,12 +6,22 @@ that made it: in a forked child, using it is an error with code `"forked"`.
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Literal, final
+from typing import Any, Literal, Protocol, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _Doubles = NDArray[np.float64]
+
+class _Airspace(Protocol):
+    """What counts of an `Airspace`."""
+
+    @property
+    def radius(self) -> int: ...
+    @property
+    def pays(self) -> str: ...
+    @property
+    def no_fly(self) -> NDArray[np.bool_] | None: ...
 
 def check_settings(flags: Sequence[str]) -> str:
     """What a server would run with, given these flags, as TOML."""
@@ -73,12 +83,18 @@ class Agent:
 class Flights:
     """The present path of each robot, as far as it is flown. Rows are robots.
 
-    With `reward`, each cell pays when it is first visited, what its hidden state pays. A copy or
-    pickle is as new.
+    With `reward`, each cell pays when it is first visited, or seen where that pays, what its hidden
+    state pays. A copy or pickle is as new.
     """
 
     def __init__(
-        self, n_rows: int, height: int, width: int, n_moves: int, reward: list[float] | None
+        self,
+        n_rows: int,
+        height: int,
+        width: int,
+        n_moves: int,
+        reward: list[float] | None,
+        airspace: _Airspace | None = None,
     ) -> None: ...
     @property
     def robots(self) -> NDArray[np.int64]:
@@ -95,6 +111,10 @@ class Flights:
     @property
     def paid(self) -> NDArray[np.float64]:
         """What the moves have been paid."""
+
+    @property
+    def masks(self) -> NDArray[np.bool_]:
+        """Whether each move takes a robot to another cell, `(n_rows, 4)`; all, where none does."""
 
     def begin(
         self,
@@ -179,6 +199,18 @@ class Recording:
 def read_model(text: str) -> dict[str, Any]:
     """The fields of `Model` but `toml`; raises `ValueError` for what is no model file."""
 
+def grid_of_maps(path: str) -> tuple[int, int] | None:
+    """Height and width of the maps of a model file; None if it has none, or is wrong."""
+
+def model_text(path: str) -> str:
+    """The text of a model file, with the maps that are in files beside it."""
+
+def model_with_radius(text: str, radius: int) -> str:
+    """The text of a model file with another sensor radius."""
+
+def description_with_radius(text: str, radius: int) -> str:
+    """The same of a description."""
+
 def read_description(text: str) -> dict[str, Any]:
     """The same of `Description`."""
 
@@ -204,6 +236,7 @@ def beam_search(
     keys: NDArray[np.uint64],
     n_moves: int,
     width: int,
+    airspace: _Airspace | None = None,
 ) -> NDArray[np.uint8]:
     """A path for each world: `(n, H, W)`, `(n, 2)` and `(n,)` give `(n, n_moves)`."""
 

@@ -35,7 +35,9 @@ class WildfireEnv(WorldEnv):
     ## Action Space
 
     `MultiDiscrete([4] * T)`: a path, move by move: 0 up (row - 1), 1 down (row + 1), 2 left
-    (column - 1), 3 right (column + 1). A move off the grid leaves the robot where it is.
+    (column - 1), 3 right (column + 1). A move off the grid or into a no-fly cell of the model file
+    leaves the robot where it is. There is no `action_masks`, as MaskablePPO asks for: where a move
+    leads depends on those before it. `WildfireMovesEnv` has one.
 
     ## Observation Space
 
@@ -52,17 +54,19 @@ class WildfireEnv(WorldEnv):
     | `team` | `Box(0, 255, (H, W, 1), uint8)` | `frame`, of what all robots of the world saw |
     | `others` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells where other robots are |
 
-    The last channel of `image` stands for nothing observed. `belief` is about what the next path
+    The last channel of `image` stands for nothing observed. With a `sensor_radius` of r, or a
+    sensor in the model file, cells up to r rows and columns from the path are seen, too; O counts
+    the observations once for each of the sensor's matrices. `belief` is about what the next path
     will meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far;
     it begins as `wrappers.BeliefObservation` does.
 
     ## Rewards
 
-    The number of distinct cells visited that burn after the world moved (in general the sum of
-    the model's rewards). The start cell counts only if it is flown over again. In a world of
-    several robots `reward` chooses: `"share"` (the default), where a cell that v robots visited
-    pays 1 / v to each; `"team"`, the reward of all robots together; or `"marginal"`, what that
-    would lack without this robot.
+    The number of distinct cells visited that burn after the world moved (in general the sum of the
+    model's rewards; of the cells seen, where the model file's sensor says so). The start cell
+    counts only if it is flown over again. In a world of several robots `reward` chooses: `"share"`
+    (the default), where a cell that v robots visited pays 1 / v to each; `"team"`, the reward of
+    all robots together; or `"marginal"`, what that would lack without this robot.
 
     ## One Robot of a Team
 
@@ -104,17 +108,18 @@ class WildfireEnv(WorldEnv):
     * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
     * `reward`: `"share"`, `"team"` or `"marginal"`.
     * `takeover`: take the world from its holder (False).
-    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"terrain"`, `"road-ice"`,
-      `"team"`, `"jacksboro"` or the path of a task file (`docs/environments/index.md`), which decides all
-      keywords from `model` to `states_offset`, `robots` and the length of episodes: none of them
-      may stand beside it. With `instance`: the name of the running server's.
+    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"terrain"`,
+      `"road-ice"`, `"team"`, `"jacksboro"` or the path of a task file
+      (`docs/environments/index.md`), which decides all keywords from `model` to `states_offset`,
+      `robots` and the length of episodes: none of them may stand beside it. With `instance`: the
+      name of the running server's.
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
       `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells), `"wildfire-burnout"` (what has
       burnt doesn't burn again until it has regrown), `"wildfire-terrain"` (the same on real land),
       `"road-ice"` or the path of a model file;
-      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
-      (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
-      they may be left out, or must agree.
+      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (0 to 8; None:
+      as the model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the
+      private server. With `instance` they may be left out, or must agree.
     * `states`: recorded states in the place of a model (a `.npz` or `.npy` file or a folder, see
       `docs/recorded-worlds.md`, or `"jacksboro"`), which decide `height`, `width` and `burn_in`;
       `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.

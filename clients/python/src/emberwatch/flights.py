@@ -8,9 +8,11 @@ from emberwatch.settings import WorldSpec
 def flights_of(spec: WorldSpec, n_rows: int, *, pays: bool) -> Flights:
     """The present path of each robot, as far as it is flown.
 
-    `pays`: each cell pays when it is first visited, what its hidden state pays.
+    `pays`: each cell pays when it is first visited, or seen where that pays, what its hidden state
+    pays.
     """
     if pays and spec.described is None:
         raise InvalidArgumentError("reward='move': expected a server that reveals its model")
     reward = spec.described.reward.tolist() if pays and spec.described else None
-    return Flights(n_rows, spec.height, spec.width, spec.n_moves, reward)
+    grid = spec.height, spec.width
+    return Flights(n_rows, *grid, spec.n_moves, reward, spec.airspace)

@@ -9,15 +9,15 @@ from dataclasses import dataclass, fields
 from importlib import resources
 from importlib.resources.abc import Traversable
 from os import PathLike, fspath
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import _native
-from emberwatch.arguments import check_settings
-from emberwatch.errors import invalid
+from emberwatch.airspace import MAX_RADIUS, Airspace, Zones
+from emberwatch.arguments import as_count, check_settings
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.paths import utf8
 
 Color = tuple[int, int, int]
@@ -31,8 +31,9 @@ MAX_VALUES = 64
 class Description:
     """What is known of states and observations: of recorded worlds, that is all.
 
-    S is the number of states, O that of observations. Two descriptions are equal if all they say
-    is, whatever their files look like.
+    S is the number of states, O that of observations: those that the file names, once for each
+    observation matrix of the sensor. Two descriptions are equal if all they say is, whatever their
+    files look like.
     """
 
     name: str
@@ -42,13 +43,16 @@ class Description:
     state_colors: tuple[Color, ...]
     """By state."""
     observation_names: tuple[str, ...]
-    """By observed value."""
+    """By observed value; those of rings around the path end in the ring, as in `fire ring 1`."""
     observation_colors: tuple[Color, ...]
     """By observed value."""
     observation_matrix: NDArray[np.float64]
-    """``O[state, observed value]``, each row a distribution, shape (S, O)."""
+    """``O[state, observed value]``, each row a distribution for each of the `n_rings` matrices,
+    shape (S, O)."""
     reward: NDArray[np.float64]
-    """What a step pays for each distinct visited cell by its state, shape (S,)."""
+    """What a step pays for each distinct cell that pays by its state, shape (S,)."""
+    airspace: Airspace
+    """Where robots may fly and what they see."""
     toml: str
     """Text of the file, for other programs."""
 
@@ -56,10 +60,39 @@ class Description:
     def from_toml(cls, text: str) -> Self:
         """Reads the text of a file that a server has accepted."""
         try:
-            return cls(**cls._read(text), toml=text)
+            values = cls._read(text)
+            values["airspace"] = Airspace(**values["airspace"])
+            return cls(**values, toml=text)
         except (TypeError, ValueError) as error:
             expected = "a file that `emberwatch-server --check` accepts"
             raise invalid(cls.__name__.lower(), expected, error) from None
+
+    def with_radius(self, radius: int) -> Self:
+        """The same with a sensor that sees so many rows and columns beyond each cell of a path."""
+        radius = as_count(radius, "radius", 0, MAX_RADIUS)
+        if radius == self.airspace.radius:
+            return self
+        return self.from_toml(self._with_radius(self.toml, radius))
+
+    @property
+    def sensor_radius(self) -> int:
+        """Rows and columns that robots see beyond each cell of their path."""
+        return self.airspace.radius
+
+    @property
+    def n_rings(self) -> int:
+        """Observation matrices: of the path, then of each ring around it."""
+        return self.airspace.n_rings
+
+    @property
+    def pays(self) -> str:
+        """Which distinct cells pay: `"visited"`, or `"seen"`."""
+        return self.airspace.pays
+
+    @property
+    def no_fly(self) -> NDArray[np.bool_] | None:
+        """Where no robot may be, shape (H, W); None: nowhere."""
+        return self.airspace.no_fly
 
     @property
     def n_states(self) -> int:
@@ -89,6 +122,10 @@ class Description:
         """All fields but the text."""
         return _native.read_description(text)
 
+    @staticmethod
+    def _with_radius(text: str, radius: int) -> str:
+        return _native.description_with_radius(text, radius)
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Model(Description):
@@ -100,24 +137,44 @@ class Model(Description):
     kernels: NDArray[np.float64]
     """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
     downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
-    is in, shape (S, S, S, KH, KW)."""
+    is in, shape (S, S, S, KH, KW). Where there are zones, as many for each, zone by zone: shape
+    (n_zones, ...) or (n_zones * S, ...)."""
     bias: NDArray[np.float64]
     """``b``, added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
     """Distribution of a cell at the start of the burn-in, shape (S,)."""
+    zone_names: tuple[str, ...]
+    """Of the zones of land; empty where all cells are alike."""
+    zone_colors: tuple[Color, ...]
+    """By zone."""
+    zone_map: NDArray[np.uint8] | None
+    """The zone of each cell, shape (H, W); None where all cells are alike."""
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
         """The built-in model of a name, or that of a file, which the server checks first."""
         utf8("model", name)
-        check_settings([f"--model={fspath(name)}"])
+        flags = [f"--model={fspath(name)}"]
+        try:
+            check_settings(flags)
+        except InvalidArgumentError:
+            grid = _native.grid_of_maps(fspath(name))
+            if grid is None:
+                raise
+            check_settings([*flags, f"--height={grid[0]}", f"--width={grid[1]}"])
         return cls.checked(name)
 
     @classmethod
     def checked(cls, name: str | PathLike[str]) -> Self:
         """The same of a name or file that the server has accepted already."""
-        source = built_in("models").get(fspath(name), Path(name))
-        return cls.from_toml(source.read_text("utf-8"))
+        source = built_in("models").get(fspath(name))
+        if source is not None:
+            return cls.from_toml(source.read_text("utf-8"))
+        try:
+            text = _native.model_text(fspath(name))
+        except ValueError as error:  # it has changed since
+            raise InvalidArgumentError(f"model: {error}") from None
+        return cls.from_toml(text)
 
     @classmethod
     def wildfire(cls) -> Self:
@@ -125,18 +182,30 @@ class Model(Description):
         return cls.checked("wildfire")
 
     @property
+    def zones(self) -> Zones | None:
+        """The zones of land; None where all cells are alike."""
+        if self.zone_map is None:
+            return None
+        colors = tuple("#{:02x}{:02x}{:02x}".format(*color) for color in self.zone_colors)
+        return Zones(names=self.zone_names, colors=colors, map=self.zone_map)
+
+    @property
     def kernel(self) -> NDArray[np.float64]:
-        """The first of the kernels: that of all cells, unless `sees_own_state`."""
+        """The first: that of all cells, unless there are zones or it `sees_own_state`."""
         return self.kernels[0]
 
     @property
     def sees_own_state(self) -> bool:
         """Whether a cell's weights depend on the state that it is in itself."""
-        return len(self.kernels) > 1
+        return len(self.kernels) > max(1, len(self.zone_names))
 
     @staticmethod
     def _read(text: str) -> dict[str, Any]:
         return _native.read_model(text)
+
+    @staticmethod
+    def _with_radius(text: str, radius: int) -> str:
+        return _native.model_with_radius(text, radius)
 
 
 def built_in(kind: str) -> dict[str, Traversable]:

@@ -16,7 +16,7 @@ from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.flights import flights_of
 from emberwatch.moves import fly
 from emberwatch.observations import WINDOW, MovesParts, Observations
-from emberwatch.session import Session
+from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.wire import StepAnswer
@@ -34,7 +34,8 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Action Space
 
-    `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. A move off the grid leaves the robot in place.
+    `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. A move off the grid or into a no-fly cell leaves
+    the robot in place; `action_masks` tells which do not, as MaskablePPO of sb3-contrib asks.
 
     ## Observation Space
 
@@ -48,11 +49,12 @@ class WildfireMovesEnv(WorldEnv):
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
     | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | what frames alone told of the same cells |
 
-    The channels of `local`, times 255: the probability of the state that pays most, and the
-    entropy of the belief divided by log S, both 0 where this path has been; 1 where it has been;
-    1 off the grid; and the share of the path's moves that are left, everywhere alike. `recent`
-    needs no model: its first channels are the value last observed in a cell, one of O channels,
-    1 if seen in the last frame and half of it for each 16 steps since; the last three are the same.
+    The channels of `local`, times 255: the probability of the state that pays most, and the entropy
+    of the belief divided by log S, both 0 where this path has been (and what it has seen, where
+    that pays); 1 where it has been; 1 off the grid and in no-fly cells; and the share of the path's
+    moves that are left, everywhere alike. `recent` needs no model: its first channels are the value
+    last observed in a cell, one of O channels, 1 if seen in the last frame and half of it for each
+    16 steps since; the last three are the same.
 
     ## Rewards
 
@@ -60,12 +62,12 @@ class WildfireMovesEnv(WorldEnv):
     last move, and 0 before: what a cell pays is only decided when the world moves, after the
     flight. The three differ in worlds of several robots, as for `WildfireEnv`.
 
-    With `reward="move"` each cell pays when it is first visited, what its hidden state pays
-    before the world moves; the last move also brings the difference to the robot's share of the
-    path's true reward, which is small for a lone robot, as one step changes few cells. So both sum
-    to the same over each path, but the second says more about the hidden state, and earlier:
-    results with the two are not comparable. The environment needs the `truth` channel for it: a
-    private server publishes it, a running one must.
+    With `reward="move"` each cell pays when it is first visited, what its hidden state pays before
+    the world moves (or seen, where that pays); the last move also brings the difference to the
+    robot's share of the path's true reward, which is small for a lone robot, as one step changes
+    few cells. So both sum to the same over each path, but the second says more about the hidden
+    state, and earlier: results with the two are not comparable. The environment needs the `truth`
+    channel for it: a private server publishes it, a running one must.
 
     ## Episode End
 
@@ -138,6 +140,12 @@ class WildfireMovesEnv(WorldEnv):
         outcome = self._complete(move) if completes else self._move(move)
         self._session.finish()
         return outcome
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which moves take the robot to another cell, `(4,)`; all, where none does."""
+        if not self.is_open:
+            raise not_reset()
+        return self._flights.masks[0]
 
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """A move that does not complete its path."""
@@ -222,6 +230,12 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which moves take each robot to another cell, `(num_envs, 4)`; all, where none does."""
+        if not self.is_open:
+            raise not_reset()
+        return self._flights.masks
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         return as_choices(actions, self.num_envs, wire.N_MOVES)

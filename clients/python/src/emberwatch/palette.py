@@ -46,17 +46,20 @@ class Palette:
     """Of a path over observed cells: dark or light, whichever is further from all of them."""
 
     @classmethod
-    def of(cls, source: Description | int, *, on_paper: bool = False) -> Self:
+    def of(cls, source: Description | int, *, on_paper: bool = False, n_rings: int = 1) -> Self:
         """The described colours, or of a number of observations eight colours in turn.
 
-        `on_paper` makes what was not observed light if it can be, as the page around it.
+        `on_paper` makes what was not observed light if it can be, as the page around it. The
+        observations of a sensor's outer rings have the colours of the first `1 / n_rings` of all.
         """
         if isinstance(source, Description):
-            states, observations = source.state_colors, source.observation_colors
+            states, n_observations = source.state_colors, source.n_observations
+            colors = source.observation_colors
         else:
             # However many there may be.
             states = tuple(map(color_from_hex, islice(cycle(_COLORS), MAX_VALUES)))
-            observations = states[:source]
+            n_observations, colors = source, states
+        observations = (colors[: n_observations // n_rings] * n_rings)[:n_observations]
         return cls(
             states=states,
             observations=observations,
@@ -78,13 +81,21 @@ def mark_on(*colors: Color) -> Color:
 
     Contrast ratios and luminances are those of the Web Content Accessibility Guidelines 2.1.
     """
-    lights = [_luminance(color) for color in colors]
-    return DARK if min(lights) * max(lights) > _luminance(DARK) * _luminance(LIGHT) else LIGHT
+    lights = _luminances(np.array(colors))
+    return DARK if lights.min() * lights.max() > _MIDDLE else LIGHT
 
 
-def _luminance(color: Color) -> float:
-    red, green, blue = ((channel / 255.0) ** 2.2 for channel in color)
-    return 0.05 + 0.2126 * red + 0.7152 * green + 0.0722 * blue
+def mark_on_each(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """`mark_on` of each of many colours, shape (n, 3)."""
+    is_light = _luminances(colors) ** 2 > _MIDDLE
+    return np.where(is_light[:, None], DARK, LIGHT).astype(np.uint8)
+
+
+def _luminances(colors: NDArray[np.integer]) -> NDArray[np.float64]:
+    return 0.05 + (colors / 255.0) ** 2.2 @ np.array([0.2126, 0.7152, 0.0722])
+
+
+_MIDDLE = _luminances(np.array([DARK, LIGHT])).prod()
 
 
 def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.uint8]:

@@ -136,6 +136,15 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             self._infos(infos),
         )
 
+    def action_masks(self) -> dict[str, NDArray[np.bool_]]:
+        """Which moves take each robot to another cell, `(4,)`; all, where none does.
+
+        Of moves only: where a move of a path leads depends on those before it.
+        """
+        if not isinstance(self._worlds, WildfireMovesVectorEnv):
+            raise invalid("action_masks", "an environment of action='move'", "'path'")
+        return dict(zip(self.possible_agents, self._worlds.action_masks(), strict=True))
+
     def state(self) -> NDArray[np.uint8]:
         """What the team saw in the last step, and where the robots are; not the hidden states.
 

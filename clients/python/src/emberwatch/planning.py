@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import _native
+from emberwatch.airspace import Airspace
 from emberwatch.arguments import as_count
 from emberwatch.errors import invalid
 
@@ -18,6 +19,7 @@ def beam_search(
     rng: np.random.Generator,
     visited: NDArray[np.generic] | None = None,
     width: int = 50,
+    airspace: Airspace | None = None,
 ) -> NDArray[np.uint8]:
     """Paths whose distinct cells are worth most together, as far as a beam of this width finds.
 
@@ -29,6 +31,8 @@ def beam_search(
         visited: Cells that are worth nothing any more, where not 0, `(n, H, W)`.
         width: Paths kept after each move, 1 to 65,536, fewer where they need over 4 GiB; of those
             that end in one cell and have visited the same cells, one.
+        airspace: Where the robots may fly, such as `env.world_spec.airspace`; None: everywhere. If
+            it pays what is seen, each cell counts that is in sight of the path.
 
     Returns:
         The moves, `(n, n_moves)`: 0 up, 1 down, 2 left, 3 right.
@@ -37,6 +41,8 @@ def beam_search(
     n_moves = as_count(n_moves, "n_moves", 1, 4096)
     width = as_count(width, "width", 1, 65536)
     _check(given, cells, visited)
+    if airspace is not None and airspace.no_fly is not None:
+        _check_free(airspace.no_fly, cells, given.shape[1:])
     with np.errstate(over="ignore"):
         worth = given.astype(np.float32)
     if not np.isfinite(worth).all():
@@ -44,7 +50,7 @@ def beam_search(
     if visited is not None:
         worth[np.asarray(visited) != 0] = 0.0
     keys = rng.integers(2**64, size=len(worth), dtype=np.uint64)
-    return _native.beam_search(worth, cells.astype(np.int64), keys, n_moves, width)
+    return _native.beam_search(worth, cells.astype(np.int64), keys, n_moves, width, airspace)
 
 
 def _check(
@@ -61,3 +67,12 @@ def _check(
         raise invalid("robots", f"cells of a {values.shape[1]} x {values.shape[2]} grid", "others")
     if visited is not None and np.shape(visited) != values.shape:
         raise invalid("visited", f"shape {values.shape}", np.shape(visited))
+
+
+def _check_free(
+    no_fly: NDArray[np.bool_], robots: NDArray[np.integer], shape: tuple[int, ...]
+) -> None:
+    if no_fly.shape != shape:
+        raise invalid("airspace: no_fly", f"shape {shape}", no_fly.shape)
+    if no_fly[robots[:, 0], robots[:, 1]].any():
+        raise invalid("robots", "cells where they may fly", "others")

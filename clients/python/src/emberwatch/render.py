@@ -23,6 +23,7 @@ from emberwatch.errors import invalid
 from emberwatch.model import Color
 from emberwatch.palette import DARK, LIGHT, ROBOTS, mark_on
 from emberwatch.palette import Palette as Palette
+from emberwatch.scenery import Scenery
 from emberwatch.wire import UNOBSERVED
 
 _EDGE = (0xB4, 0xB4, 0xB4)
@@ -33,6 +34,7 @@ _LEAST_RIM_SCALE = 12  # the same with a rim around the line
 _TINT = 0.45  # share of white in visited cells too small for a line
 _LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # pixels of the robot's mark
 _MOST_WIDE_ROWS = 32  # rows that fit a terminal at one line each
+_NOTHING = Scenery()
 _SYMBOLS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz+/"
 
 _LOG = logging.getLogger(__name__)
@@ -51,6 +53,7 @@ class Picture:
         palette: Palette,
         paths: Sequence[Cells] = (),
         truth: NDArray[np.uint8] | None = None,
+        scenery: Scenery = _NOTHING,
     ) -> None:
         """Takes what is known of a world.
 
@@ -60,12 +63,14 @@ class Picture:
             palette: The colours.
             paths: Visited cells in order, of each robot that flew.
             truth: Hidden states, shape (H, W).
+            scenery: What lies on its grid.
         """
         if frame.ndim != 2 or not frame.size:
             raise invalid("frame", "shape (H, W)", frame.shape)
         if truth is not None and truth.shape != frame.shape:
             raise invalid("truth", f"shape {frame.shape}", truth.shape)
         self.frame, self.robots, self.palette, self.truth = frame, robots, palette, truth
+        self.scenery = scenery
         self.paths = [np.asarray(path, dtype=np.intp).reshape(-1, 2) for path in paths]
         for what, places in (("robot", _cells(robots)), *(("path", path) for path in self.paths)):
             off = ((places < 0) | (places >= frame.shape)).any(axis=1)
@@ -78,6 +83,11 @@ class Picture:
                 at = int(np.argmax(jumps))
                 got = [tuple(cell) for cell in path[at : at + 2].tolist()]
                 raise invalid("path", "neighbours one after the other", got)
+
+    def painted(self) -> NDArray[np.uint8]:
+        """The colour of each cell of the frame, shape (H, W, 3)."""
+        colors = self.palette.paint_frame(self.frame)
+        return self.scenery.tint(colors, self.frame, self.palette.unobserved)
 
     def color_of(self, robot: int) -> Color | None:
         """The colour of a robot of a team; None if it is alone."""
@@ -102,17 +112,20 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
         raise invalid("scale", "at least 1 pixel", scale)
-    colors = palette.paint_frame(picture.frame)
+    colors = picture.painted()
     if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]
+        picture.scenery.draw(panels[0], picture.frame, scale)
     else:
         seen = (picture.frame != UNOBSERVED)[:, :, None]
         line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
         panels = [_enlarge(colors, scale)]
+        picture.scenery.draw(panels[0], picture.frame, scale)
         for robot, path in enumerate(picture.paths):
             _draw_path(panels[0], path, line, picture.color_of(robot), scale)
     if picture.truth is not None:
         panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
+        picture.scenery.draw(panels[1], picture.truth, scale)
     for panel in panels:
         for robot, cell in enumerate(picture.robots):
             _draw_robot(panel, cell, picture.color_of(robot), scale)
@@ -124,18 +137,23 @@ def ansi(picture: Picture, *, color: bool = True) -> str:
 
     In colour (24 bits), a cell is two characters, or on grids of more than 32 rows half of one,
     which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
-    or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path or a space.
+    or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path, ``x`` for a
+    no-fly cell or a space.
     """
     palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
-    grids = [(picture.frame, palette.paint_frame(picture.frame), cells)]
+    grids = [(picture.frame, picture.painted(), cells)]
     if picture.truth is not None:
         grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
     if not color:
-        panels = [_ascii_lines(values, _marks(values, at, robots)) for values, _, at in grids]
+        panels = [_ascii_lines(values, _marks(picture, at, robots)) for values, _, at in grids]
     elif len(picture.frame) <= _MOST_WIDE_ROWS:
-        panels = [_wide_lines(colors, _marks(values, at, robots)) for values, colors, at in grids]
+        panels = [_wide_lines(colors, _marks(picture, at, robots)) for _, colors, at in grids]
     else:
-        panels = [_half_lines(_tinted(colors, at), robots) for _, colors, at in grids]
+        panels = list[Iterator[str]]()
+        for values, colors, at in grids:
+            colors = _tinted(colors, at)
+            picture.scenery.draw(colors, values, 1)
+            panels.append(_half_lines(colors, robots))
     return "\n".join("  ".join(lines).rstrip(" ") for lines in zip(*panels, strict=True))
 
 
@@ -279,10 +297,10 @@ def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
     return np.pad(image, ((0, height & 1), (0, width & 1), (0, 0)), mode="edge")
 
 
-def _marks(
-    values: NDArray[np.uint8], cells: NDArray[np.intp], robots: NDArray[np.intp]
-) -> NDArray[np.str_]:
-    marks = np.full(values.shape, " ")
+def _marks(picture: Picture, cells: NDArray[np.intp], robots: NDArray[np.intp]) -> NDArray[np.str_]:
+    marks = np.full(picture.frame.shape, " ")
+    if picture.scenery.no_fly is not None:
+        marks[picture.scenery.no_fly] = "x"
     marks[tuple(cells.T)] = "*"
     marks[tuple(robots.T)] = "@"
     return marks
@@ -297,7 +315,7 @@ def _ascii_lines(values: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator
 
 def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
     """Lines of cells two characters wide, on the cell's colour."""
-    wide = {" ": "  ", "*": "··", "@": "()"}
+    wide = {" ": "  ", "*": "··", "@": "()", "x": "xx"}
     for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
         cells: list[tuple[str, str]] = []
         for (red, green, blue), mark in zip(line, line_marks, strict=True):

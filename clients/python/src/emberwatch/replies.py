@@ -5,8 +5,13 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
-from emberwatch.errors import bad_answer
-from emberwatch.model import Description
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.airspace import Airspace, Zones
+from emberwatch.arguments import told
+from emberwatch.errors import bad_answer, invalid
+from emberwatch.model import Description, color_from_hex
 from emberwatch.wire import Shape
 
 _Record = TypeVar("_Record")
@@ -56,6 +61,10 @@ class ServerInfo:
     recorded_world: RecordedWorld | None = None
     #: That of the number `pid`.
     pid_namespace: int | None = None
+    #: Where robots may fly and what they see.
+    airspace: Airspace = Airspace()  # noqa: RUF009
+    #: Zones of land; None where all cells are alike, or learners are not told.
+    zones: Zones | None = None
 
     @property
     def recorded_states(self) -> Description | None:
@@ -201,6 +210,8 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
+        if name in ("airspace", "zones"):
+            continue
         if name in ("pid_namespace", "task") and name not in given:
             continue
         if name == "recorded_world":  # it may be missing, too
@@ -213,7 +224,42 @@ def record(kind: type[_Record], keys: Any) -> _Record:
         if not isinstance(value, types):
             raise bad_answer("reply", f"another {name!r}", repr(value))
         values[name] = value
+    if kind is ServerInfo:
+        values |= _land(given, (values["height"], values["width"]))
     return kind(**values)
+
+
+def _land(given: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Airspace | Zones]:
+    """What the answer to `hello` says of airspace and zones; both may be missing."""
+    land: dict[str, Airspace | Zones] = {}
+    airspace, zones = given.get("airspace"), given.get("zones")
+    try:
+        if airspace is not None:
+            kept = {name: airspace[name] for name in ("radius", "n_rings", "pays")}
+            rows = airspace.get("no_fly")
+            no_fly = None if rows is None else _cells("no_fly", rows, shape, 2) != 0
+            land["airspace"] = Airspace(**kept, no_fly=no_fly)
+        if zones is not None:
+            names, colors = (tuple(map(str, zones[name])) for name in ("names", "colors"))
+            if len(names) != len(tuple(map(color_from_hex, colors))):
+                raise invalid("colors", len(names), len(colors))
+            cells = _cells("map", zones["map"], shape, len(names))
+            land["zones"] = Zones(names=names, colors=colors, map=cells)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise bad_answer("reply", "'airspace' and 'zones' of the grid", error) from None
+    return land
+
+
+def _cells(what: str, rows: Any, shape: tuple[int, int], n_values: int) -> NDArray[np.uint8]:
+    """A map of the grid from its rows, which have numbers below `n_values`."""
+    try:
+        cells = np.array(rows)
+    except ValueError:  # rows differ in length
+        cells = np.empty(0)
+    is_map = cells.shape == shape and cells.dtype.kind == "i"
+    if not is_map or ((cells < 0) | (cells >= n_values)).any():
+        raise invalid(what, f"integers below {n_values} of shape {shape}", told(rows))
+    return cells.astype(np.uint8)
 
 
 def _as_tuples(value: Any) -> Any:

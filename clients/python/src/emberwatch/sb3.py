@@ -93,9 +93,10 @@ class WildfireVecEnv(VecEnv):
         if method_name == "render":
             pictures = self.get_images()
             return [pictures[index] for index in self._get_indices(indices)]
-        raise invalid(
-            "env_method", "'render' alone, as the worlds share one environment", repr(method_name)
-        )
+        if method_name == "action_masks":
+            return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
+        expected = "'render' or 'action_masks', as the worlds share one environment"
+        raise invalid("env_method", expected, repr(method_name))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -11,6 +11,7 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
+from emberwatch.airspace import Airspace, Zones
 from emberwatch.arguments import check_settings
 from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
@@ -48,6 +49,7 @@ class WorldArguments(TypedDict, total=False):
     width: int | None
     n_moves: int | None
     burn_in: int | None
+    sensor_radius: int | None
     start: str | None
     truth: bool
     timeout: float
@@ -73,6 +75,7 @@ class Settings:
     width: int | None = None
     n_moves: int | None = None
     burn_in: int | None = None
+    sensor_radius: int | None = None
     start: str | None = None
     truth: bool = False
     timeout: float = STEP_TIMEOUT
@@ -141,6 +144,7 @@ class Settings:
             "width": self.width,
             "moves": self.n_moves,
             "burn-in": self.burn_in,
+            "sensor-radius": self.sensor_radius,
             "start": self.start,
             "publish-truth": str(self.truth).lower(),
             # Refused where there is no states file.
@@ -179,6 +183,10 @@ class WorldSpec:
     n_moves: int
     n_observations: int
     burn_in: int
+    #: Where robots may fly and what they see.
+    airspace: Airspace
+    #: Which land each cell is; None where all are alike, or learners are not told.
+    zones: Zones | None
     #: Robots of a world.
     n_robots: int
     #: Whether hidden states come from a states file, not from a model.
@@ -220,6 +228,8 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         described = _description(local(checked["states"]))
     else:
         described = Model.checked(local(checked["model"]))
+    if checked["sensor_radius"] >= 0:
+        described = described.with_radius(checked["sensor_radius"])
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
@@ -227,6 +237,8 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_moves=checked["moves"],
         n_observations=described.n_observations,
         burn_in=checked["burn_in"],
+        airspace=described.airspace,
+        zones=described.zones if isinstance(described, Model) else None,
         n_robots=checked["robots"],
         is_recorded=bool(checked["states"]),
         description=described if checked["states"] else None,
@@ -248,9 +260,10 @@ def running_spec(
         _check_task(settings.task, info)
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
-    for name in ("height", "width", "n_moves", "burn_in", "robots"):
+    known = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
+    known |= {"robots": info.n_robots, "sensor_radius": info.airspace.radius}
+    for name, has in known.items():
         asked = getattr(settings, name)
-        has = getattr(info, "n_robots" if name == "robots" else name)
         if asked not in (None, has):
             raise invalid(name, f"{has}, as the server has, or None", asked)
     robots = _robots(settings, n_rows, info.n_robots)
@@ -260,16 +273,23 @@ def running_spec(
     if settings.truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
     model = None if info.model is None else Model.from_toml(info.model)
+    if settings.model is not None:
+        model = Model.named(settings.model).with_radius(info.airspace.radius)
+    description = info.recorded_states
+    if description is not None:
+        description = description.with_radius(info.airspace.radius)
     spec = WorldSpec(
-        model=model if settings.model is None else Model.named(settings.model),
+        model=model,
         height=info.height,
         width=info.width,
         n_moves=info.n_moves,
         n_observations=info.n_observations,
         burn_in=info.burn_in,
+        airspace=info.airspace,
+        zones=info.zones,
         n_robots=info.n_robots,
         is_recorded=info.recorded_world is not None,
-        description=info.recorded_states,
+        description=description,
     )
     return spec, robots
 

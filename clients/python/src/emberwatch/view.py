@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
+from emberwatch.scenery import Scenery
 from emberwatch.settings import WorldSpec
 
 #: The render modes of every environment here.
@@ -26,7 +27,9 @@ class View:
                 "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
             )
         self.mode: Final = render_mode
-        self._palette = Palette.of(spec.described or spec.n_observations)
+        source, n_rings = spec.described or spec.n_observations, spec.airspace.n_rings
+        self._scenery: Final = Scenery.of(spec.airspace, spec.zones)
+        self._palette: Final = Palette.of(source, n_rings=n_rings)
         self._screen: Screen | None = None
 
     def draw(
@@ -37,7 +40,7 @@ class View:
         truth: NDArray[np.uint8] | None,
     ) -> Any:
         """An image, a text, or `None` after showing it to a human, as the mode has it."""
-        picture = Picture(frame, robots, self._palette, paths, truth)
+        picture = Picture(frame, robots, self._palette, paths, truth, self._scenery)
         if self.mode == "rgb_array":
             return rgb_array(picture)
         if self.mode == "ansi":

@@ -31,7 +31,11 @@ class Windows:
         self._maps = np.zeros((n_rows, height, width, n_channels), np.uint8)
         self._maps[..., _OFF] = 255
         self._inside = self._maps[:, margin : margin + spec.height, margin : margin + spec.width]
-        self._inside[..., _OFF] = 0
+        no_fly = spec.airspace.no_fly
+        self._inside[..., _OFF] = 0 if no_fly is None else 255 * no_fly.astype(np.uint8)
+        reach = spec.airspace.radius if spec.airspace.pays == "seen" else 0
+        #: Rows and columns from a robot to the cells that its visit has pay.
+        self._near = np.arange(-reach, reach + 1)
         # By row and robot's cell: rows of a window, each contiguous in the maps.
         step, row, col, _ = self._maps.strides
         self._cut = as_strided(
@@ -50,8 +54,12 @@ class Windows:
     def visit(
         self, indices: NDArray[np.intp], rows: NDArray[np.int64], cols: NDArray[np.int64]
     ) -> None:
-        """Nothing is left to be found where a path has been."""
-        self._inside[indices, rows, cols, :_VISITED] = 0
+        """Nothing is left to be found where a path has been, or has seen where that pays."""
+        near_rows = (rows[:, np.newaxis] + self._near).clip(0, self._spec.height - 1)
+        near_cols = (cols[:, np.newaxis] + self._near).clip(0, self._spec.width - 1)
+        all_rows = indices[:, np.newaxis, np.newaxis]
+        found = all_rows, near_rows[:, :, np.newaxis], near_cols[:, np.newaxis]
+        self._inside[*found, :_VISITED] = 0
         self._inside[indices, rows, cols, _VISITED] = 255
 
     def around(self, flights: Flights) -> NDArray[np.uint8]:

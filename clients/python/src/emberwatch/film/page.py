@@ -16,6 +16,7 @@ from emberwatch.model import Color, Model
 from emberwatch.palette import DARK, LIGHT, ROBOTS, Palette
 from emberwatch.render import LEAST_LINE_SCALE, Picture, rgb_array
 from emberwatch.replies import ServerInfo
+from emberwatch.scenery import MOST_ZONES, Scenery
 
 _MARGIN, _GAP, _LINE, _SWATCH = 14, 16, 20, 11  # pixels
 _TOP = 68  # of the panels, below step and titles
@@ -31,7 +32,7 @@ _FINE = 4  # texts are drawn this many times larger, then reduced
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13 * _FINE))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(16 * _FINE))
 
-_Mark = Color | Literal["robot", "scale"]
+_Mark = Color | Literal["robot", "scale", "no-fly", "words"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,10 +64,13 @@ class Page:
         self._scale = scale or min(max(_LONG_SIDE // max(height, width), 1), _MOST_SCALE)
         self._grid = height * self._scale, width * self._scale
         self._room = max(_LEAST_ROOM, self._grid[1])
-        palette = Palette.of(described or server.n_observations, on_paper=True)
-        names = (described.state_names if described else (), server.observations)
-        self._panels = _panels(palette, names, model, has_truth=has_truth)
-        self.palette = _film_palette(palette)
+        self._scenery = scenery = Scenery.of(server.airspace, server.zones)
+        source = described or server.n_observations
+        palette = Palette.of(source, on_paper=True, n_rings=scenery.n_rings)
+        n_named = server.n_observations // scenery.n_rings
+        names = (described.state_names if described else (), server.observations[:n_named])
+        self._panels = _panels(palette, names, model, scenery, has_truth=has_truth)
+        self.palette = _film_palette(palette, scenery)
         n_panels = len(self._panels)
         bottom = _TOP + self._grid[0] + 6
         legends = [self._placed(panel.marks) for panel in self._panels]
@@ -125,7 +129,8 @@ class Page:
         robots = [(row, col) for row, col in (path[-1].tolist() for path in paths)]
         if not panel.has_path or self._scale < LEAST_LINE_SCALE:
             paths = []
-        pixels = rgb_array(Picture(cells, robots, panel.palette, paths), scale=self._scale)
+        picture = Picture(cells, robots, panel.palette, paths, scenery=self._scenery)
+        pixels = rgb_array(picture, scale=self._scale)
         image.paste(Image.fromarray(pixels[:height, :width]), (left, _TOP))
 
     def _placed(self, marks: list[tuple[_Mark, str]]) -> list[tuple[_Mark, str, tuple[int, int]]]:
@@ -144,17 +149,22 @@ class Page:
     def _draw_mark(self, mark: _Mark, name: str, at: tuple[int, int]) -> None:
         draw, (x, y) = ImageDraw.Draw(self._base), at
         top, bottom = y - _SWATCH // 2, y + _SWATCH // 2
+        blank = Palette(states=(), observations=(LIGHT,), unobserved=LIGHT, path=DARK)
         if mark == "robot":
-            blank = Palette(states=(), observations=(LIGHT,), unobserved=LIGHT, path=DARK)
             frame = np.zeros((1, 1), np.uint8)
             robot = rgb_array(Picture(frame, [(0, 0)], blank), scale=_SWATCH + 1)
             self._base.paste(Image.fromarray(robot), (x, top))
+        elif mark == "no-fly":
+            frame = np.zeros((4, 4), np.uint8)
+            hatch = Picture(frame, [], blank, scenery=Scenery(no_fly=frame == 0))
+            self._base.paste(Image.fromarray(rgb_array(hatch, scale=3)), (x, top))
+            draw.rectangle((x, top, x + _SWATCH, bottom), outline=_EDGE)
         elif mark == "scale":
             _write(self._base, (x, y), "0")
             draw.rectangle((x + 11, top - 1, x + 76, bottom + 1), outline=_EDGE)
             for column, color in enumerate(_ramp(64), x + 12):
                 draw.line((column, top, column, bottom), color)
-        else:
+        elif mark != "words":
             draw.rectangle((x, top, x + _SWATCH - 1, bottom), mark, outline=_EDGE)
         _write(self._base, (x + _width(mark), y), name)
 
@@ -188,13 +198,15 @@ def _fit(text: str, room: float) -> str:
     return f"{text}…" if text else ""
 
 
-def _film_palette(palette: Palette) -> Image.Image:
-    """All colours of cells, marks and letters, few enough for a GIF."""
+def _film_palette(palette: Palette, scenery: Scenery) -> Image.Image:
+    """All colours of cells, marks and letters, few enough for a GIF; of many zones the first."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
     marks = np.array([DARK, LIGHT, _EDGE, *ROBOTS, *palette.states, *_ramp(_SHADES)])
     image = Image.new("P", (1, 1))
-    image.putpalette(np.concatenate([cells, marks, inks]).astype(np.uint8).tobytes())
+    tints = np.array(scenery.tints(palette.unobserved)).reshape(-1, 3)
+    colors = np.concatenate([cells, marks, inks, tints])[:256]
+    image.putpalette(colors.astype(np.uint8).tobytes())
     return image
 
 
@@ -202,11 +214,12 @@ def _panels(
     palette: Palette,
     names: tuple[Sequence[str], Sequence[str]],
     model: Model | None,
+    scenery: Scenery,
     *,
     has_truth: bool,
 ) -> list[_Panel]:
     states = list[tuple[_Mark, str]](zip(palette.states, names[0], strict=False))
-    seen = list[tuple[_Mark, str]](zip(palette.observations, names[1], strict=True))
+    seen = list[tuple[_Mark, str]](zip(palette.observations, names[1], strict=False))
     if has_truth and seen == states:
         seen = []  # said once
     truth = _Panel(
@@ -218,7 +231,7 @@ def _panels(
     path = _Panel(
         title="seen in this step",
         palette=palette,
-        marks=[*seen, (palette.unobserved, "not seen"), ("robot", "robot")],
+        marks=[*seen, *_land(palette, scenery), ("robot", "robot")],
         cells=lambda scene: None if scene.is_gap else scene.step.frame.frame,
         has_path=True,
     )
@@ -244,6 +257,22 @@ def _panels(
     return panels
 
 
+def _land(palette: Palette, scenery: Scenery) -> list[tuple[_Mark, str]]:
+    """Marks of what was not seen, by its zone, and of no-fly cells."""
+    names = scenery.zone_names
+    marks: list[tuple[_Mark, str]] = []
+    if not names:
+        marks.append((palette.unobserved, "not seen"))
+    elif len(names) > MOST_ZONES:
+        marks.append(("words", f"not seen: {len(names)} zones"))
+    else:
+        marks.append(("words", "not seen:"))
+        marks += zip(scenery.tints(palette.unobserved), names, strict=True)
+    if scenery.no_fly is not None:
+        marks.append(("no-fly", "no-fly"))
+    return marks
+
+
 def _levels(shares: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.rint(shares.clip(0.0, 1.0) * (_SHADES - 1)).astype(np.uint8)
 
@@ -258,6 +287,8 @@ def _ramp(n_colors: int) -> tuple[Color, ...]:
 
 def _width(mark: _Mark) -> int:
     """Width of a mark and the space behind it, pixels."""
+    if mark == "words":
+        return 0
     return 12 + 64 + 6 if mark == "scale" else _SWATCH + 5
 
 

@@ -1,0 +1,97 @@
+// What lies on the grid whatever happens there, over cells, in device pixels: lines around zones of land unless there
+// are many, hatches over no-fly cells; and the line around what was seen. Each line is dark beside light, so that one of
+// the two is seen on any cell.
+
+import { NEVER } from "/palette.js";
+import { cellsOf, hasLand, shapeOf } from "/wire.js";
+
+/** Most zones with lines around them and names in the legend. */
+export const MOST_ZONES = 8;
+
+// Cells below so many device pixels would be hidden by lines.
+const LEAST_LINE_CELL = 3;
+// From line to line of a hatch, CSS pixels: so that each cell has a line, and most of its colour is seen.
+const HATCH = { least: 4, most: 9 };
+const DARK = "#141414";
+const LIGHT = "#ffffff";
+// Widths and dashes of the light line and the dark one on top of it, CSS pixels.
+const SOLID = { light: 2.4, dark: 1.2, dash: [] };
+const THIN = { light: 2, dark: 1, dash: [] };
+const DOTTED = { light: 1, dark: 1, dash: [2, 2] };
+
+// All panels are alike, from picture to picture.
+let kept = { key: "", layer: null };
+
+/** Draws it on a panel's marks. */
+export function drawLand(frame, picture) {
+  const { arrays: { zones, no_fly: noFly }, info } = picture;
+  if (!hasLand(picture)) return;
+  const { width, height, ratio } = frame;
+  const key = JSON.stringify([info.pid, shapeOf(picture), Boolean(zones), Boolean(noFly), width, height, ratio]);
+  if (key !== kept.key) kept = { key, layer: layerOf(frame, picture) };
+  frame.context.drawImage(kept.layer, 0, 0);
+}
+
+/** Draws the line around what robots saw, if that is more than their path. */
+export function drawFootprint(frame, picture) {
+  const { arrays, info } = picture;
+  if (!info.radius || frame.cell.x < LEAST_LINE_CELL * frame.ratio) return;
+  outline(frame, picture, (at) => arrays.frame[at] !== NEVER, SOLID);
+}
+
+function layerOf(frame, picture) {
+  const { arrays: { zones, no_fly: noFly }, info } = picture;
+  const layer = new OffscreenCanvas(frame.width, frame.height);
+  const onLayer = { ...frame, context: layer.getContext("2d") };
+  const hasLines = zones && info.zones.length <= MOST_ZONES && frame.cell.x >= LEAST_LINE_CELL * frame.ratio;
+  if (hasLines) outline(onLayer, picture, (at) => zones[at], DOTTED);
+  if (noFly) hatch(onLayer, picture, noFly);
+  return layer;
+}
+
+// Between neighbours that differ.
+function outline({ context, ratio, cell }, picture, of, line) {
+  const { height, width } = shapeOf(picture);
+  context.beginPath();
+  const side = (row, col, down, right) => {
+    context.moveTo(Math.round(col * cell.x), Math.round(row * cell.y));
+    context.lineTo(Math.round((col + right) * cell.x), Math.round((row + down) * cell.y));
+  };
+  for (let at = 0; at < cellsOf(picture); at += 1) {
+    const [row, col] = [Math.floor(at / width), at % width];
+    if (col + 1 < width && of(at) !== of(at + 1)) side(row, col + 1, 1, 0);
+    if (row + 1 < height && of(at) !== of(at + width)) side(row + 1, col, 0, 1);
+  }
+  stroke(context, ratio, line);
+}
+
+function hatch({ context, ratio, width, height, cell }, picture, noFly) {
+  const { width: columns } = shapeOf(picture);
+  context.save();
+  context.beginPath();
+  for (let at = 0; at < noFly.length; at += 1) {
+    if (!noFly[at]) continue;
+    const [row, col] = [Math.floor(at / columns), at % columns];
+    const [left, top] = [Math.round(col * cell.x), Math.round(row * cell.y)];
+    context.rect(left, top, Math.round((col + 1) * cell.x) - left, Math.round((row + 1) * cell.y) - top);
+  }
+  context.clip();
+  context.beginPath();
+  const step = Math.min(Math.max(1.4 * Math.min(cell.x, cell.y), HATCH.least * ratio), HATCH.most * ratio);
+  for (let x = 0; x < width + height; x += step) {
+    context.moveTo(x, 0);
+    context.lineTo(x - height, height);
+  }
+  stroke(context, ratio, THIN);
+  context.restore();
+}
+
+function stroke(context, ratio, { light, dark, dash }) {
+  for (const [color, width, dashes] of [[LIGHT, light, []], [DARK, dark, dash]]) {
+    context.strokeStyle = color;
+    context.lineWidth = width * ratio;
+    context.setLineDash(dashes.map((length) => length * ratio));
+    context.stroke();
+  }
+  context.setLineDash([]);
+}

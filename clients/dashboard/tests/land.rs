@@ -1,0 +1,49 @@
+//! What pages are told of zones, no-fly cells and sensors.
+
+use emberwatch_dashboard::scene::Info;
+use emberwatch_protocol::Grid;
+use emberwatch_protocol::control::ServerInfo;
+use serde_json::{Value, json};
+
+/// What a server of a 2 x 3 world says of itself, with some keys.
+fn info(keys: Value) -> Info {
+    let mut info = json!({
+        "protocol": 2, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,
+        "n_observations": 4, "observations": ["calm", "fire", "calm ring 1", "fire ring 1"], "model": null,
+        "burn_in": 0, "max_steps": 0, "max_clients": 16, "coverage": "path", "publish_truth": false,
+        "lease_millis": 30_000, "deadline_millis": 0,
+    });
+    let all = info.as_object_mut().expect("an object");
+    all.extend(keys.as_object().expect("an object").clone());
+    let info: ServerInfo = serde_json::from_value(info).expect("what a server says");
+    Info::new(&info)
+}
+
+#[test]
+fn land_and_sensor_are_told() {
+    let zones = json!({"names": ["a", "b"], "colors": ["#000000", "#ffffff"], "map": [[0, 1, 1], [0, 0, 1]]});
+    let no_fly = [0, 0, 1, 0, 0, 0];
+    let airspace =
+        json!({"radius": 2, "n_rings": 2, "pays": "visited", "no_fly": [no_fly[..3], no_fly[3..]]});
+    let info = info(json!({"airspace": airspace, "zones": zones}));
+    let cells = |map: &Option<Grid<u8>>| map.iter().flatten().copied().collect::<Vec<_>>();
+    assert_eq!(cells(&info.zone_map), [0, 1, 1, 0, 0, 1]);
+    assert_eq!(cells(&info.no_fly), no_fly);
+    let told = serde_json::to_value(&info).expect("JSON");
+    assert_eq!((&told["radius"], &told["n_named"]), (&json!(2), &json!(2)));
+    assert_eq!(told["zones"], json!(["a", "b"]));
+    assert!(told.get("zone_map").is_none(), "maps go as arrays");
+}
+
+#[test]
+fn land_of_another_grid_counts_as_none() {
+    let zones = json!({"names": ["a"], "colors": ["#000000"], "map": [[0, 0]]});
+    let airspace = json!({"radius": 1, "n_rings": 9, "pays": "visited"});
+    let told = info(json!({"airspace": airspace, "zones": zones}));
+    assert_eq!(told, info(json!({})));
+    let told = serde_json::to_value(&told).expect("JSON");
+    assert_eq!(
+        (&told["zones"], &told["n_named"]),
+        (&Value::Null, &json!(4))
+    );
+}

@@ -1,0 +1,97 @@
+"""Models of lively worlds with a sensor, no-fly cells and zones."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from environments import LIVELY
+from numpy.typing import NDArray
+
+Cells = NDArray[np.bool_]
+
+#: Robots see exactly, and know by how far away a cell is seen.
+RING = {"observed_as": np.eye(3).tolist()}
+
+#: Cells of a 7 x 5 grid where no robot may be; the corner (0, 4) has no way out.
+NO_FLY: Cells = np.array(
+    [
+        [0, 0, 0, 1, 0],
+        [0, 1, 0, 1, 1],
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 1, 0],
+        [1, 1, 0, 0, 0],
+        [0, 0, 0, 0, 1],
+        [0, 1, 0, 0, 0],
+    ],
+    np.bool_,
+)
+
+
+def model(
+    *,
+    radius: int = 0,
+    n_rings: int = 1,
+    pays: str = "visited",
+    no_fly: Cells | str | None = None,
+    zone_map: NDArray[np.uint8] | str | None = None,
+) -> str:
+    """The text of a model whose sensor sees exactly; maps may be names of files beside it."""
+    keys = [f'sensor = {{ radius = {radius}, pays = "{pays}", rings = [']
+    keys += [f"{{ observed_as = {RING['observed_as']} }}," for _ in range(1, n_rings)]
+    keys += ["] }"]
+    keys += [f"no_fly = {_rows(no_fly)}"] if no_fly is not None else []
+    text = Path(LIVELY).read_text()
+    for state, old in enumerate(("[0.98, 0.01, 0.01]", "[0.80, 0.15, 0.05]", "[0.01, 0.01, 0.98]")):
+        text = text.replace(old, str(np.eye(3)[state].tolist()))
+    if zone_map is not None:
+        keys += [f"zone_map = {_rows(zone_map)}"]
+        keys += [
+            'zones = [{ name = "land", color = "#010203" }, { name = "sea", color = "#040506" }]'
+        ]
+        head, *kernels = text.split("[[kernel]]\n")
+        entries = "".join(f'[[kernel]]\nzone = "land"\n{kernel}' for kernel in kernels)
+        stays = "weights = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]\n"
+        for name in ("normal", "latent", "fire"):
+            entries += f'[[kernel]]\nzone = "sea"\nfrom = "{name}"\nto = "{name}"\n{stays}'
+        text = head + entries
+    return text.replace("kernel_size = [3, 3]\n", "kernel_size = [3, 3]\n" + "\n".join(keys) + "\n")
+
+
+def _rows(cells: NDArray[Any] | str) -> str:
+    return f'"{cells}"' if isinstance(cells, str) else str(cells.astype(int).tolist())
+
+
+def cells_of(start: Sequence[int], moves: Sequence[int], no_fly: Cells) -> list[tuple[int, int]]:
+    """Start and the cell after each move."""
+    cells = [(int(start[0]), int(start[1]))]
+    for move in moves:
+        down, right = ((-1, 0), (1, 0), (0, -1), (0, 1))[move]
+        row, col = cells[-1][0] + down, cells[-1][1] + right
+        is_on_grid = 0 <= row < no_fly.shape[0] and 0 <= col < no_fly.shape[1]
+        cells.append((row, col) if is_on_grid and not no_fly[row, col] else cells[-1])
+    return cells
+
+
+def rings_of(
+    cells: Sequence[tuple[int, int]], shape: tuple[int, int], radius: int, n_rings: int
+) -> dict[tuple[int, int], int]:
+    """The matrix by which each cell in sight of some is seen."""
+    seen: dict[tuple[int, int], int] = {}
+    for at in np.ndindex(shape):
+        distance = min(max(abs(at[0] - row), abs(at[1] - col)) for row, col in cells)
+        if distance <= radius:
+            seen[at[0], at[1]] = min(distance, n_rings - 1)
+    return seen
+
+
+def legal_moves(cell: tuple[int, int], no_fly: Cells) -> list[bool]:
+    """Which moves leave a cell; all, if none does."""
+    leaves = [cells_of(cell, [move], no_fly)[1] != cell for move in range(4)]
+    return leaves if any(leaves) else [True] * 4
+
+
+def stays(cells: Sequence[tuple[int, int]]) -> int:
+    """How often a robot stayed in place."""
+    return sum(before == after for before, after in pairwise(cells))

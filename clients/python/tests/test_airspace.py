@@ -1,0 +1,435 @@
+"""Sensors that see beyond the path, no-fly cells and zones, against loops over all cells."""
+
+import copy
+import dataclasses
+import pickle
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import land
+import numpy as np
+import oracle
+import pytest
+from environments import (
+    LIVELY,
+    MOVES,
+    RECORDED,
+    SMALL,
+    WILDFIRE,
+    actions,
+    assert_same,
+    closed_later,
+    make,
+    make_vec,
+    rollout,
+    serving,
+)
+from failures import fails, refuses
+from gymnasium.utils.env_checker import check_env
+from processes import server
+
+import emberwatch
+from emberwatch._native import Flights
+from emberwatch.airspace import Airspace
+from emberwatch.belief import Filter, Transition
+from emberwatch.model import Description, Model
+from emberwatch.moves import fly
+from emberwatch.planning import beam_search
+from emberwatch.prior import simulated_prior
+
+SHAPE = (7, 5)
+BACKENDS = ("server", "embedded")
+ALL_MOVES = ("frame", "robot", "age", "belief", "local", "recent", "visited", "move")
+
+
+@pytest.fixture
+def seeing(tmp_path: Path) -> Any:
+    """Writes a model file of `land.model`; returns keywords of its worlds."""
+
+    def written(**keys: Any) -> dict[str, Any]:
+        path = tmp_path / "model.toml"
+        path.write_text(land.model(**{"no_fly": land.NO_FLY, **keys}))
+        return {"model": path, "start": "2,2", "n_moves": 6}
+
+    return written
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("radius", "n_rings"), [(0, 1), (1, 1), (1, 2), (2, 2), (3, 4)])
+def test_a_frame_shows_what_is_in_sight_of_the_path(
+    seeing: Any, backend: str, radius: int, n_rings: int
+) -> None:
+    env = make(**seeing(radius=radius, n_rings=n_rings), backend=backend, truth=True)
+    air = env.unwrapped.world_spec.airspace
+    assert (air.radius, air.n_rings, air.no_fly.tolist()) == (radius, n_rings, land.NO_FLY.tolist())
+    assert env.unwrapped.world_spec.n_observations == 3 * n_rings
+    cell, n_stays = (2, 2), 0
+    env.reset(seed=3)
+    for path in actions(env, 30):
+        cells = land.cells_of(cell, path, land.NO_FLY)
+        observation, reward, _, _, info = env.step(path)
+        expected = np.full(SHAPE, 255)
+        for at, ring in land.rings_of(cells[1:], SHAPE, radius, n_rings).items():
+            expected[at] = 3 * ring + info["truth"][at]
+        assert np.array_equal(observation["frame"][..., 0], expected)
+        assert reward == sum(info["truth"][at] == 2 for at in set(cells[1:])) == info["n_hits"]
+        assert info["n_visited"] == len(set(cells[1:]))
+        n_stays += land.stays(cells)
+        cell = cells[-1]
+        assert observation["robot"].tolist() == list(cell)
+        assert np.array_equal(fly(cells[0], path, env.unwrapped.world_spec), cells[1:])
+    assert n_stays > 20
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("robots", [1, 3])
+def test_what_is_seen_can_pay(seeing: Any, backend: str, robots: int) -> None:
+    keywords = {**seeing(radius=2, pays="seen"), "backend": backend, "robots": robots}
+    for reward in ("share", "team", "marginal"):
+        env = make_vec(2 * robots, truth=True, reward=reward, **keywords)
+        env.reset(seed=3)
+        cells = [(2, 2)] * env.num_envs
+        for paths in actions(env, 10):
+            _, rewards, _, _, infos = env.step(paths)
+            flown = [land.cells_of(*each, land.NO_FLY) for each in zip(cells, paths, strict=True)]
+            seen = [set(land.rings_of(path[1:], SHAPE, 2, 1)) for path in flown]
+            cells = [path[-1] for path in flown]
+            for row, got in enumerate(rewards):
+                first = row // robots * robots
+                team = seen[first : first + robots]
+                burning = {at for at in np.ndindex(SHAPE) if infos["truth"][row][at] == 2}
+                if reward == "team":
+                    assert got == len(burning & set.union(*team))
+                    continue
+                n_seen = {at: sum(at in other for other in team) for at in burning & seen[row]}
+                shares = [1 / n if reward == "share" else float(n == 1) for n in n_seen.values()]
+                assert got == pytest.approx(sum(shares))
+
+
+@pytest.mark.parametrize("pays", ["visited", "seen"])
+def test_moves_lead_where_the_server_says(seeing: Any, pays: str) -> None:
+    keywords = seeing(radius=1, n_rings=2, pays=pays)
+    paths = make(**keywords, truth=True)
+    late, early = (
+        make(
+            MOVES, **keywords, truth=True, reward=reward, observation=("frame", "robot", "visited")
+        )
+        for reward in ("share", "move")
+    )
+    expected = paths.reset(seed=6)
+    begun = [env.reset(seed=6)[0] for env in (late, early)]
+    assert_same(begun[0], begun[1])
+    truth, cell = expected[1]["truth"], (2, 2)
+    for path in actions(paths, 40):
+        expected = paths.step(path)
+        paid, cells = set[tuple[int, int]](), land.cells_of(cell, path, land.NO_FLY)
+        total = 0.0
+        for index, move in enumerate(path):
+            assert late.unwrapped.action_masks().tolist() == land.legal_moves(
+                cells[index], land.NO_FLY
+            )
+            got, other = late.step(move), early.step(move)
+            assert_same(got[0], other[0])
+            assert tuple(got[0]["robot"]) == cells[index + 1]
+            total += other[1]
+            if index < 5:
+                visited = np.argwhere(got[0]["visited"][..., 0]).tolist()
+                assert set(map(tuple, visited)) == set(cells[1 : index + 2])
+                now = set(land.rings_of([cells[index + 1]], SHAPE, pays == "seen", 1)) - paid
+                assert other[1] == sum(truth[at] == 2 for at in now)
+                paid |= now
+        for part in ("frame", "robot"):
+            assert_same(got[0][part], expected[0][part])
+        assert got[1:4] == expected[1:4] and total == pytest.approx(expected[1])
+        truth, cell = expected[4]["truth"], cells[-1]
+
+
+@pytest.mark.parametrize("pays", ["visited", "seen"])
+def test_windows_show_what_is_left_to_be_found(seeing: Any, pays: str) -> None:
+    parts = {"observation": ("local", "recent", "belief", "robot"), "window": 5}
+    env = make(MOVES, **seeing(radius=1, n_rings=2, pays=pays), **parts)
+    seen, _ = env.reset(seed=1)
+    assert seen["recent"].shape == (5, 5, 6 + 3)
+    for path in np.array(actions(env, 60)).reshape(10, 6):
+        visited: list[tuple[int, int]] = []
+        fire = seen["belief"][..., 2]
+        for move in path[:-1]:
+            seen = env.step(move)[0]
+            row, col = seen["robot"].tolist()
+            visited.append((row, col))
+            found = land.rings_of(visited, SHAPE, pays == "seen", 1)
+            for at in product(range(5), repeat=2):
+                cell = row + at[0] - 2, col + at[1] - 2
+                is_on_grid = 0 <= cell[0] < 7 and 0 <= cell[1] < 5
+                for part in ("local", "recent"):
+                    flown, off = seen[part][at][-3:-1]
+                    assert flown == 255 * (cell in visited)
+                    assert off == 255 * (not is_on_grid or land.NO_FLY[cell])
+                if is_on_grid:
+                    assert seen["local"][at][0] == (0 if cell in found else fire[cell])
+        seen = env.step(path[-1])[0]
+
+
+@pytest.mark.parametrize("no_fly", [None, land.NO_FLY])
+def test_action_masks_are_those_of_a_loop(no_fly: Any) -> None:
+    cells = [at for at in np.ndindex(SHAPE) if no_fly is None or not no_fly[at]]
+    flights = Flights(len(cells), *SHAPE, 4, None, Airspace(no_fly=no_fly))
+    flights.begin(np.ones(len(cells), bool), np.array(cells), None)
+    nowhere = np.zeros(SHAPE, bool) if no_fly is None else no_fly
+    expected = [land.legal_moves((at[0], at[1]), nowhere) for at in cells]
+    assert flights.masks.tolist() == expected and flights.masks.dtype == np.bool_
+    assert not all(map(any, expected)) or no_fly is None or [True] * 4 in expected
+    again = pickle.loads(pickle.dumps(flights))
+    again.begin(np.ones(len(cells), bool), np.array(cells), None)
+    assert again.masks.tolist() == expected
+
+
+def test_every_environment_of_moves_has_action_masks(seeing: Any) -> None:
+    keywords = {**seeing(), "start": "0,2", "backend": "embedded"}
+    expected = land.legal_moves((0, 2), land.NO_FLY)
+    assert expected == [False, True, True, False]
+    env = make(MOVES, **keywords)
+    with fails("closed"):
+        env.unwrapped.action_masks()
+    env.reset(seed=1)
+    masks = env.get_wrapper_attr("action_masks")()
+    assert masks.dtype == np.bool_ and masks.shape == (4,) and masks.tolist() == expected
+    assert env.action_space.sample(mask=masks.astype(np.int8)) not in (0, 3)
+    vector = make_vec(3, MOVES, **keywords)
+    vector.reset(seed=1)
+    assert vector.unwrapped.action_masks().tolist() == [expected] * 3
+    vector.step(np.array([0, 1, 2]))
+    robots = [(0, 2), (1, 2), (0, 1)]
+    assert vector.unwrapped.action_masks().tolist() == [
+        land.legal_moves(robot, land.NO_FLY) for robot in robots
+    ]
+    team = closed_later(emberwatch.parallel_env(**{**SMALL, **keywords}))
+    team.reset(seed=1)
+    assert {agent: mask.tolist() for agent, mask in team.action_masks().items()} == {
+        "robot_0": expected,
+        "robot_1": expected,
+    }
+    team = closed_later(emberwatch.parallel_env(action="path", **{**SMALL, **keywords}))
+    with refuses("action_masks: expected an environment of action='move'"):
+        team.action_masks()
+    assert not hasattr(make(**keywords).unwrapped, "action_masks")
+
+
+def test_masked_learners_take_it(seeing: Any) -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+
+    from emberwatch.sb3 import make_vec_env
+
+    env = make_vec_env(MOVES, 2, **{**SMALL, **seeing(), "observation": "robot"})
+    assert is_masking_supported(env)
+    env.reset()
+    assert get_action_masks(env).shape == (2, 4)
+    contrib.MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=4).learn(32)
+
+
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
+def test_the_checker_and_both_backends_agree(seeing: Any, name: str) -> None:
+    keywords = seeing(radius=2, n_rings=2, pays="seen", zone_map=np.eye(*SHAPE, dtype=np.uint8))
+    parts = ALL_MOVES if name == MOVES else ("frame", "image", "robot", "age", "belief")
+    at_server, embedded = (
+        make(name, **keywords, observation=parts, backend=backend) for backend in BACKENDS
+    )
+    assert at_server.observation_space == embedded.observation_space
+    assert_same(rollout(at_server, 60, seed=5), rollout(embedded, 60, seed=5))
+    check_env(make(name, **keywords, backend="embedded").unwrapped, skip_render_check=True)
+    flags = {"model": keywords["model"], "start": "2,2", "moves": 6}
+    with serving(**flags) as instance:
+        running = make(name, instance=instance, observation=parts)
+        assert running.unwrapped.world_spec == dataclasses.replace(at_server.unwrapped.world_spec)
+        assert_same(rollout(running, 60, seed=5), rollout(at_server, 60, seed=5))
+
+
+def test_a_radius_may_be_given_beside_a_model() -> None:
+    plain, none = make(), make(sensor_radius=0)
+    assert_same(rollout(plain, 5, seed=1), rollout(none, 5, seed=1))
+    wide = make(sensor_radius=8)
+    assert wide.observation_space == plain.observation_space
+    assert wide.unwrapped.model.sensor_radius == 8
+    transitions = rollout(wide, 3, seed=1)
+    assert (transitions[1][0]["frame"] != 255).sum() > 30
+    with serving(sensor_radius=2) as instance:
+        for radius in (None, 2):
+            env = make(instance=instance, sensor_radius=radius)
+            assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
+            assert env.unwrapped.model.sensor_radius == 2
+        with refuses("sensor_radius: expected 2, as the server has, or None, got 1"):
+            make(instance=instance, sensor_radius=1)
+    with serving(sensor_radius=2, reveal_model=False) as instance:
+        env = make(instance=instance, model=LIVELY)
+        assert env.unwrapped.model.sensor_radius == 2
+    embedded = closed_later(emberwatch.embed(sensor_radius=3, height=7, width=5, burn_in=0))
+    assert embedded.info.airspace == Airspace(radius=3) and embedded.info.zones is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sensor_radius": 9}, "invalid value '9' for '--sensor-radius"),
+        ({"sensor_radius": -1}, "invalid value '-1' for '--sensor-radius"),
+        ({"sensor_radius": 1.5}, "sensor_radius: .* got 1.5"),
+        ({"sensor_radius": "1"}, "sensor_radius: .* got '1'"),
+    ],
+    ids=str,
+)
+def test_a_wrong_radius_is_named(wrong: dict[str, Any], message: str) -> None:
+    with refuses(message):
+        make(**wrong)
+
+
+def test_a_task_has_its_own_radius() -> None:
+    with refuses("sensor_radius"):
+        gymnasium.make(WILDFIRE, task="small", sensor_radius=1)
+
+
+def test_recorded_worlds_are_seen_from_afar_too(tmp_path: Path) -> None:
+    path = tmp_path / "lab.npy"
+    np.save(path, np.random.default_rng(1).integers(0, 3, (20, *SHAPE), np.uint8))
+    rings = "rings = [{ observed_as = [[1, 0], [0, 1], [1, 0]] }]"
+    text = f"sensor = {{ radius = 2, {rings} }}\nno_fly = {land.NO_FLY.astype(int).tolist()}\n"
+    path.with_suffix(".toml").write_text(text + RECORDED.read_text())
+    of_states = dict.fromkeys(("height", "width", "burn_in", "model"))
+    keywords = {**of_states, "states": path, "start": "2,2", "observation": ("image", "recent")}
+    env = make(MOVES, **keywords)
+    assert env.unwrapped.world_spec.airspace.n_rings == 2
+    assert env.unwrapped.world_spec.description.observation_names[2:] == (
+        "cold ring 1",
+        "hot ring 1",
+    )
+    assert env.observation_space["image"].shape == (7, 5, 5)
+    near, embedded = (
+        make(MOVES, **keywords, sensor_radius=0, backend=backend) for backend in BACKENDS
+    )
+    assert near.observation_space["image"].shape == (7, 5, 3)
+    assert near.unwrapped.world_spec.description.n_rings == 1
+    assert_same(rollout(near, 20, seed=1), rollout(embedded, 20, seed=1))
+    flags = dict.fromkeys(("height", "width", "burn_in", "model"))
+    with serving(**flags, states=path, start="2,2", sensor_radius=1) as instance:
+        spec = make(instance=instance).unwrapped.world_spec
+        assert (spec.airspace.radius, spec.n_observations) == (1, 4)
+        assert spec.description.sensor_radius == 1
+
+
+def test_a_model_says_what_its_file_does(tmp_path: Path) -> None:
+    zones = np.arange(35, dtype=np.uint8).reshape(SHAPE) & 1
+    keys: dict[str, Any] = {"radius": 3, "n_rings": 2, "pays": "seen"}
+    whole = Model.from_toml(land.model(**keys, no_fly=land.NO_FLY, zone_map=zones))
+    assert (whole.sensor_radius, whole.n_rings, whole.pays) == (3, 2, "seen")
+    assert whole.no_fly is not None and whole.no_fly.dtype == np.bool_
+    assert np.array_equal(whole.no_fly, land.NO_FLY)
+    assert whole.zone_map is not None and whole.zone_map.dtype == np.uint8
+    assert np.array_equal(whole.zone_map, zones)
+    assert whole.zone_names == ("land", "sea")
+    assert whole.zone_colors == ((1, 2, 3), (4, 5, 6))
+    assert whole.kernels.shape == (2, 3, 3, 3, 3) and not whole.sees_own_state
+    assert whole.observation_names == (
+        *("normal", "latent", "fire"),
+        *("normal ring 1", "latent ring 1", "fire ring 1"),
+    )
+    assert whole.observation_colors == 2 * whole.state_colors
+    expected = oracle.parameters(whole.toml)
+    assert np.array_equal(whole.kernels, expected.kernels)
+    assert np.array_equal(whole.observation_matrix, expected.observed)
+    # Maps beside the file are those in it.
+    path = tmp_path / "model.toml"
+    path.write_text(land.model(**keys, no_fly="no_fly.npy", zone_map="zones.npy"))
+    np.save(tmp_path / "no_fly.npy", land.NO_FLY)
+    np.save(tmp_path / "zones.npy", zones)
+    beside = Model.named(path)
+    assert beside == whole == Model.from_toml(beside.toml) == copy.deepcopy(whole)
+    assert whole != Model.from_toml(land.model(**keys, zone_map=zones))
+    with refuses("emberwatch-server --check"):
+        Model.from_toml(path.read_text())
+    (tmp_path / "zones.npy").unlink()
+    with refuses("zones.npy"):
+        Model.named(path)
+    plain = Model.wildfire()
+    assert (plain.airspace, plain.zone_map, plain.zone_names) == (Airspace(), None, ())
+    assert plain.with_radius(0) is plain
+    assert (whole.with_radius(1).n_rings, whole.with_radius(0).n_rings) == (2, 1)
+    assert whole.with_radius(1).with_radius(3) == whole
+    with refuses("radius: expected an integer within 0 to 8, got 9"):
+        plain.with_radius(9)
+    described = Description.from_toml(RECORDED.read_text())
+    assert described.with_radius(4).airspace == Airspace(radius=4)
+
+
+def test_the_filter_knows_zones_and_rings() -> None:
+    rng = np.random.default_rng(2)
+    zones = rng.integers(0, 2, SHAPE, np.uint8)
+    text = land.model(radius=2, n_rings=2, zone_map=zones)
+    model, expected = Model.from_toml(text), oracle.parameters(text)
+    belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
+    phi = Transition(model, height=7, width=5).apply(belief)
+    np.testing.assert_allclose(phi, oracle.phi(expected, belief), atol=1e-12)
+    assert np.allclose(phi[:, zones == 1], belief[:, zones == 1])
+    frame = rng.choice(np.array([*range(6), 255], np.uint8), SHAPE)
+    kept = Filter(model, prior=belief)
+    kept.correct(frame)
+    np.testing.assert_allclose(kept.belief, oracle.bayes(expected, belief, frame), atol=1e-12)
+    assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
+    with refuses("model: zone_map: expected a map of the 5 x 5 grid, got 7 x 5"):
+        Transition(model, height=5, width=5).apply(np.full((3, 5, 5), 1 / 3))
+
+
+def test_a_server_tells_zones_that_learners_may_know(seeing: Any) -> None:
+    path = seeing(zone_map=np.eye(*SHAPE, dtype=np.uint8))["model"]
+    keys = {"height": 7, "width": 5, "moves": 4, "burn_in": 5, "model": path}
+    for info in (server(**keys).connect().info, closed_later(emberwatch.embed(**keys)).info):
+        assert info.airspace == Airspace(no_fly=land.NO_FLY) and hash(info)
+        assert info.zones is not None and info.zones.names == ("land", "sea")
+        assert info.zones.map.tolist() == np.eye(*SHAPE, dtype=int).tolist()
+        assert info.zones.colors == ("#010203", "#040506")
+    path.write_text("zones_public = false\n" + path.read_text())
+    assert closed_later(emberwatch.embed(**keys)).info.zones is None
+
+
+@pytest.mark.parametrize("air", [{}, {"radius": 1}, {"radius": 1, "pays": "seen"}], ids=str)
+def test_beams_are_planned_within_the_airspace(air: dict[str, Any]) -> None:
+    rng = np.random.default_rng(4)
+    values, robots = rng.random((2, *SHAPE)), np.array([(2, 2), (0, 4)])
+    airspace = Airspace(no_fly=land.NO_FLY, **air)
+    paths = beam_search(values, robots, 5, rng=rng, width=4**5, airspace=airspace)
+    reach = airspace.radius if airspace.pays == "seen" else 0
+
+    def worth(world: int, path: Any) -> float:
+        cells = land.cells_of(robots[world], path, land.NO_FLY)[1:]
+        return sum(values[world][at] for at in land.rings_of(cells, SHAPE, reach, 1))
+
+    best = max(worth(0, every) for every in product(range(4), repeat=5))
+    assert worth(0, paths[0]) == pytest.approx(best, abs=1e-5)
+    # The other has no way out.
+    assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
+
+
+def test_no_argument_of_a_plan_is_taken_for_another() -> None:
+    right: dict[str, Any] = {"values": np.zeros((1, 7, 5)), "robots": np.array([(0, 0)])}
+    right |= {"n_moves": 2, "rng": np.random.default_rng(1)}
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"airspace": Airspace(no_fly=np.zeros((5, 7), bool))}, r"no_fly: expected shape \(7, 5\)"),
+        (
+            {"airspace": Airspace(no_fly=land.NO_FLY), "robots": np.array([(0, 3)])},
+            "robots: expected cells where they may fly",
+        ),
+    ]
+    for keywords, message in wrong:
+        with refuses(message):
+            beam_search(**{**right, **keywords})
+    for keywords, message in (
+        ({"radius": 9}, "radius: expected an integer within 0 to 8, got 9"),
+        ({"radius": 1, "n_rings": 3}, "n_rings: expected an integer within 1 to 2, got 3"),
+        ({"pays": "both"}, "pays: expected 'visited' or 'seen', got 'both'"),
+        ({"no_fly": np.zeros(3, bool)}, r"no_fly: expected .* \(H, W\) and type bool"),
+        ({"no_fly": np.zeros((3, 3))}, r"no_fly: expected .* \(H, W\) and type bool"),
+    ):
+        with refuses(message):
+            Airspace(**keywords)
+    with refuses(r"no_fly: expected shape \(7, 5\), got \(5, 7\)"):
+        Flights(1, 7, 5, 4, None, Airspace(no_fly=np.zeros((5, 7), bool)))

@@ -1,0 +1,97 @@
+"""Zones, no-fly cells and what was seen beyond the path, in pictures."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emberwatch.palette import mark_on, mark_on_each
+from emberwatch.render import Palette, Picture, ansi, rgb_array
+from emberwatch.scenery import MOST_ZONES, Scenery
+
+PALETTE = Palette.of(3)
+FRAME = np.array([[0, 255, 255], [2, 255, 1]], np.uint8)
+TRUTH = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+NO_FLY = np.array([[False, True, False], [False, False, True]])
+ZONES = np.array([[0, 0, 1], [0, 0, 1]], np.uint8)
+LAND: dict[str, Any] = {"zones": ZONES, "zone_names": ("grass", "town")}
+LAND |= {"zone_colors": ((0, 100, 0), (200, 0, 200))}
+SCALE = 20
+GAP = 8
+
+
+def draw(*, truth: bool = False, scale: int = SCALE, **scenery: Any) -> NDArray[np.uint8]:
+    shown = Picture(FRAME, [], PALETTE, (), TRUTH if truth else None, Scenery(**scenery))
+    return rgb_array(shown, scale=scale)
+
+
+def cell(image: NDArray[np.uint8], row: int, col: int, left: int = 0) -> NDArray[np.uint8]:
+    """The pixels of a cell, `(n, 3)`."""
+    top, left = SCALE * row, left + SCALE * col
+    return image[top : top + SCALE, left : left + SCALE].reshape(-1, 3)
+
+
+def test_what_was_not_seen_has_the_muted_colour_of_its_zone() -> None:
+    plain, image = draw(), draw(**LAND)
+    for row, col in np.ndindex(FRAME.shape):
+        before, after = (cell(drawn, row, col)[0] for drawn in (plain, image))
+        if FRAME[row, col] != 255:
+            assert (after == before).all()
+        else:
+            color = np.array(LAND["zone_colors"][ZONES[row, col]])
+            assert (after == np.rint(0.4 * color + 0.6 * before)).all()
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_no_fly_cells_are_hatched_in_what_stands_out_from_their_colour(truth: bool) -> None:
+    left = (3 * SCALE + GAP) * truth
+    plain, image = draw(truth=True), draw(truth=True, no_fly=NO_FLY)
+    for row, col in np.ndindex(FRAME.shape):
+        before, after = (cell(drawn, row, col, left) for drawn in (plain, image))
+        changed = (before != after).any(axis=1)
+        assert (0.1 < changed.mean() < 0.5) == NO_FLY[row, col]
+        assert changed.any() == NO_FLY[row, col]
+        ink = mark_on((before[0, 0], before[0, 1], before[0, 2]))
+        assert (after[changed] == ink).all()
+    assert (draw(scale=1, no_fly=NO_FLY) != draw(scale=1)).any(), "in cells of a pixel, too"
+
+
+def test_dots_part_zones_unless_there_are_many() -> None:
+    plain, image = draw(truth=True), draw(truth=True, **LAND)
+    changed = (plain != image).any(axis=2)[:, 3 * SCALE + GAP :]
+    assert set(np.nonzero(changed)[1]) == {2 * SCALE - 1}
+    assert changed[:, 2 * SCALE - 1].mean() == 0.5
+    many = {"zone_names": ("grass",) * (MOST_ZONES + 1), "zone_colors": ((0, 0, 0),) * 9}
+    changed = (plain != draw(truth=True, **LAND | many)).any(axis=2)
+    assert not changed[:, 3 * SCALE + GAP :].any()
+
+
+def test_a_line_goes_around_what_was_seen_beyond_the_path() -> None:
+    plain, image = draw(), draw(sees_beyond=True)
+    changed = (plain != image).any(axis=2)
+    assert changed[:, SCALE].all() and changed[SCALE - 1, 2 * SCALE :].all()
+    assert (plain[changed] == PALETTE.unobserved).all(), "what was seen is not covered"
+    assert (image[changed] == mark_on(PALETTE.unobserved)).all()
+    assert changed.sum() < 5 * SCALE
+    assert (draw(scale=2, sees_beyond=True) == draw(scale=2)).all(), "no room for lines"
+
+
+def test_the_observations_of_rings_have_the_colours_of_the_first() -> None:
+    colors = Palette.of(6, n_rings=2).observations
+    assert colors == Palette.of(3).observations * 2
+
+
+def test_terminals_show_no_fly_cells() -> None:
+    shown = Picture(FRAME, [(0, 0)], PALETTE, scenery=Scenery(no_fly=NO_FLY))
+    assert ansi(shown, color=False).split("\n") == ["0@.x.", "2 . 1x"]
+    assert "xx" in ansi(shown)
+    tall, cells = FRAME.repeat(20, axis=0), NO_FLY.repeat(20, axis=0)
+    plain = ansi(Picture(tall, [], PALETTE))
+    assert ansi(Picture(tall, [], PALETTE, scenery=Scenery(no_fly=cells))) != plain
+
+
+def test_marks_of_many_colours_are_those_of_each() -> None:
+    colors = np.random.default_rng(1).integers(0, 256, (500, 3)).astype(np.uint8)
+    marks = mark_on_each(colors).tolist()
+    assert marks == [list(mark_on((red, green, blue))) for red, green, blue in colors.tolist()]
