@@ -60,3 +60,12 @@ class Zones:
     colors: tuple[str, ...]
     #: The zone of each cell, by its place in `names`, shape (H, W).
     map: NDArray[np.uint8]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Zones) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self.names)
+
+    def _values(self) -> tuple[object, ...]:
+        return self.names, self.colors, self.map.tolist()
