@@ -70,10 +70,10 @@ class Scenery:
         lines = np.zeros(image.shape[:2], np.bool_)
         if self.no_fly is not None:
             period = min(max(scale, _LEAST_HATCH), _MOST_HATCH)
-            hatch = (rows + cols) % period < max(1, period // 4)
+            hatch = np.remainder(rows + cols, period) < max(1, period // 4)
             lines |= _enlarge(self.no_fly, scale) & hatch
         if self.zones is not None and len(self.zone_names) <= MOST_ZONES:
-            lines |= _last_pixels(self.zones, scale) & ((rows + cols) % 2 == 0)
+            lines |= _last_pixels(self.zones, scale) & (np.remainder(rows + cols, 2) == 0)
         if self.sees_beyond:
             lines |= _around(frame != UNOBSERVED, scale)
         image[lines] = mark_on_each(image[lines])
