@@ -6,7 +6,7 @@ use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::path::path_from_bytes;
 use emberwatch_protocol::payload::split_frame_payload;
-use emberwatch_protocol::{Cell, Move, Shape};
+use emberwatch_protocol::{Airspace, Cell, Move, Shape};
 use std::time::Instant;
 
 /// One step of a world.
@@ -141,10 +141,10 @@ impl Entry {
 
 impl Robot {
     /// The cells of its path, the start first.
-    pub fn path(&self, shape: Shape) -> Vec<Cell> {
+    pub fn path(&self, airspace: &Airspace) -> Vec<Cell> {
         let mut cells = vec![self.result.start()];
         for step in &self.moves {
-            cells.push(step.apply(cells[cells.len() - 1], shape));
+            cells.push(airspace.after(*step, cells[cells.len() - 1]));
         }
         cells
     }

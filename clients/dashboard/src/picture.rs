@@ -8,7 +8,7 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use crate::memory::Memory;
 use crate::scene::{Info, Lost, Player, Scene};
-use emberwatch_protocol::Grid;
+use emberwatch_protocol::Airspace;
 use emberwatch_protocol::control::ServerStatus;
 use emberwatch_protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
@@ -175,7 +175,9 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         kept: strip
             .and_then(Strip::kept)
             .map(|(first, last)| Range { first, last }),
-        shown: chosen.map(|(serial, entry)| Shown::of(serial, entry, since)),
+        shown: chosen.map(|(serial, entry)| {
+            Shown::of(serial, entry, since, &airspace(scene.info.as_ref(), entry))
+        }),
         agent: believed.and_then(|entry| AgentFacts::of(entry, is_live(entry))),
         lost: scene.lost,
         player: scene.player.as_ref(),
@@ -239,10 +241,12 @@ impl Arrays {
 
     /// What lies on the grid; nothing where it is another than the server's.
     fn add_land(&mut self, info: Option<&Info>, entry: &Entry) {
-        let of_grid = |map: &&Grid<u8>| map.dim() == entry.shape.dim();
-        let maps = info.map(|info| [("zones", &info.zone_map), ("no_fly", &info.no_fly)]);
-        for (name, map) in maps.into_iter().flatten() {
-            if let Some(map) = map.as_ref().filter(of_grid) {
+        let zones = info.and_then(|info| info.zone_map.clone());
+        let airspace = info.and_then(|info| info.airspace.as_ref());
+        let no_fly = airspace.and_then(|airspace| airspace.no_fly());
+        let no_fly = no_fly.map(|map| map.mapv(u8::from));
+        for (name, map) in [("zones", zones), ("no_fly", no_fly)] {
+            if let Some(map) = map.filter(|map| map.dim() == entry.shape.dim()) {
                 self.add_bytes(name, &map.iter().copied().collect::<Vec<_>>());
             }
         }
@@ -305,8 +309,15 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
+/// Where the robots of an entry flew, as far as the server says.
+fn airspace(info: Option<&Info>, entry: &Entry) -> Airspace {
+    let told = info.and_then(|info| info.airspace.clone());
+    let told = told.filter(|airspace| airspace.shape() == entry.shape);
+    told.unwrap_or_else(|| Airspace::open(entry.shape))
+}
+
 impl Shown {
-    fn of(serial: u64, entry: &Entry, seen_since: u64) -> Self {
+    fn of(serial: u64, entry: &Entry, seen_since: u64, airspace: &Airspace) -> Self {
         let result = &entry.result;
         let score = entry.belief.as_ref().and_then(|belief| belief.score);
         Self {
@@ -322,7 +333,7 @@ impl Shown {
             n_hits: result.n_hits,
             n_target_cells: result.n_target_cells,
             robots: (0..entry.robots.len())
-                .map(|index| ShownRobot::of(entry, index))
+                .map(|index| ShownRobot::of(entry, index, airspace))
                 .collect(),
             terminated: result.terminated != 0,
             truncated: result.truncated != 0,
@@ -333,10 +344,10 @@ impl Shown {
 }
 
 impl ShownRobot {
-    fn of(entry: &Entry, index: usize) -> Self {
+    fn of(entry: &Entry, index: usize, airspace: &Airspace) -> Self {
         let robot = &entry.robots[index];
         let is_among = |robots: u64| robots >> index & 1 == 1;
-        let path = robot.path(entry.shape).into_iter();
+        let path = robot.path(airspace).into_iter();
         Self {
             state: if is_among(entry.result.hovered) {
                 "hovered"

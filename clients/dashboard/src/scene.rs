@@ -78,9 +78,9 @@ pub struct Info {
     /// The zone of each cell.
     #[serde(skip)]
     pub zone_map: Option<Grid<u8>>,
-    /// 1 for each cell where no robot may be.
+    /// Where robots may fly; `None` if what the server says of it makes no sense.
     #[serde(skip)]
-    pub no_fly: Option<Grid<u8>>,
+    pub airspace: Option<Airspace>,
     burn_in: u64,
     max_steps: u64,
     coverage: CoverageRule,
@@ -141,7 +141,6 @@ impl Info {
         let zones = zones.filter(|_| zone_map.is_some());
         let n_rings = airspace.as_ref().map_or(1, Airspace::n_rings);
         let colours = file.map(|file| file.observations.iter().map(|one| one.color.clone()));
-        let no_fly = airspace.as_ref().and_then(Airspace::no_fly);
         Self {
             pid: info.pid,
             height: info.height,
@@ -160,7 +159,7 @@ impl Info {
             zones: zones.map(|zones| zones.names.clone()),
             zone_colours: zones.map(|zones| zones.colors.clone()),
             zone_map,
-            no_fly: no_fly.map(|map| map.mapv(u8::from)),
+            airspace,
             burn_in: info.burn_in,
             max_steps: info.max_steps,
             coverage: info.coverage,

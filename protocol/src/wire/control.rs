@@ -238,6 +238,14 @@ impl ServerInfo {
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
         let airspace = self.airspace.as_ref();
+        let n_rings = airspace.map_or(1, |info| info.n_rings.max(1));
+        if !self.n_observations.is_multiple_of(n_rings) {
+            let expected = format!("observations for each of {n_rings} rings");
+            return Err(format!(
+                "airspace: expected {expected}, got {}",
+                self.n_observations
+            ));
+        }
         airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
     }
 

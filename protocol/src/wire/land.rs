@@ -1,7 +1,7 @@
 //! What the answer to `hello` says of airspace and land.
 
 use crate::model::grid::{Grid, Shape};
-use crate::model::{Airspace, MAX_RADIUS, Pays};
+use crate::model::{Airspace, MAX_RADIUS, Pays, parse_color};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -61,6 +61,13 @@ impl ZonesInfo {
     pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
         let map = of_grid("zones", shape, &self.map)?;
         let n_zones = self.names.len();
+        let is_color = |color: &String| parse_color(color).is_some();
+        if self.colors.len() != n_zones || !self.colors.iter().all(is_color) {
+            let got = &self.colors;
+            return Err(format!(
+                "zones: expected {n_zones} colours #rrggbb, got {got:?}"
+            ));
+        }
         match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
             None => Ok(map),
             Some(got) => Err(format!("zones: expected values below {n_zones}, got {got}")),

@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_figures::{Bar, Color, Ladder, Named};
 use emberwatch_protocol::model::parse_color;
-use emberwatch_protocol::{Cell, Frame, Grid, Model};
+use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -238,6 +238,16 @@ pub fn draw_snapshot(
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
+    // Those of rings further out have the colours of the path's.
+    let n_named = file.observations.len() as u8;
+    let of_path = |value: u8| {
+        if value == UNOBSERVED {
+            value
+        } else {
+            value % n_named
+        }
+    };
+    let frame = snapshot.frame.values().mapv(of_path);
     let belief = snapshot.belief.as_ref().map(Belief::view);
     let beliefs = belief.iter().flat_map(|belief| belief.outer_iter());
     let page = emberwatch_figures::Snapshot {
@@ -250,7 +260,7 @@ pub fn draw_snapshot(
         observations: observations.collect(),
         truth: snapshot.truth.view(),
         observation: observation.view(),
-        frame: snapshot.frame.values(),
+        frame: frame.view(),
         path: snapshot
             .path_cells
             .iter()
