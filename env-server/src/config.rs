@@ -7,7 +7,7 @@ use emberwatch_protocol::channels::{
 };
 use emberwatch_protocol::control::CoverageRule;
 use emberwatch_protocol::grid::ShapeError;
-use emberwatch_protocol::model::ModelError;
+use emberwatch_protocol::model::{MAX_RADIUS, ModelError};
 use emberwatch_protocol::path::MAX_MOVES;
 use emberwatch_protocol::program::read_text;
 use emberwatch_protocol::task::{Start, Task, TaskError};
@@ -208,6 +208,13 @@ impl ServerConfig {
     fn check_ranges(&self) -> Result<(), ConfigError> {
         in_range("worlds", u64::from(self.worlds), 1, u64::from(MAX_WORLDS))?;
         in_range("moves", self.moves as u64, 1, MAX_MOVES as u64)?;
+        if !(-1..=MAX_RADIUS as i64).contains(&self.sensor_radius) {
+            return Err(ConfigError::Range {
+                setting: "sensor_radius",
+                expected: format!("-1 to {MAX_RADIUS}"),
+                got: self.sensor_radius.to_string(),
+            });
+        }
         in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
         in_range("threads", self.threads as u64, 0, 256)?;
         in_range("burn_in", self.burn_in, 0, 1 << 40)?;
@@ -277,13 +284,15 @@ impl ServerConfig {
             return Ok(model);
         }
         let path = Path::new(&self.model);
-        // Read first for an error of its own: the name may be mistyped.
-        read_text(path).map_err(|error| {
-            let names: Vec<&str> = Model::built_in_names().collect();
-            let problem = format!("{error}: expected one, or {}", names.join(", "));
-            file_error("model file", path, problem)
-        })?;
-        Model::read(path).map_err(|error| file_error("model file", path, error))
+        Model::read(path).map_err(|error| match error {
+            // The name may be mistyped.
+            ModelError::File { path: of, problem } if Path::new(&of) == path => {
+                let names: Vec<&str> = Model::built_in_names().collect();
+                let problem = format!("{problem}: expected one, or {}", names.join(", "));
+                file_error("model file", path, problem)
+            }
+            other => file_error("model file", path, other),
+        })
     }
 }
 

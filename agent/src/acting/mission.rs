@@ -143,7 +143,9 @@ pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<Server
 pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     let recorded = info.recorded_world.as_ref();
     let description = recorded.and_then(|recorded| recorded.description.as_deref());
-    description.map(Description::model_of).transpose()
+    let model = description.map(Description::model_of).transpose()?;
+    let radius = info.airspace.as_ref().map_or(0, |airspace| airspace.radius);
+    model.map(|model| model.with_radius(radius)).transpose()
 }
 
 pub(super) fn model_of(

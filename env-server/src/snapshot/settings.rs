@@ -98,8 +98,8 @@ impl Settings {
             let (expected, got) = line.unwrap_or(("its model", "a longer or shorter one"));
             return Err(other(
                 "model",
-                &format!("{expected:?}"),
-                &format!("{got:?}"),
+                &format!("{:?}", start_of(expected)),
+                &format!("{:?}", start_of(got)),
             ));
         }
         // The same worlds have the same settings, whether by a task or by flags.
@@ -116,4 +116,9 @@ impl Settings {
         }
         Ok(())
     }
+}
+
+/// A line of a model file in an error; that of a map may be long.
+fn start_of(line: &str) -> String {
+    line.chars().take(80).collect()
 }

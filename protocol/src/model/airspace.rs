@@ -32,7 +32,7 @@ impl Airspace {
     }
 
     /// A grid without the cells of `no_fly` (shape `[H, W]`), whose sensor sees `radius` rows and columns beyond each
-    /// cell of the path by `n_rings` observation matrices.
+    /// cell of the path by `n_rings` observation matrices. With a radius of 0, what is seen is what is visited.
     ///
     /// # Panics
     /// If the map is of another grid.
@@ -47,10 +47,10 @@ impl Airspace {
         assert_eq!(dim, shape.dim(), "no_fly: expected the grid");
         Self {
             shape,
-            no_fly,
+            no_fly: no_fly.filter(|map| map.iter().any(|closed| *closed)),
             radius,
             n_rings,
-            pays,
+            pays: if radius == 0 { Pays::Visited } else { pays },
         }
     }
 
@@ -120,13 +120,13 @@ impl Airspace {
         }
     }
 
-    /// Whether a robot can leave a cell: a start from which it cannot is none.
+    /// Whether any move leads out of a cell: where none does, no robot may start.
     pub fn has_way_out(&self, cell: Cell) -> bool {
         Move::ALL.iter().any(|step| self.after(*step, cell) != cell)
     }
 
-    /// The cells where a random start may be, by row-major index: free, with a way out where any has one. `None` if
-    /// these are all cells.
+    /// The cells where a random start may be, by row-major index: those that a robot can leave, perhaps none. `None` if
+    /// there are no no-fly cells: then it may be anywhere.
     pub fn starts(&self) -> Option<Vec<usize>> {
         self.no_fly.as_ref()?;
         let cells = (0..self.shape.n_cells()).map(|index| (index, self.shape.cell(index)));

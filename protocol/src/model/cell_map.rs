@@ -4,6 +4,7 @@ use super::grid::{Grid, Shape};
 use crate::program::MAX_TEXT_BYTES;
 use ndarray::Array2;
 use ndarray_npy::ReadNpyExt;
+use ndarray_npy::npy::header::Header;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{Cursor, Read};
@@ -91,6 +92,23 @@ fn read_array(path: &Path) -> Result<Array2<u8>, String> {
     if header > MAX_HEADER_BYTES {
         let expected = format!("expected a header of at most {MAX_HEADER_BYTES} bytes");
         return Err(format!("{expected}, got {header}"));
+    }
+    // An array is made as large as its header says before it is read.
+    let mut rest = Cursor::new(&bytes);
+    let header = Header::from_reader(&mut rest).map_err(|error| words(&error))?;
+    let n_values = bytes.len() as u64 - rest.position();
+    let fits = match header.shape[..] {
+        [height, width] => {
+            Shape::new(height, width).is_ok_and(|it| it.n_cells() as u64 == n_values)
+        }
+        _ => false,
+    };
+    if !fits {
+        let expected = "expected an array [H, W] of uint8 or bool";
+        return Err(format!(
+            "{expected}, got shape {:?} in {n_values} bytes",
+            header.shape
+        ));
     }
     let numbers = Array2::<u8>::read_npy(Cursor::new(&bytes));
     let numbers = numbers.or_else(|error| {

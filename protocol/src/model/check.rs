@@ -14,6 +14,9 @@ use std::ops::RangeInclusive;
 /// those overflows or vanishes in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
+/// Most weights of all kernels: 512 MiB. 64 states with kernels of their own of 15 x 15 cells have 59 million.
+const MAX_WEIGHTS: usize = 1 << 26;
+
 /// Names that no state may have, as names of policies have them: `shooting_explore` beside `shooting_<state>`.
 const RESERVED: [&str; 3] = ["exploit", "exploit_only", "explore"];
 
@@ -239,6 +242,11 @@ impl Checker<'_> {
         let n_states = file.states.len();
         let (n_zones, n_own) = (file.zones.len().max(1), self.n_own(file)?);
         self.check_zones(file)?;
+        let n_weights = n_zones * n_own * n_states * n_states * height * width;
+        if n_weights > MAX_WEIGHTS {
+            let expected = format!("at most {MAX_WEIGHTS} weights in all zones");
+            return self.wrong("kernel".into(), &expected, n_weights);
+        }
         let mut kernels = vec![Array4::zeros((n_states, n_states, height, width)); n_zones * n_own];
         let mut filled = HashSet::new();
         for entry in &file.kernel {

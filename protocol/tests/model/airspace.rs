@@ -1,7 +1,9 @@
 //! Where robots may fly and what they see, against plain loops over all cells of the grid.
 
 use super::models::{shape, unit};
-use emberwatch_protocol::model::{Airspace, CellMap, ModelFile, Pays, RingEntry, SensorEntry};
+use emberwatch_protocol::model::{
+    Airspace, CellMap, KernelEntry, ModelFile, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry,
+};
 use emberwatch_protocol::{Cell, Grid, Model, Move};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
@@ -192,4 +194,81 @@ fn maps_are_read_beside_the_model() {
         "{error}"
     );
     std::fs::remove_dir_all(&folder).expect("removed");
+}
+
+#[test]
+fn an_array_that_claims_more_than_it_has_is_refused_before_it_is_made() {
+    let folder = std::env::temp_dir().join(format!("emberwatch-claims-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let (path, map) = (folder.join("model.toml"), folder.join("no_fly.npy"));
+    let mut file = Model::wildfire().file().clone();
+    file.no_fly = Some(CellMap::File("no_fly.npy".into()));
+    std::fs::write(&path, toml::to_string(&file).expect("TOML")).expect("a file");
+    ndarray_npy::write_npy(&map, &Grid::from_elem((1, 1), 0_u8)).expect("a map");
+    let whole = std::fs::read(&map).expect("the map");
+    let (header, numbers) = whole.split_at(whole.len() - 1);
+    let header = String::from_utf8_lossy(&header[10..]);
+    for claimed in [
+        "(4611686018427387904, 1)",
+        "(1099511627776, 0)",
+        "(2, 1)",
+        "(1,)",
+        "(1, 1, 1)",
+    ] {
+        let mut other = header.replace("(1, 1)", claimed);
+        let n_spaces = other.len() - header.len().min(other.len());
+        other = other.replacen(&" ".repeat(n_spaces), "", usize::from(n_spaces > 0));
+        let length = (other.len() as u16).to_le_bytes();
+        let bytes = [&whole[..8], &length, other.as_bytes(), numbers].concat();
+        std::fs::write(&map, bytes).expect("a map");
+        let error = Model::read(&path).expect_err(claimed).to_string();
+        assert!(
+            error.contains("expected an array [H, W] of uint8 or bool"),
+            "{error}"
+        );
+    }
+    std::fs::remove_dir_all(&folder).expect("removed");
+}
+
+#[test]
+fn kernels_of_too_many_weights_are_refused_before_they_are_made() {
+    let mut file = Model::wildfire().file().clone();
+    let state = file.states[0].clone();
+    file.states = (0..64)
+        .map(|index| StateEntry {
+            name: format!("s{index}"),
+            initial: 1.0 / 64.0,
+            ..state.clone()
+        })
+        .collect();
+    file.kernel_size = [15, 15];
+    let zone = |index| ZoneEntry {
+        name: format!("z{index}"),
+        color: "#808080".into(),
+    };
+    file.zones = (0..256).map(zone).collect();
+    let entry = |zone: &ZoneEntry| KernelEntry {
+        zone: Some(zone.name.clone()),
+        own: Some("s0".into()),
+        from: "s0".into(),
+        to: "s0".into(),
+        scale: 1.0,
+        weights: vec![vec![1.0; 15]; 15],
+    };
+    file.kernel = file.zones.iter().map(entry).collect();
+    let error = Model::new(file).expect_err("121 GB").to_string();
+    assert!(
+        error.contains("kernel: expected at most 67108864 weights in all zones, got"),
+        "{error}"
+    );
+}
+
+#[test]
+fn maps_and_sensors_that_change_nothing_are_none() {
+    let grid = shape(2, 3);
+    let none = Some(Arc::new(Grid::from_elem((2, 3), false)));
+    assert_eq!(
+        Airspace::new(grid, none, 0, 1, Pays::Seen),
+        Airspace::open(grid)
+    );
 }

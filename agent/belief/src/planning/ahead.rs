@@ -4,7 +4,7 @@
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::Grid;
+use emberwatch_protocol::{Cell, Grid};
 
 /// Paths that are planned at once: of T = 12 moves, they reach most of a grid of 64 x 64 cells.
 const N_PATHS: usize = 6;
@@ -46,10 +46,16 @@ impl Planner for Ahead {
 /// over equal cells has no direction without it.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
     let mut promise = values.worth().mapv(|value| value.max(0.0));
+    let airspace = values.airspace();
+    let is_free = |(row, col): (usize, usize)| airspace.is_free(Cell { row, col });
+    // Nothing draws a robot to where it may not be, and no way leads through there.
+    let all = promise.indexed_iter_mut();
+    all.filter(|(at, _)| !is_free(*at))
+        .for_each(|(_, promise)| *promise = 0.0);
     let (height, width) = promise.dim();
     let cells = (0..height).flat_map(|row| (0..width).map(move |col| (row, col)));
     let mut spread = |(row, col): (usize, usize), from: [(usize, usize); 2]| {
-        for near in from {
+        for near in from.into_iter().filter(|_| is_free((row, col))) {
             let passed_on = promise.get(near).map_or(0.0, |near| near * kept_per_move);
             promise[[row, col]] = promise[[row, col]].max(passed_on);
         }
@@ -70,7 +76,6 @@ fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Cell;
 
     #[test]
     fn a_promise_fades_with_the_way_to_it() {

@@ -75,30 +75,44 @@ impl Outlook {
         let surplus = probability.mapv(|p| (p - LIKELY).max(0.0));
         let entropy = belief.entropy(EntropyKind::Sum) / greatest;
         let layers = [probability, surplus, entropy, memory.novelty()];
-        Self {
+        let outlook = Self {
             airspace: airspace.clone(),
             sums: layers.each_ref().map(Sums::of),
             layers,
             n_moves,
             recent: memory.recent,
+        };
+        let Some(no_fly) = airspace.no_fly() else {
+            return outlook;
+        };
+        let closed = no_fly.iter().enumerate().filter(|(_, closed)| **closed);
+        outlook.without_visits(&closed.map(|(cell, _)| cell).collect::<Vec<_>>())
+    }
+
+    /// The same, with nothing to gain by a visit to some cells.
+    fn without_visits(mut self, visited: &[usize]) -> Self {
+        for layer in Layer::ALL {
+            if !self.counts_in_sight(layer) {
+                let cells = self.layers[layer as usize].as_slice_mut();
+                let cells = cells.expect("invariant: grids are row-major");
+                visited.iter().for_each(|&cell| cells[cell] = 0.0);
+            }
         }
+        self.sums = self.layers.each_ref().map(Sums::of);
+        self
     }
 
     /// The same, with nothing to gain at cells that another robot visits, and nothing to learn at those that it sees.
     pub fn without(mut self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         for layer in Layer::ALL {
-            let counts_in_sight = self.counts_in_sight(layer);
-            let cells = self.layers[layer as usize].as_slice_mut();
-            let cells = cells.expect("invariant: grids are row-major");
-            if counts_in_sight {
+            if self.counts_in_sight(layer) {
+                let cells = self.layers[layer as usize].as_slice_mut();
+                let cells = cells.expect("invariant: grids are row-major");
                 seen.iter().for_each(|it| cells[it.cell] = 0.0);
-            } else {
-                visited.iter().for_each(|&cell| cells[cell] = 0.0);
             }
         }
-        self.sums = self.layers.each_ref().map(Sums::of);
-        self
+        self.without_visits(visited)
     }
 
     pub fn shape(&self) -> Shape {

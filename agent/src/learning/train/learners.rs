@@ -31,14 +31,10 @@ pub fn learner(
         numbers: client.robots(),
     };
     let n_rings = worlds.airspace.n_rings();
-    let is_network = matches!(
-        config.learner,
-        LearnerKind::Neural | LearnerKind::Autoencoder
-    );
+    let decides = config.learner == LearnerKind::Decisions;
     ensure!(
-        n_rings == 1 || !is_network,
-        "learner: expected one that learns several observation matrices, as this server's sensor has {n_rings}: filter, \
-         own_filter or decisions; got another"
+        n_rings == 1 || (decides && !config.decisions.estimator.is_learned()),
+        "learner: expected a sensor with one observation matrix, as beliefs are learned of such alone, got {n_rings}"
     );
     let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {

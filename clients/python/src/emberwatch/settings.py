@@ -275,6 +275,9 @@ def running_spec(
     model = None if info.model is None else Model.from_toml(info.model)
     if settings.model is not None:
         model = Model.named(settings.model).with_radius(info.airspace.radius)
+        has, got = (info.n_observations, info.airspace), (model.n_observations, model.airspace)
+        if has != got:
+            raise invalid("model", f"the server's sensor and no-fly cells, {has}", f"{got}")
     description = info.recorded_states
     if description is not None:
         description = description.with_radius(info.airspace.radius)
