@@ -138,7 +138,8 @@ def test_a_damaged_file_is_read_or_refused(at: int, length: int, edit: str) -> N
         with tempfile.TemporaryDirectory() as folder:
             model = read(Path(folder), text)
     except InvalidArgumentError as error:
-        assert "model.toml" in str(error)
+        # Weights that may vanish are named with the model and the grid, not with the file.
+        assert "model.toml" in str(error) or "transition weights of cell" in str(error)
         return
     assert np.isfinite(model.kernel).all()
     assert np.allclose(model.observation_matrix.sum(axis=1), 1)
