@@ -1,13 +1,11 @@
 //! The messages of the `control` channel: JSON text both ways, rare and readable.
 
 use super::codes::{Status, VERSION};
-use crate::model::Airspace;
 use crate::model::frame::Coverage;
-use crate::model::grid::{Shape, ShapeError};
 use serde::{Deserialize, Serialize};
 
+pub use super::hello::{AirspaceInfo, CoverageRule, RecordedWorld, ServerInfo, ZonesInfo};
 pub use super::json::{MAX_CONTROL_BYTES, parse};
-pub use super::land::{AirspaceInfo, ZonesInfo};
 
 /// Most bytes of a belief in one message, before they are written in base64.
 pub const MAX_BELIEF_PART: usize = 1 << 19;
@@ -164,120 +162,6 @@ pub enum Reply {
         /// Reason for people.
         message: String,
     },
-}
-
-/// The handshake: everything a client needs to know to act.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ServerInfo {
-    /// The server's protocol version.
-    pub protocol: u32,
-    /// The server's release.
-    pub build: String,
-    /// The server's process.
-    pub pid: u32,
-    /// The PID namespace of this number, as Linux numbers it; only there a client can watch the process.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pid_namespace: Option<u64>,
-    /// Grid height H.
-    pub height: usize,
-    /// Grid width W.
-    pub width: usize,
-    /// Moves in a path.
-    pub n_moves: usize,
-    /// Number of worlds.
-    pub n_worlds: u32,
-    /// Robots of each world R.
-    pub n_robots: u32,
-    /// Number of observations O; frames hold values below it, or 255.
-    pub n_observations: usize,
-    /// Names of the observations.
-    pub observations: Vec<String>,
-    /// The model as TOML, if there is one and the server reveals it.
-    pub model: Option<String>,
-    /// The task that the worlds are, by its name.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub task: Option<String>,
-    /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub airspace: Option<AirspaceInfo>,
-    /// Which land each cell is, where lands differ and learners are told.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub zones: Option<ZonesInfo>,
-    /// What worlds show whose hidden states were recorded.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub recorded_world: Option<RecordedWorld>,
-    /// Steps simulated from the initial distribution before k = 0.
-    pub burn_in: u64,
-    /// Episode length; 0: never truncated.
-    pub max_steps: u64,
-    /// Most clients at a time.
-    pub max_clients: usize,
-    /// Which cells a step observes.
-    pub coverage: CoverageRule,
-    /// Whether the `truth` channel exists.
-    pub publish_truth: bool,
-    /// How long a lease lives without use, by default.
-    pub lease_millis: u64,
-    /// How long a world waits for the paths of its other held robots from the first path on; 0: no deadline.
-    pub deadline_millis: u64,
-}
-
-impl ServerInfo {
-    /// Height and width of the grid.
-    ///
-    /// # Errors
-    /// If a side is outside `1..=MAX_SIDE`.
-    pub fn shape(&self) -> Result<Shape, ShapeError> {
-        Shape::new(self.height, self.width)
-    }
-
-    /// Where robots may fly and what they see.
-    ///
-    /// # Errors
-    /// If that is not of the grid, or out of range; the error says what was expected.
-    pub fn airspace(&self) -> Result<Airspace, String> {
-        let shape = self.shape().map_err(|error| error.to_string())?;
-        let airspace = self.airspace.as_ref();
-        let n_rings = airspace.map_or(1, |info| info.n_rings.max(1));
-        if !self.n_observations.is_multiple_of(n_rings) {
-            let expected = format!("observations for each of {n_rings} rings");
-            return Err(format!(
-                "airspace: expected {expected}, got {}",
-                self.n_observations
-            ));
-        }
-        airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
-    }
-
-    /// Steps of the shortest episode, if any is truncated.
-    pub fn shortest_episode(&self) -> Option<u64> {
-        let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);
-        let truncated = Some(self.max_steps).filter(|&steps| steps > 0);
-        recorded.into_iter().chain(truncated).min()
-    }
-}
-
-/// Sequences of recorded hidden states.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordedWorld {
-    /// The description of its states as TOML, if the server reveals it.
-    pub description: Option<String>,
-    /// Number of sequences.
-    pub n_sequences: usize,
-    /// Steps of the shortest episode.
-    pub n_steps: u64,
-}
-
-/// Which cells a server's steps observe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum CoverageRule {
-    /// The cells on the path.
-    Path,
-    /// Every cell.
-    Full,
-    /// The cells on the path, or every cell if the request asks for it.
-    Client,
 }
 
 /// A lease that was given or extended.

@@ -47,9 +47,10 @@ fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
     let mut next = Array3::zeros(p.dim());
     for (row, col) in ndarray::indices((height, width)) {
         let zone = &file.zones[usize::from(zones[[row, col]])].name;
-        let owns: Vec<Option<usize>> = match model.sees_own_state() {
-            true => (0..n_states).map(Some).collect(),
-            false => vec![None],
+        let owns: Vec<Option<usize>> = if model.sees_own_state() {
+            (0..n_states).map(Some).collect()
+        } else {
+            vec![None]
         };
         for own in owns {
             let mut weights: Vec<f64> = file.states.iter().map(|state| state.bias).collect();
@@ -80,9 +81,12 @@ fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
 }
 
 fn random_land(key: u64, n_states: usize, n_zones: u64, own: bool, side: (usize, usize)) -> Model {
-    let of_zone = |zone| match own {
-        true => random_own_model(key + 1000 * zone, n_states, [3, 3]),
-        false => random_model(key + 1000 * zone, n_states, [3, 3]),
+    let of_zone = |zone| {
+        if own {
+            random_own_model(key + 1000 * zone, n_states, [3, 3])
+        } else {
+            random_model(key + 1000 * zone, n_states, [3, 3])
+        }
     };
     let models: Vec<Model> = (0..n_zones).map(of_zone).collect();
     let mut file = zoned(&models, key, side).file().clone();

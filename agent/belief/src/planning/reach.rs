@@ -104,33 +104,39 @@ impl Sight {
         self.rows * self.cols
     }
 
-    /// The rows and columns that a robot may see anew which came by a move from a cell whose surroundings are seen, if
-    /// that `was_seen`, to another; both are cells of the reach.
+    /// The rows and columns that a move may show for the first time, between two cells of the reach; `was_seen`: whether
+    /// all around the first cell was seen.
     #[inline]
-    fn anew(&self, from: (u32, u32), to: (u32, u32), was_seen: bool) -> [Range<usize>; 2] {
+    fn newly_seen(&self, from: (u32, u32), to: (u32, u32), was_seen: bool) -> [Range<usize>; 2] {
         let around = |at: u32, first: usize, side: usize| {
             let at = at as usize + first;
             at.saturating_sub(self.radius)..(at + self.radius + 1).min(side)
         };
         let rows = |row| around(row, self.first.0, self.rows);
         let cols = |col| around(col, self.first.1, self.cols);
-        let (now, mut anew) = ([rows(to.0), cols(to.1)], [rows(to.0), cols(to.1)]);
-        if was_seen {
-            let (rows, cols) = (rows(from.0), cols(from.1));
-            anew = match to.0.cmp(&from.0) {
-                std::cmp::Ordering::Less => [now[0].start..rows.start, cols],
-                std::cmp::Ordering::Greater => [rows.end..now[0].end, cols],
-                std::cmp::Ordering::Equal if to.1 < from.1 => [rows, now[1].start..cols.start],
-                std::cmp::Ordering::Equal => [rows, cols.end..now[1].end],
-            };
+        let (now, before) = ([rows(to.0), cols(to.1)], [rows(from.0), cols(from.1)]);
+        if !was_seen {
+            return now;
         }
-        anew
+        // A move changes the row or the column, by one: what it adds lies at one end.
+        let added = |now: &Range<usize>, before: &Range<usize>| {
+            if now.start < before.start {
+                now.start..before.start
+            } else {
+                before.end..now.end
+            }
+        };
+        if to.0 == from.0 {
+            [now[0].clone(), added(&now[1], &before[1])]
+        } else {
+            [added(&now[0], &before[0]), now[1].clone()]
+        }
     }
 
     /// What a move shows for the first time is worth, given a bit for each cell that was seen.
     #[inline]
     pub fn gain(&self, seen: &[u64], from: (u32, u32), to: (u32, u32), was_seen: bool) -> f32 {
-        let [rows, cols] = self.anew(from, to, was_seen);
+        let [rows, cols] = self.newly_seen(from, to, was_seen);
         let mut gain = 0.0;
         for row in rows {
             for cell in row * self.cols + cols.start..row * self.cols + cols.end {
@@ -143,7 +149,7 @@ impl Sight {
 
     /// Marks what a move shows as seen.
     pub fn mark(&self, seen: &mut [u64], from: (u32, u32), to: (u32, u32), was_seen: bool) {
-        let [rows, cols] = self.anew(from, to, was_seen);
+        let [rows, cols] = self.newly_seen(from, to, was_seen);
         for row in rows {
             for cell in row * self.cols + cols.start..row * self.cols + cols.end {
                 seen[cell / 64] |= 1 << (cell % 64);
