@@ -267,11 +267,6 @@ impl Model {
         self.zone_map.as_ref()
     }
 
-    /// Whether learners are told the zones.
-    pub fn zones_are_public(&self) -> bool {
-        self.file.zones_public
-    }
-
     /// Where robots of a grid may fly, and what they see from there.
     ///
     /// # Errors
