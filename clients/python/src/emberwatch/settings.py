@@ -185,7 +185,7 @@ class WorldSpec:
     burn_in: int
     #: Where robots may fly and what they see.
     airspace: Airspace
-    #: Which land each cell is, for pictures; None where all are alike, or a running server hides it.
+    #: Which land each cell is, for pictures; None where all are alike, or a server hides it.
     zones: Zones | None
     #: Robots of a world.
     n_robots: int
