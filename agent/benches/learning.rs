@@ -23,6 +23,8 @@ fn parameters(sees_own_state: bool) -> Parameters {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
+        n_zones: 0,
+        n_rings: 0,
     };
     Parameters::first(dimensions, 0)
 }

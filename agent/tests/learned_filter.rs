@@ -206,6 +206,8 @@ fn every_gradient_agrees_with_finite_differences() {
                 n_observations,
                 kernel,
                 sees_own_state,
+                n_zones: 0,
+                n_rings: 0,
             };
             check_gradients(dimensions, size, from_belief);
         };
@@ -284,6 +286,8 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
+        n_zones: 0,
+        n_rings: 0,
     }
 }
 

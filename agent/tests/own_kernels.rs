@@ -23,6 +23,8 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
+        n_zones: 0,
+        n_rings: 0,
     }
 }
 
@@ -79,7 +81,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     let mut config = AgentConfig::default();
     config.learning.steady_updates = 600;
     config.learning.falling_updates = 400;
-    let mut learner = FilterFit::new(dimensions(sees_own_state), shape(), &config);
+    let mut learner = FilterFit::new(dimensions(sees_own_state), None, shape(), &config);
     let worlds = 0..N_WORLDS;
     let mut worlds: Vec<World> = worlds
         .map(|world| World::new(model, &learner, 1000 + u64::from(world)))

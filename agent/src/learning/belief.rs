@@ -40,13 +40,9 @@ impl LearnedBelief {
     }
 
     /// Before the first frame. `is_spatial`: whether a filter's corrections reach the neighbours of visited cells.
-    pub fn estimator(
-        &self,
-        is_spatial: bool,
-        shape: Shape,
-    ) -> Result<Box<dyn Estimator>, NetworkError> {
+    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Result<Box<dyn Estimator>> {
         Ok(match self {
-            Self::Filter(model) => model.estimator(is_spatial, shape),
+            Self::Filter(model) => model.estimator(is_spatial, shape)?,
             Self::Neural(model) => Box::new(model.estimator(shape)?),
         })
     }
@@ -95,17 +91,17 @@ impl SavedBelief {
         }
     }
 
-    /// With its tensors, of which `find` gives the numbers by name and shape. `sees_own_state`: whether a filter's kernels
-    /// do; a network computes on `device`.
+    /// With its tensors. `sees_own_state`: whether a filter's kernels do; a network computes on `device`.
     pub fn read(
         &self,
         sees_own_state: bool,
-        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
+        part: &Part<'_>,
         device: &Device,
     ) -> Result<LearnedBelief> {
+        let find = |name: &str, shape: &[usize]| part.tensor(name, shape);
         Ok(match self {
             Self::Filter(saved) => {
-                LearnedBelief::Filter(Box::new(saved.read(sees_own_state, find)?))
+                LearnedBelief::Filter(Box::new(saved.read(sees_own_state, part)?))
             }
             Self::Neural {
                 n_observations,
@@ -117,7 +113,7 @@ impl SavedBelief {
                 network.set_parameters(&find)?;
                 let filter = filter
                     .as_ref()
-                    .map(|it| it.read_corrected(*n_observations, &find));
+                    .map(|it| it.read_corrected(*n_observations, part));
                 LearnedBelief::Neural(NeuralModel {
                     network,
                     target: *target,

@@ -113,6 +113,14 @@ impl Contents {
         Ok(tensor.numbers.clone())
     }
 
+    /// The tensors whose names begin so.
+    pub fn part(&self, prefix: &'static str) -> Part<'_> {
+        Part {
+            contents: self,
+            prefix: prefix.into(),
+        }
+    }
+
     /// Refuses means of squares, whose roots are taken, that are negative.
     pub fn check_squares(&self) -> Result<()> {
         let ends = [".second_moment", "running_var"];
@@ -143,6 +151,35 @@ impl Contents {
         digest.update(&self.state);
         digest.update(self.settings.as_bytes());
         format!("{:08x}", digest.finalize())
+    }
+}
+
+/// Tensors of a checkpoint whose names begin alike.
+#[derive(Debug, Clone)]
+pub struct Part<'a> {
+    contents: &'a Contents,
+    prefix: String,
+}
+
+impl Part<'_> {
+    /// A part of this part.
+    pub fn part(&self, prefix: &str) -> Self {
+        Self {
+            contents: self.contents,
+            prefix: format!("{}{prefix}", self.prefix),
+        }
+    }
+
+    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
+        self.contents
+            .tensor(&format!("{}{name}", self.prefix), expected)
+    }
+
+    /// The axes of a tensor, if it is there.
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        let tensor = self.contents.tensors.get(&format!("{}{name}", self.prefix));
+        tensor.map(|tensor| &*tensor.shape)
     }
 }
 

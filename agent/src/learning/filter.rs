@@ -14,6 +14,7 @@ mod layout;
 mod operator;
 mod optimiser;
 mod recursion;
+mod zoned;
 
 pub use adam::Adam;
 pub use optimiser::{Optimiser, Update};

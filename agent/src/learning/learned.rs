@@ -156,8 +156,7 @@ fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedBelief> {
         sees_own_state,
         ..saved.optimiser.dimensions()
     };
-    let dimensions = dimensions.check();
-    let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-    saved.load(contents, dimensions)?;
+    let of_tensors = read_parameters(dimensions, &contents.part(""))?;
+    saved.load(contents, of_tensors.dimensions)?;
     Ok(LearnedBelief::Filter(Box::new(saved.learned())))
 }

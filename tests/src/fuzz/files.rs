@@ -153,6 +153,8 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state,
+        n_zones: 0,
+        n_rings: 0,
     }
 }
 
@@ -160,6 +162,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
 fn worlds() -> Worlds {
     Worlds {
         airspace: Airspace::open(Shape::new(1, 3).expect("a grid")),
+        zones: None,
         n_observations: 2,
         n_moves: 2,
         numbers: 0..1,
@@ -186,7 +189,7 @@ fn decisions() -> Contents {
 }
 
 fn base_of_filter() -> Base {
-    let fit = FilterFit::new(dimensions(false), worlds().shape(), &config());
+    let fit = FilterFit::new(dimensions(false), None, worlds().shape(), &config());
     let belief = LearnedBelief::Filter(Box::new(fit.learned()));
     Base::learned(EstimatorKind::LEARNED, belief, worlds().shape())
 }
@@ -214,7 +217,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape(), config());
-    let mut fit = FilterFit::new(dimensions, shape, &config);
+    let mut fit = FilterFit::new(dimensions, None, shape, &config);
     let belief = Belief::uniform(2, shape);
     fit.begin(0);
     for value in [0, 1, 1, 0, 1] {

@@ -144,7 +144,8 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
     let bias = vec![0.0; n_states];
-    let transition = Transition::of_weights(&kernels, &bias, belief.shape(), (None, 1));
+    let zones = (tables.zones.as_deref(), dimensions.n_zones.max(1));
+    let transition = Transition::of_weights(&kernels, &bias, belief.shape(), zones);
     (transition, likelihood, checksum)
 }
 

@@ -7,9 +7,10 @@
 use crate::estimation::belief::Belief;
 use emberwatch_protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Model, Shape};
+use emberwatch_protocol::{Grid, Model, Shape};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
@@ -37,23 +38,36 @@ pub struct Dimensions {
     /// Whether each state that a cell itself can be in has a kernel of its own. The kind of a checkpoint tells it.
     #[serde(skip)]
     pub sees_own_state: bool,
+    /// Zones of land with kernels of their own; 0: all cells are alike. A checkpoint's tensors tell it.
+    #[serde(skip)]
+    pub n_zones: usize,
+    /// Observation matrices of the sensor; 0: one. A checkpoint's tensors tell it.
+    #[serde(skip)]
+    pub n_rings: usize,
 }
 
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
-    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
+    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, with an axis for zones before, `[S, O]` or `[S, M, O / M]`, and `[S]`,
+    /// row-major.
     #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
+    /// The zone of each cell, where zones have kernels of their own.
+    #[serde(skip)]
+    pub zones: Option<Arc<Grid<u8>>>,
 }
 
 /// What the free numbers stand for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`; for each
+    /// zone, one after the other.
     pub kernel: Vec<f32>,
+    /// The zone of each cell, where zones have kernels of their own.
+    pub zones: Option<Arc<Grid<u8>>>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<f32>,
     /// The belief about every cell before the first frame, shape `[S]`.
@@ -106,16 +120,28 @@ impl Dimensions {
         if self.sees_own_state {
             kernel.insert(0, states);
         }
-        [kernel, vec![states, self.n_observations], vec![states]]
+        if self.n_zones > 0 {
+            kernel.insert(0, self.n_zones);
+        }
+        let likelihood = match self.n_rings {
+            0 => vec![states, self.n_observations],
+            n_rings => vec![states, n_rings, self.n_observations / n_rings],
+        };
+        [kernel, likelihood, vec![states]]
     }
 
-    /// One for all cells, or one for each state that a cell itself can be in.
-    pub fn n_kernels(&self) -> usize {
+    /// Kernels of a zone: one for all cells, or one for each state that a cell itself can be in.
+    pub fn n_own(&self) -> usize {
         if self.sees_own_state {
             self.n_states
         } else {
             1
         }
+    }
+
+    /// Observations of each matrix of the sensor.
+    pub fn n_named(&self) -> usize {
+        self.n_observations / self.n_rings.max(1)
     }
 
     pub fn lengths(&self) -> [usize; 3] {
@@ -141,10 +167,8 @@ impl Parameters {
             weight.exp_m1().ln() as f32
         };
         let logit = |index: usize| {
-            let (state, seen) = (
-                index / dimensions.n_observations,
-                index % dimensions.n_observations,
-            );
+            let state = index / dimensions.n_observations;
+            let seen = index % dimensions.n_observations % dimensions.n_named();
             let own = if state == seen { OWN_OBSERVATION } else { 0.0 };
             own + noise(n_kernel + index)
         };
@@ -155,7 +179,23 @@ impl Parameters {
                 (0..n_likelihood).map(logit).collect(),
                 vec![0.0; n_initial],
             ],
+            zones: None,
         }
+    }
+
+    /// The same on land with kernels for each zone, which the map tells of each cell.
+    ///
+    /// # Panics
+    /// If the dimensions are of fewer zones.
+    pub fn on_land(mut self, zones: Option<Arc<Grid<u8>>>) -> Self {
+        let most = zones.iter().flat_map(|map| map.iter()).max();
+        let n_zones = most.map_or(0, |&zone| usize::from(zone) + 1);
+        assert!(
+            n_zones <= self.dimensions.n_zones.max(1),
+            "zones: expected those of the dimensions"
+        );
+        self.zones = zones;
+        self
     }
 
     pub fn zeros(dimensions: Dimensions) -> Self {
@@ -163,6 +203,7 @@ impl Parameters {
         Self {
             dimensions,
             tensors,
+            zones: None,
         }
     }
 
@@ -173,6 +214,7 @@ impl Parameters {
         Tables {
             dimensions: self.dimensions,
             kernel: kernel.iter().map(weight).collect(),
+            zones: self.zones.clone(),
             likelihood: cast(self.likelihood()),
             initial: cast(softmax(initial)),
         }
@@ -180,7 +222,7 @@ impl Parameters {
 
     /// `P(y | x)`, shape `[S, O]`.
     pub fn likelihood(&self) -> Vec<f64> {
-        let rows = self.tensors[1].chunks_exact(self.dimensions.n_observations);
+        let rows = self.tensors[1].chunks_exact(self.dimensions.n_named());
         rows.flat_map(softmax).collect()
     }
 
@@ -189,11 +231,12 @@ impl Parameters {
         let [kernel, likelihood, initial] = &self.tensors;
         let [by_kernel, by_likelihood, by_initial] = by_tables;
         let slope = |(&free, by): (&f32, &f64)| (by / (1.0 + (-f64::from(free)).exp())) as f32;
-        let n_observations = self.dimensions.n_observations;
+        let n_named = self.dimensions.n_named();
         let rows = likelihood
-            .chunks_exact(n_observations)
-            .zip(by_likelihood.chunks_exact(n_observations));
+            .chunks_exact(n_named)
+            .zip(by_likelihood.chunks_exact(n_named));
         Self {
+            zones: None,
             dimensions: self.dimensions,
             tensors: [
                 kernel.iter().zip(by_kernel).map(slope).collect(),
@@ -235,7 +278,14 @@ impl Tables {
                 n_observations: model.n_observations(),
                 kernel: (height, width),
                 sees_own_state: model.sees_own_state(),
+                n_zones: model.zone_map().map_or(0, |_| model.n_zones()),
+                n_rings: if model.n_rings() > 1 {
+                    model.n_rings()
+                } else {
+                    0
+                },
             },
+            zones: model.zone_map().cloned(),
             kernel: model.kernels().iter().flatten().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
             initial: model.initial().iter().map(cast).collect(),
@@ -294,6 +344,8 @@ mod tests {
             n_observations: 4,
             kernel: (3, 1),
             sees_own_state: false,
+            n_zones: 0,
+            n_rings: 0,
         }
     }
 

@@ -47,6 +47,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> Progress {
     let worlds = Worlds {
         airspace: Airspace::open(shape()),
+        zones: None,
         n_observations: 3,
         n_moves: N_MOVES,
         numbers: 0..1,
@@ -103,8 +104,10 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
             n_observations: 3,
             kernel: (3, 3),
             sees_own_state,
+            n_zones: 0,
+            n_rings: 0,
         };
-        Some(FilterFit::new(dimensions, shape(), &AgentConfig::default()).learned())
+        Some(FilterFit::new(dimensions, None, shape(), &AgentConfig::default()).learned())
     };
     let learned = Learned {
         filter: filter(false),

@@ -62,6 +62,8 @@ mod tests {
             n_observations: 2,
             kernel: (1, 1),
             sees_own_state: false,
+            n_zones: 0,
+            n_rings: 0,
         };
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);

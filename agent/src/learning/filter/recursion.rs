@@ -9,6 +9,7 @@
 use crate::learning::filter::convolution::Region;
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::Operator;
+use crate::learning::filter::zoned::ZonedOperator;
 use crate::learning::replay::Sighting;
 use emberwatch_belief::estimation::parameters::Tables;
 use emberwatch_protocol::Shape;
@@ -26,7 +27,7 @@ pub struct Outcome {
 /// The recursion with its work space: give each thread its own.
 #[derive(Debug, Clone)]
 pub struct Recursion {
-    operator: Operator,
+    operator: Phi,
     tables: Tables,
     /// Posteriors of each frame, and the predictor after the last.
     planes: Vec<Vec<f32>>,
@@ -38,6 +39,31 @@ pub struct Recursion {
     /// `dL/dp` or `dL/du`; `dL/dv`, and forward room for `v`.
     by_belief: Vec<f32>,
     by_weights: Vec<f32>,
+}
+
+/// The operator of cells that are alike, or that differ by zone.
+#[derive(Debug, Clone)]
+enum Phi {
+    Alike(Operator),
+    Zoned(ZonedOperator),
+}
+
+impl Phi {
+    fn new(layout: Layout, tables: &Tables) -> Self {
+        let n_own = tables.dimensions.n_own();
+        match &tables.zones {
+            None => Self::Alike(Operator::new(layout, n_own, &tables.kernel)),
+            Some(zones) => Self::Zoned(ZonedOperator::new(layout, zones, n_own, &tables.kernel)),
+        }
+    }
+
+    /// Room for the weights' planes, where there are such.
+    fn weighed_planes(&self) -> Vec<f32> {
+        match self {
+            Self::Alike(operator) => operator.weighed_planes(),
+            Self::Zoned(_) => Vec::new(),
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -53,7 +79,7 @@ impl Recursion {
     pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
         let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
-        let operator = Operator::new(layout, dimensions.n_kernels(), &tables.kernel);
+        let operator = Phi::new(layout, &tables);
         Self {
             by_weights: operator.weighed_planes(),
             operator,
@@ -68,8 +94,7 @@ impl Recursion {
 
     /// Takes other parameters of the same dimensions.
     pub fn set(&mut self, tables: &Tables) {
-        let n_kernels = tables.dimensions.n_kernels();
-        self.operator = Operator::new(self.layout(), n_kernels, &tables.kernel);
+        self.operator = Phi::new(self.layout(), tables);
         self.tables.clone_from(tables);
     }
 
@@ -93,7 +118,10 @@ impl Recursion {
     }
 
     fn layout(&self) -> Layout {
-        self.operator.layout
+        match &self.operator {
+            Phi::Alike(operator) => operator.layout,
+            Phi::Zoned(operator) => operator.layout,
+        }
     }
 
     fn begin(&mut self, start: Option<&[f32]>) {
@@ -143,8 +171,11 @@ impl Recursion {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
         let weights = &mut self.by_weights;
-        self.operator
-            .forward(simd, &before[frame], &mut after[0], factors, weights);
+        let (p, u) = (&before[frame], &mut after[0]);
+        match &mut self.operator {
+            Phi::Alike(operator) => operator.forward(simd, p, u, factors, weights),
+            Phi::Zoned(operator) => operator.forward(p, u),
+        }
     }
 
     #[inline(always)]
@@ -199,8 +230,14 @@ impl Recursion {
     ) -> Region {
         let (before, after) = self.planes.split_at_mut(frame);
         let (p, u, factors) = (&before[frame - 1], &mut after[0], &self.factors[frame]);
-        let operator = &self.operator;
         let (g, h) = (&mut self.by_belief, &mut self.by_weights);
+        let operator = match &mut self.operator {
+            Phi::Alike(operator) => operator,
+            Phi::Zoned(operator) => {
+                operator.backward(p, g, &mut outcome.gradient[0]);
+                return region.reached(&operator.layout);
+            }
+        };
         operator.backward_normalise(simd, p, u, factors, (g, h), region);
         operator.add_weight_gradient(simd, p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
@@ -252,7 +289,9 @@ impl WithSimd for Pass<'_> {
             .layout()
             .unload(&recursion.planes[n_frames], self.end);
         recursion.backward(simd, n_frames, &mut outcome);
-        recursion.operator.end_gradient(&mut outcome.gradient[0]);
+        if let Phi::Alike(operator) = &recursion.operator {
+            operator.end_gradient(&mut outcome.gradient[0]);
+        }
         if self.start.is_none() {
             recursion.add_initial_gradient(&mut outcome);
         }

@@ -12,7 +12,7 @@ type Lanes = [f32; LANES];
 /// Weights `w[zone, to, from, row, col]`, or `w[zone, own, to, from, row, col]`, laid out for a grid.
 #[derive(Debug, Clone)]
 pub(super) struct ZonedOperator {
-    layout: Layout,
+    pub(super) layout: Layout,
     /// Kernels of a zone: 1, or one for each state that a cell itself can be in.
     n_own: usize,
     weights: Vec<f32>,
@@ -72,10 +72,14 @@ impl ZonedOperator {
                 let share = self.share(own, &total);
                 for state in 0..n_states {
                     let lanes = self.next[state].iter_mut().zip(&self.weighed[state]);
-                    lanes.zip(&share).for_each(|((next, v), share)| *next += v * share);
+                    lanes
+                        .zip(&share)
+                        .for_each(|((next, v), share)| *next += v * share);
                 }
             }
-            let Chunk { n_cells, places, .. } = &self.chunks[at];
+            let Chunk {
+                n_cells, places, ..
+            } = &self.chunks[at];
             for (state, next) in self.next.iter().enumerate() {
                 for (place, next) in places[..*n_cells].iter().zip(next) {
                     u[state * self.layout.plane + place] = *next;
@@ -98,7 +102,9 @@ impl ZonedOperator {
             for own in 0..self.n_own {
                 self.unweigh(at, own, gradient);
             }
-            let Chunk { n_cells, places, .. } = &self.chunks[at];
+            let Chunk {
+                n_cells, places, ..
+            } = &self.chunks[at];
             for (input, by) in self.by_inputs.iter().enumerate() {
                 let (from, tap) = (input / self.offsets.len(), input % self.offsets.len());
                 let first = from * self.layout.plane + self.offsets[tap];
@@ -125,7 +131,9 @@ impl ZonedOperator {
     /// Reads `dL/du` of a chunk; whether any is not 0.
     #[inline(always)]
     fn gather_next(&mut self, at: usize) -> bool {
-        let Chunk { n_cells, places, .. } = &self.chunks[at];
+        let Chunk {
+            n_cells, places, ..
+        } = &self.chunks[at];
         let mut any = false;
         for (state, lanes) in self.next.iter_mut().enumerate() {
             *lanes = [0.0; LANES];
@@ -154,9 +162,15 @@ impl ZonedOperator {
                     }
                     continue;
                 }
-                weighed.iter_mut().zip(lanes).for_each(|(v, x)| *v += weight * x);
+                weighed
+                    .iter_mut()
+                    .zip(lanes)
+                    .for_each(|(v, x)| *v += weight * x);
             }
-            total.iter_mut().zip(&*weighed).for_each(|(total, v)| *total += v);
+            total
+                .iter_mut()
+                .zip(&*weighed)
+                .for_each(|(total, v)| *total += v);
         }
         total
     }
@@ -183,8 +197,11 @@ impl ZonedOperator {
                 mean[lane] += g[lane] * v[lane] / total[lane];
             }
         }
-        let (n_inputs, n_taps, centre) =
-            (self.inputs.len(), self.offsets.len(), self.offsets.len() / 2);
+        let (n_inputs, n_taps, centre) = (
+            self.inputs.len(),
+            self.offsets.len(),
+            self.offsets.len() / 2,
+        );
         let first = self.kernel(at, own);
         for (to, g) in self.next.iter().enumerate() {
             let mut h = [0.0; LANES];

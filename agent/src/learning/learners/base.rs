@@ -12,8 +12,9 @@ use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Rollout, Seen};
 use emberwatch_belief::planning::Target;
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::{Airspace, Move, Shape};
+use emberwatch_protocol::{Airspace, Grid, Move, Shape};
 use std::ops::Range;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// The robots to fly, as far as a learner is told.
@@ -21,6 +22,8 @@ use std::time::Duration;
 pub struct Worlds {
     /// Where robots may fly and what they see.
     pub airspace: Airspace,
+    /// The zone of each cell, shape `[H, W]`, where lands differ and learners are told.
+    pub zones: Option<Arc<Grid<u8>>>,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     pub n_moves: usize,

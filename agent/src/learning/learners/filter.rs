@@ -43,7 +43,8 @@ pub struct FilterLearner {
 impl FilterLearner {
     /// A learner before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let fit = FilterFit::new(dimensions, worlds.shape(), config);
+        let zones = worlds.zones.clone();
+        let fit = FilterFit::new(dimensions, zones, worlds.shape(), config);
         Self::of(fit, BTreeMap::new(), worlds, config)
     }
 
@@ -58,7 +59,8 @@ impl FilterLearner {
             worlds: mut left,
         } = contents.state()?;
         let shape = fit.optimiser.shape;
-        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape(), config)?;
+        let zones = worlds.zones.clone();
+        let fit = FilterFit::resume(fit, contents, dimensions, zones, worlds.shape(), config)?;
         let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
         if shape != worlds.shape() {

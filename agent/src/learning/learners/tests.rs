@@ -27,6 +27,7 @@ const ROBOT: Cell = Cell { row: 4, col: 4 };
 fn worlds() -> Worlds {
     Worlds {
         airspace: Airspace::open(Shape::new(8, 9).expect("test shape")),
+        zones: None,
         n_observations: 3,
         n_moves: 6,
         numbers: 0..1,
@@ -140,6 +141,8 @@ fn learners_plan_on_the_belief_that_settings_say() {
             n_observations: 3,
             kernel: (3, 3),
             sees_own_state: false,
+            n_zones: 0,
+            n_rings: 0,
         };
         let learner = FilterLearner::new(dimensions, worlds(), config);
         let beam = |belief: &Belief, target: usize, step: u64| {
@@ -210,8 +213,16 @@ fn learned_filter(sees_own_state: bool) -> LearnedModel {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
+        n_zones: 0,
+        n_rings: 0,
     };
-    FilterFit::new(dimensions, worlds().shape(), &config(BasisKind::Estimate)).learned()
+    FilterFit::new(
+        dimensions,
+        None,
+        worlds().shape(),
+        &config(BasisKind::Estimate),
+    )
+    .learned()
 }
 
 #[test]

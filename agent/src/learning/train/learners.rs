@@ -13,8 +13,9 @@ use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_protocol::control::{CoverageRule, ServerInfo};
-use emberwatch_protocol::{Client, Model, Shape};
+use emberwatch_protocol::{Client, Grid, Model, Shape};
 use std::path::Path;
+use std::sync::Arc;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.
 pub fn learner(
@@ -26,20 +27,24 @@ pub fn learner(
     let (info, config) = (client.info(), &spec.config);
     let worlds = Worlds {
         airspace: info.airspace().map_err(anyhow::Error::msg)?,
+        zones: zones(info)?,
         n_observations: info.n_observations,
         n_moves: info.n_moves,
         numbers: client.robots(),
     };
     let n_rings = worlds.airspace.n_rings();
-    let decides = config.learner == LearnerKind::Decisions;
+    let is_network = matches!(
+        config.learner,
+        LearnerKind::Neural | LearnerKind::Autoencoder
+    );
     ensure!(
-        n_rings == 1 || (decides && !config.decisions.estimator.is_learned()),
-        "learner: expected a sensor with one observation matrix, as beliefs are learned of such alone, got {n_rings}"
+        n_rings == 1 || !is_network,
+        "learner: expected a sensor with one observation matrix, as networks learn such alone, got {n_rings}"
     );
     let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {
         LearnerKind::Filter | LearnerKind::OwnFilter => {
-            let dimensions = dimensions(config, worlds.n_observations)?;
+            let dimensions = dimensions(config, &worlds)?;
             Box::new(match contents {
                 Some(contents) => FilterLearner::resume(contents, dimensions, worlds, config)
                     .with_context(of_file)?,
@@ -123,18 +128,31 @@ fn base(spec: &TrainingSpec, info: &ServerInfo, shape: Shape) -> Result<Base> {
     Ok(Base::known(kind, filter, &model))
 }
 
-fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions> {
-    let learning = config.learning;
+fn zones(info: &ServerInfo) -> Result<Option<Arc<Grid<u8>>>> {
+    let shape = info.shape()?;
+    let map = info.zones.as_ref().map(|zones| zones.zone_map(shape));
+    let map = map.transpose().map_err(anyhow::Error::msg)?;
+    // Of one zone, all cells are alike.
+    Ok(map
+        .filter(|map| map.iter().any(|&zone| zone > 0))
+        .map(Arc::new))
+}
+
+fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
+    let (learning, n_rings) = (config.learning, worlds.airspace.n_rings());
     let n_states = match learning.states {
-        0 => n_observations,
+        0 => worlds.n_observations / n_rings,
         states => states,
     };
+    let most = worlds.zones.iter().flat_map(|map| map.iter()).max();
     let kernel = (learning.kernel[0], learning.kernel[1]);
     let dimensions = Dimensions {
         n_states,
-        n_observations,
+        n_observations: worlds.n_observations,
         kernel,
         sees_own_state: config.learner == LearnerKind::OwnFilter,
+        n_zones: most.map_or(0, |&zone| usize::from(zone) + 1),
+        n_rings: if n_rings > 1 { n_rings } else { 0 },
     };
     Ok(dimensions.check()?)
 }

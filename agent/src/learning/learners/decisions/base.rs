@@ -6,7 +6,7 @@ use crate::learning::checkpoint::Contents;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
-use emberwatch_network::{Device, NetworkError};
+use emberwatch_network::Device;
 use emberwatch_protocol::{Model, Shape};
 
 /// What keeps the beliefs that decisions are made on, before a world's first frame.
@@ -52,7 +52,7 @@ impl Base {
         }
     }
 
-    pub(super) fn estimator(&self) -> Result<Box<dyn Estimator>, NetworkError> {
+    pub(super) fn estimator(&self) -> Result<Box<dyn Estimator>> {
         let is_spatial = self.kind.is_spatial();
         match &self.start {
             Start::Known(filter) => {

@@ -95,10 +95,11 @@ impl SavedDecisions {
         let is_neural = matches!(self.belief, Some(SavedBelief::Neural { .. }));
         let fits = is_neural == (self.estimator == EstimatorKind::Neural);
         check(fits, "belief", self.estimator.label(), "another")?;
-        let find = |name: &str, shape: &[usize]| contents.tensor(&format!("{BELIEF}{name}"), shape);
         let is_own = self.estimator.sees_own_state();
         let belief = self.belief.as_ref();
-        belief.map(|it| it.read(is_own, find, device)).transpose()
+        belief
+            .map(|it| it.read(is_own, &contents.part(BELIEF), device))
+            .transpose()
     }
 
     pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {

@@ -7,6 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
+use crate::learning::learners::filter::model::{read_parameters, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use anyhow::Result;
@@ -14,8 +15,9 @@ use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_network::NamedTensor;
-use emberwatch_protocol::{Frame, Shape};
+use emberwatch_protocol::{Frame, Grid, Shape};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 pub const KIND: &str = "learned_filter";
 
@@ -65,8 +67,13 @@ pub struct FilterFit {
 
 impl FilterFit {
     /// Before the first frame.
-    pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
-        let parameters = Parameters::first(dimensions, config.seed);
+    pub fn new(
+        dimensions: Dimensions,
+        zones: Option<Arc<Grid<u8>>>,
+        shape: Shape,
+        config: &AgentConfig,
+    ) -> Self {
+        let parameters = Parameters::first(dimensions, config.seed).on_land(zones);
         Self {
             optimiser: Optimiser::new(parameters, shape, config.learning, config.seed),
             reward: RewardEstimate::new(dimensions.n_states),
@@ -162,7 +169,10 @@ impl FilterFit {
                 (name, shapes[at].clone(), part.tensors[at].clone())
             })
         };
-        SUFFIXES.into_iter().zip(parts).flat_map(named).collect()
+        let parts = SUFFIXES.into_iter().zip(parts).flat_map(named);
+        parts
+            .chain(zones_tensor(self.optimiser.parameters()))
+            .collect()
     }
 
     /// Takes the tensors of a checkpoint that it is of, as those of given dimensions.
@@ -170,13 +180,21 @@ impl FilterFit {
     /// # Errors
     /// Names what is missing or of another form.
     pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
+        let empty = read_parameters(dimensions, &contents.part(""))?;
+        let (expected, got) = (dimensions.shapes(), empty.dimensions.shapes());
+        check(
+            got == expected,
+            "tensors",
+            format!("shapes {expected:?}"),
+            format!("{got:?}"),
+        )?;
         let counts = [
             ("n_updates", self.n_updates()),
             ("world_steps", self.world_steps),
         ];
         check_counts(&counts)?;
         let part = |suffix: &str| -> Result<Parameters> {
-            let mut part = Parameters::zeros(dimensions);
+            let mut part = empty.clone();
             for (at, shape) in dimensions.shapes().iter().enumerate() {
                 let name = format!("{}{suffix}", Parameters::NAMES[at]);
                 part.tensors[at] = contents.tensor(&name, shape)?;
@@ -199,11 +217,14 @@ impl FilterFit {
         mut saved: Self,
         contents: &Contents,
         dimensions: Dimensions,
+        zones: Option<Arc<Grid<u8>>>,
         shape: Shape,
         config: &AgentConfig,
     ) -> Result<Self> {
         saved.load(contents, dimensions)?;
-        let mut fit = Self::new(dimensions, shape, config);
+        let is_same = saved.optimiser.parameters().zones == zones;
+        check(is_same, "zones", "those of the server", "others")?;
+        let mut fit = Self::new(dimensions, zones, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
             let fits = (0.0..MAX_EARNED).contains(&saved.earned);
             check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
@@ -239,6 +260,8 @@ mod tests {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state: false,
+        n_zones: 0,
+        n_rings: 0,
     };
 
     fn shape() -> Shape {
@@ -266,7 +289,7 @@ mod tests {
     }
 
     fn fit() -> FilterFit {
-        let mut fit = FilterFit::new(DIMENSIONS, shape(), &config());
+        let mut fit = FilterFit::new(DIMENSIONS, None, shape(), &config());
         fit.begin(4);
         see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
         fit

@@ -1,23 +1,38 @@
 //! A learned filter as others need it: its estimator, and as part of their checkpoints.
 
-use crate::learning::checkpoint::{check, wrong};
+use crate::learning::checkpoint::{Part, check, wrong};
 use crate::learning::learners::filter::fit::LearnedModel;
 use anyhow::Result;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_network::NamedTensor;
-use emberwatch_protocol::Shape;
+use emberwatch_protocol::{Grid, Shape};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// The name of the tensor that holds the zone of each cell.
+const ZONES: &str = "zones";
 
 /// Before the names of the tensors of the filter that a neural belief corrects.
 const FILTER: &str = "filter.";
 
 impl LearnedModel {
     /// Before the first frame. `is_spatial`: whether its corrections reach the neighbours of visited cells.
-    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Estimator> {
+    ///
+    /// # Errors
+    /// If it was learned on land of another grid.
+    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Result<Box<dyn Estimator>> {
+        let of_zones = self.tables.zones.as_ref().map(|zones| zones.dim());
+        let got = of_zones.unwrap_or(shape.dim());
+        check(
+            got == shape.dim(),
+            ZONES,
+            format!("those of a {shape} grid"),
+            format!("{got:?}"),
+        )?;
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
         let neighbours = || (self.target, self.correlations.clone());
-        correcting(filter, is_spatial.then(neighbours))
+        Ok(correcting(filter, is_spatial.then(neighbours)))
     }
 
     pub fn tensors(&self) -> Vec<NamedTensor> {
@@ -25,7 +40,7 @@ impl LearnedModel {
         let names = Parameters::NAMES.iter().map(|name| (*name).to_owned());
         let tensors = names.zip(shapes).zip(self.parameters.tensors.clone());
         let tensors = tensors.map(|((name, shape), numbers)| (name, shape, numbers));
-        tensors.collect()
+        tensors.chain(zones_tensor(&self.parameters)).collect()
     }
 
     /// Those of a filter that a neural belief corrects.
@@ -52,37 +67,71 @@ impl SavedModel {
         }
     }
 
-    pub fn read(
-        &self,
-        sees_own_state: bool,
-        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
-    ) -> Result<LearnedModel> {
+    pub fn read(&self, sees_own_state: bool, part: &Part<'_>) -> Result<LearnedModel> {
         let dimensions = Dimensions {
             sees_own_state,
             ..self.dimensions
         };
-        let dimensions = dimensions.check();
-        let dimensions =
-            dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+        let mut parameters = read_parameters(dimensions, part)?;
+        let dimensions = parameters.dimensions;
         check_target(self.target, dimensions.n_states)?;
-        let mut parameters = Parameters::zeros(dimensions);
         for (at, shape) in dimensions.shapes().iter().enumerate() {
-            parameters.tensors[at] = find(Parameters::NAMES[at], shape)?;
+            parameters.tensors[at] = part.tensor(Parameters::NAMES[at], shape)?;
         }
         let correlations = self.correlations.clone();
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
 
     /// One that a neural belief corrects, about so many observations.
-    pub fn read_corrected(
-        &self,
-        n_observations: usize,
-        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>>,
-    ) -> Result<LearnedModel> {
+    pub fn read_corrected(&self, n_observations: usize, part: &Part<'_>) -> Result<LearnedModel> {
         let (name, got) = ("filter.n_observations", self.dimensions.n_observations);
         check(got == n_observations, name, n_observations, got)?;
-        self.read(false, |name, shape| find(&format!("{FILTER}{name}"), shape))
+        self.read(false, &part.part(FILTER))
     }
+}
+
+/// The zones that a filter was learned on, where it has kernels for each.
+pub fn zones_tensor(parameters: &Parameters) -> Option<NamedTensor> {
+    let map = parameters.zones.as_ref()?;
+    let (height, width) = map.dim();
+    let numbers = map.iter().map(|&zone| f32::from(zone)).collect();
+    Some((ZONES.into(), vec![height, width], numbers))
+}
+
+/// Parameters of a filter's dimensions, with the zones and the observation matrices that its tensors tell of; all zeros.
+pub fn read_parameters(dimensions: Dimensions, part: &Part<'_>) -> Result<Parameters> {
+    let zones = part
+        .shape(ZONES)
+        .map(|shape| read_zones(shape, part))
+        .transpose()?;
+    let n_rings = match part.shape(Parameters::NAMES[1]) {
+        Some(&[_, n_rings, _]) => n_rings,
+        _ => 0,
+    };
+    let most = zones.iter().flat_map(|map| map.iter()).max();
+    let dimensions = Dimensions {
+        n_zones: most.map_or(0, |&zone| usize::from(zone) + 1),
+        n_rings,
+        ..dimensions
+    };
+    let dimensions = dimensions.check();
+    let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+    Ok(Parameters::zeros(dimensions).on_land(zones.map(Arc::new)))
+}
+
+fn read_zones(shape: &[usize], part: &Part<'_>) -> Result<Grid<u8>> {
+    let &[height, width] = shape else {
+        return Err(wrong(ZONES, "a map of a grid", format!("{shape:?}")));
+    };
+    let grid = Shape::new(height, width).map_err(|error| wrong(ZONES, "a map of a grid", error))?;
+    let numbers = part.tensor(ZONES, shape)?;
+    let is_zone = |number: &f32| (0.0..256.0).contains(number) && number.fract() == 0.0;
+    if let Some(got) = numbers.iter().find(|number| !is_zone(number)) {
+        return Err(wrong(ZONES, "zones from 0 to 255", got));
+    }
+    let zones = numbers.iter().map(|&number| number as u8).collect();
+    let zones = Grid::from_shape_vec(grid.dim(), zones);
+    Ok(zones.expect("invariant: the tensor has this shape"))
 }
 
 pub fn check_target(target: usize, n_states: usize) -> Result<()> {

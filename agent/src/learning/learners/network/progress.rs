@@ -134,6 +134,7 @@ impl Progress {
         check_belief("prediction", prediction, sizes.n_states, shape)?;
         let worlds = Worlds {
             airspace: Airspace::open(shape),
+            zones: None,
             n_observations,
             n_moves: 0,
             numbers: 0..1,

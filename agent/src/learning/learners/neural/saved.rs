@@ -85,7 +85,7 @@ impl NeuralModel {
     }
 
     /// Before the first frame.
-    pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator, NetworkError> {
+    pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
         estimator(&self.network, self.filter.as_deref(), shape)
     }
 }
@@ -95,9 +95,9 @@ pub(super) fn estimator(
     network: &NeuralBelief,
     filter: Option<&LearnedModel>,
     shape: Shape,
-) -> Result<NeuralEstimator, NetworkError> {
-    let filter = filter.map(|it| it.estimator(true, shape));
-    NeuralEstimator::new(network, filter, shape)
+) -> Result<NeuralEstimator> {
+    let filter = filter.map(|it| it.estimator(true, shape)).transpose()?;
+    Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 
 /// A network whose parameters are still to be read; refuses numbers of observations that no world has.
@@ -111,9 +111,8 @@ pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelie
 impl SavedNeural<'_> {
     /// The filter that it corrects.
     pub(super) fn filter(&self, contents: &Contents) -> Result<Option<Box<LearnedModel>>> {
-        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
         let filter = self.filter.as_ref();
-        let filter = filter.map(|it| it.read_corrected(self.n_observations, find));
+        let filter = filter.map(|it| it.read_corrected(self.n_observations, &contents.part("")));
         Ok(filter.transpose()?.map(Box::new))
     }
 
