@@ -7,7 +7,8 @@ use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Model, Probabilities, Shape};
+use emberwatch_protocol::{Cell, Frame, Grid, Model, Probabilities, Shape};
+use std::sync::Arc;
 
 /// What a few cells of a made-up world show: no two frames see the same cells.
 fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
@@ -114,17 +115,26 @@ fn loss(
     loss
 }
 
+/// The zone of each cell, scattered, if the dimensions have zones.
+fn zones(dimensions: Dimensions, shape: Shape) -> Option<Arc<Grid<u8>>> {
+    let n_zones = dimensions.n_zones;
+    let zone = |(row, col)| ((7 * row + 3 * col + row * col) % n_zones) as u8;
+    (n_zones > 0).then(|| Arc::new(Grid::from_shape_fn(shape.dim(), zone)))
+}
+
 /// Eqs. 2 and 3 by the definition.
 fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
     let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
     let n_cells = shape.n_cells();
     let mut predicted = vec![0.0; n_states * n_cells];
     for (cell, own) in
-        (0..n_cells).flat_map(|cell| (0..dimensions.n_kernels()).map(move |own| (cell, own)))
+        (0..n_cells).flat_map(|cell| (0..dimensions.n_own()).map(move |own| (cell, own)))
     {
         let Cell { row, col } = shape.cell(cell);
+        let zone = zones(dimensions, shape).map_or(0, |zones| zones[[row, col]]);
+        let first = usize::from(zone) * dimensions.n_own() + own;
         let mut weights = vec![0.0; n_states];
-        for (at, weight) in kernel[own * n_states * n_states * rows * cols..]
+        for (at, weight) in kernel[first * n_states * n_states * rows * cols..]
             .iter()
             .enumerate()
         {
@@ -161,7 +171,8 @@ fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64
 
 fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bool) {
     let shape = Shape::new(size.0, size.1).expect("test shape");
-    let tables = Parameters::first(dimensions, 11).tables();
+    let parameters = Parameters::first(dimensions, 11);
+    let tables = parameters.on_land(zones(dimensions, shape)).tables();
     let frames: Vec<_> = (0..5)
         .map(|number| sightings(shape, dimensions.n_observations, number))
         .collect();
@@ -200,21 +211,23 @@ fn every_gradient_agrees_with_finite_differences() {
     for (from_belief, sees_own_state) in
         [(false, false), (true, false), (false, true), (true, true)]
     {
-        let check = |n_states, n_observations, kernel, size| {
+        let check = |n_zones, n_states, n_observations, kernel, size| {
             let dimensions = Dimensions {
                 n_states,
                 n_observations,
                 kernel,
                 sees_own_state,
-                n_zones: 0,
+                n_zones,
                 n_rings: 0,
             };
             check_gradients(dimensions, size, from_belief);
         };
-        check(3, 3, (3, 3), (6, 7));
-        check(2, 3, (1, 5), (4, 19));
-        check(4, 2, (5, 3), (if sees_own_state { 2 } else { 9 }, 70));
-        check(7, 4, (3, 1), (3, 2));
+        check(0, 3, 3, (3, 3), (6, 7));
+        check(0, 2, 3, (1, 5), (4, 19));
+        check(0, 4, 2, (5, 3), (if sees_own_state { 2 } else { 9 }, 70));
+        check(0, 7, 4, (3, 1), (3, 2));
+        check(3, 3, 3, (3, 3), (6, 7));
+        check(5, 2, 3, (1, 5), (4, 19));
     }
 }
 
@@ -240,6 +253,15 @@ fn a_window_ends_with_the_filters_prediction() {
         check_window(Parameters::first(dimensions(sees_own_state), 2).tables());
     }
     check_window(Tables::of_model(&burnout()));
+    for sees_own_state in [false, true] {
+        let dimensions = Dimensions {
+            n_zones: 4,
+            ..dimensions(sees_own_state)
+        };
+        let shape = Shape::new(7, 18).expect("test shape");
+        let parameters = Parameters::first(dimensions, 2).on_land(zones(dimensions, shape));
+        check_window(parameters.tables());
+    }
 }
 
 #[test]

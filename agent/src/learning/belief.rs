@@ -1,11 +1,12 @@
 //! A belief that was learned, with all that estimators of it need, also as part of a checkpoint.
 
+use crate::learning::checkpoint::Part;
 use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::learners::filter::model::{SavedModel, check_target};
 use crate::learning::learners::neural::{NeuralModel, new_network};
 use anyhow::Result;
 use emberwatch_belief::estimation::Estimator;
-use emberwatch_network::{Device, NamedTensor, NetworkError};
+use emberwatch_network::{Device, NamedTensor};
 use emberwatch_protocol::Shape;
 use serde::{Deserialize, Serialize};
 

@@ -1,10 +1,11 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
 use crate::learning::belief::LearnedBelief;
-use crate::learning::checkpoint::{self, Contents, wrong};
+use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learners::decisions::{self, LearnedDecisions};
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
+use crate::learning::learners::filter::model::read_parameters;
 use crate::learning::learners::network;
 use crate::learning::learners::neural::{self, NeuralModel};
 use crate::policy::{Choice, EstimatorKind, Policy};

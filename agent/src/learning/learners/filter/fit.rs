@@ -304,9 +304,9 @@ mod tests {
         dimensions: Dimensions,
         config: &AgentConfig,
     ) -> Result<FilterFit, String> {
-        let fit = contents
-            .state()
-            .and_then(|saved| FilterFit::resume(saved, contents, dimensions, shape(), config));
+        let fit = contents.state().and_then(|saved| {
+            FilterFit::resume(saved, contents, dimensions, None, shape(), config)
+        });
         fit.map_err(|error| error.to_string())
     }
 

@@ -12,7 +12,7 @@ use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_network::{Device, NetworkError, NeuralBelief};
+use emberwatch_network::{Device, NeuralBelief};
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::model::MAX_VALUES;
