@@ -54,6 +54,9 @@ pub struct Task {
     /// Grid width, likewise.
     #[serde(default)]
     pub width: usize,
+    /// Rows and columns that robots see beyond each cell of their path; as the model says if it is not given.
+    #[serde(default)]
+    pub sensor_radius: Option<u8>,
     /// Moves in a path.
     pub moves: usize,
     /// Robots of each world.

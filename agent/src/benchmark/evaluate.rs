@@ -59,15 +59,17 @@ pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Sc
     Ok(scores)
 }
 
-/// Score of telling each cell alike the frequencies with which values were seen in all worlds, with
-/// hindsight.
-pub fn score_of_frequencies(all: &[Scores], counts: &[u64]) -> Score {
+/// Score of telling each cell alike the frequencies with which each of the sensor's matrices showed values in all worlds,
+/// with hindsight.
+pub fn score_of_frequencies(all: &[Scores], counts: &[u64], n_matrices: usize) -> Score {
     let total = |value: usize| all.iter().map(|scores| scores.counts[value]).sum::<u64>();
     let totals: Vec<u64> = (0..counts.len()).map(total).collect();
-    let sum: u64 = totals.iter().sum();
+    let of_matrix = counts.len() / n_matrices;
     let mut score = Score::default();
-    for (&count, &total) in counts.iter().zip(&totals).filter(|(count, _)| **count > 0) {
-        score.log_likelihood += count as f64 * (total as f64 / sum as f64).ln();
+    for (value, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
+        let first = value / of_matrix * of_matrix;
+        let sum: u64 = totals[first..first + of_matrix].iter().sum();
+        score.log_likelihood += count as f64 * (totals[value] as f64 / sum as f64).ln();
         score.n_seen += count;
     }
     score
@@ -138,14 +140,19 @@ mod tests {
 
     #[test]
     fn frequencies_score_the_entropy_of_what_was_seen() {
-        let scores = |counts: [u64; 3]| Scores {
+        let scores = |counts: &[u64]| Scores {
             seed: 0,
             scores: Vec::new(),
             counts: counts.to_vec(),
         };
-        let all = [scores([3, 0, 1]), scores([1, 0, 3])];
-        let score = score_of_frequencies(&all, &all[0].counts);
+        let all = [scores(&[3, 0, 1]), scores(&[1, 0, 3])];
+        let score = score_of_frequencies(&all, &all[0].counts, 1);
         assert_eq!(score.n_seen, 4);
         assert!((score.mean() - 0.5_f64.ln()).abs() < 1e-12);
+        // Two matrices: the first shows both values alike, the second one alone.
+        let all = [scores(&[3, 1, 8, 0]), scores(&[1, 3, 0, 0])];
+        let score = score_of_frequencies(&all, &all[0].counts, 2);
+        assert_eq!(score.n_seen, 12);
+        assert!((score.log_likelihood - 4.0 * 0.5_f64.ln()).abs() < 1e-12);
     }
 }

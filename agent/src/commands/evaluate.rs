@@ -82,7 +82,8 @@ impl EvaluateCommand {
                 learned: &learned,
             };
             let scores = evaluate(arena, &evaluation)?;
-            write(&predictions(guide, &policies, &scores))?;
+            let n_matrices = arena.model().n_rings();
+            write(&predictions(guide, &policies, &scores, n_matrices))?;
         }
         if !self.predictions_only {
             self.policies(arena, config, learned)?;
@@ -134,12 +135,12 @@ fn examined(learned: &Learned) -> Vec<&'static str> {
 }
 
 /// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
-fn predictions(guide: &str, policies: &[Policy], scores: &[Scores]) -> String {
+fn predictions(guide: &str, policies: &[Policy], scores: &[Scores], n_matrices: usize) -> String {
     let column = |of: &dyn Fn(&Scores) -> Score| -> Vec<f64> {
         scores.iter().map(|scores| of(scores).mean()).collect()
     };
     let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect();
-    let frequencies = column(&|one| score_of_frequencies(scores, &one.counts));
+    let frequencies = column(&|one| score_of_frequencies(scores, &one.counts, n_matrices));
     let scores = |index: usize| column(&|scores| scores.scores[index]);
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];

@@ -1,6 +1,6 @@
 //! `run`: act on one world of a running server.
 
-use super::shared::{WaitFlag, model_named, parse_range};
+use super::shared::{WaitFlag, model_named, model_of, parse_range};
 use anyhow::{Context, Result};
 use clap::Args;
 use emberwatch_agent::acting::mission::{Company, Mission};
@@ -116,7 +116,7 @@ impl RunCommand {
 }
 
 fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
-    let model = (!task.is_recorded()).then(|| model_named(&task.model));
+    let model = (!task.is_recorded()).then(|| model_of(&task));
     Ok((task, model.transpose()?))
 }
 

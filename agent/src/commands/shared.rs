@@ -5,6 +5,7 @@ use clap::Args;
 use emberwatch_agent::client::info::wait_for_server;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::task::Task;
 use std::io::Write;
 use std::ops::Range;
 use std::path::Path;
@@ -57,6 +58,19 @@ pub fn model_named(name: &str) -> Result<Model> {
         Model::built_in_names().collect::<Vec<_>>().join(", ")
     );
     read_model(path)
+}
+
+/// The model of a task that has one, with the task's sensor.
+pub fn model_of(task: &Task) -> Result<Model> {
+    with_sensor(model_named(&task.model)?, task.sensor_radius)
+}
+
+/// A model whose robots see so many rows and columns beyond their path; `None`: as it says.
+pub fn with_sensor(model: Model, radius: Option<u8>) -> Result<Model> {
+    Ok(match radius {
+        Some(radius) => model.with_radius(radius.into())?,
+        None => model,
+    })
 }
 
 pub fn read_model(path: &Path) -> Result<Model> {

@@ -1,7 +1,7 @@
 //! `suite`: policies on the test worlds of all tasks, and one score.
 
 use super::compare::run_comparison;
-use super::shared::{make_folder, model_named, write};
+use super::shared::{make_folder, model_of, write};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
@@ -222,7 +222,7 @@ impl SuiteCommand {
     /// What states are called; of recorded worlds their server tells.
     fn model(&self, task: &Task, seeds: &Range<u64>) -> Result<Model> {
         if !task.is_recorded() {
-            return model_named(&task.model);
+            return model_of(task);
         }
         let (arena, _server) = self.open(task, seeds)?;
         Ok(arena.model().clone())

@@ -1,6 +1,6 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
-use super::shared::{WaitFlag, model_named, parse_range};
+use super::shared::{WaitFlag, model_named, model_of, parse_range, with_sensor};
 use anyhow::{Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
@@ -182,11 +182,13 @@ impl GridFlags {
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),
-            Some(task) => (&task.model, task.height, task.width),
+            Some(task) => (model_of(task)?, task.height, task.width),
             None if self.states.is_some() => return Ok(None),
-            None => (&self.model, self.height, self.width),
+            None => {
+                let model = with_sensor(model_named(&self.model)?, self.sensor_radius)?;
+                (model, self.height, self.width)
+            }
         };
-        let model = model_named(model)?;
         model.check_on(Shape::new(height, width)?)?;
         Ok(Some(model))
     }

@@ -111,7 +111,7 @@ impl SavedBelief {
             } => {
                 check_target(*target, *n_observations)?;
                 let mut network = new_network(*n_observations, device)?;
-                network.set_parameters(&find)?;
+                network.set_parameters(find)?;
                 let filter = filter
                     .as_ref()
                     .map(|it| it.read_corrected(*n_observations, part));

@@ -5,7 +5,7 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learners::decisions::{self, LearnedDecisions};
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
-use crate::learning::learners::filter::model::read_parameters;
+use crate::learning::learners::filter::model::Form;
 use crate::learning::learners::network;
 use crate::learning::learners::neural::{self, NeuralModel};
 use crate::policy::{Choice, EstimatorKind, Policy};
@@ -157,7 +157,7 @@ fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedBelief> {
         sees_own_state,
         ..saved.optimiser.dimensions()
     };
-    let of_tensors = read_parameters(dimensions, &contents.part(""))?;
-    saved.load(contents, of_tensors.dimensions)?;
+    let form = Form::read(dimensions, &contents.part(""))?;
+    saved.load(contents, &form)?;
     Ok(LearnedBelief::Filter(Box::new(saved.learned())))
 }

@@ -34,7 +34,7 @@ import emberwatch
 from emberwatch._native import Flights
 from emberwatch.airspace import Airspace
 from emberwatch.belief import Filter, Transition
-from emberwatch.model import Description, Model
+from emberwatch.model import Description, Model, built_in
 from emberwatch.moves import fly
 from emberwatch.planning import beam_search
 from emberwatch.prior import simulated_prior
@@ -284,9 +284,26 @@ def test_a_wrong_radius_is_named(wrong: dict[str, Any], message: str) -> None:
         make(**wrong)
 
 
-def test_a_task_has_its_own_radius() -> None:
+def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
     with refuses("sensor_radius"):
         gymnasium.make(WILDFIRE, task="small", sensor_radius=1)
+    small = built_in("tasks")["small"].read_text()
+    far, near = tmp_path / "far.toml", tmp_path / "near.toml"
+    far.write_text(small.replace('"small"', '"far"') + "sensor_radius = 2\n")
+    near.write_text(small.replace('"small"', '"far"') + "sensor_radius = 1\n")
+    for backend in BACKENDS:
+        env = closed_later(gymnasium.make(WILDFIRE, task=far, backend=backend))
+        assert env.unwrapped.model.sensor_radius == 2
+        assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
+    none = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
+    with serving(**none, task=far) as instance:
+        env = closed_later(gymnasium.make(WILDFIRE, task=far, instance=instance))
+        assert env.unwrapped.model.sensor_radius == 2
+        with refuses("states of task 'far': expected those that the server has"):
+            gymnasium.make(WILDFIRE, task=near, instance=instance)
+    near.write_text(near.read_text().replace("radius = 1", "radius = 9"))
+    with refuses("sensor_radius: expected -1 to 8, got 9"):
+        gymnasium.make(WILDFIRE, task=near)
 
 
 def test_recorded_worlds_are_seen_from_afar_too(tmp_path: Path) -> None:

@@ -88,6 +88,10 @@ pub enum DimensionsError {
         "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
     )]
     Kernel { height: usize, width: usize },
+    #[error(
+        "learned filter: observations: expected as many for each of {n_rings} matrices, got {got}"
+    )]
+    Rings { n_rings: usize, got: usize },
 }
 
 impl Dimensions {
@@ -109,6 +113,10 @@ impl Dimensions {
         let (height, width) = self.kernel;
         if !(is_side(height) && is_side(width)) {
             return Err(DimensionsError::Kernel { height, width });
+        }
+        let (n_rings, got) = (self.n_rings, self.n_observations);
+        if n_rings > 0 && got % n_rings != 0 {
+            return Err(DimensionsError::Rings { n_rings, got });
         }
         Ok(self)
     }
@@ -188,10 +196,8 @@ impl Parameters {
     /// # Panics
     /// If the dimensions are of fewer zones.
     pub fn on_land(mut self, zones: Option<Arc<Grid<u8>>>) -> Self {
-        let most = zones.iter().flat_map(|map| map.iter()).max();
-        let n_zones = most.map_or(0, |&zone| usize::from(zone) + 1);
         assert!(
-            n_zones <= self.dimensions.n_zones.max(1),
+            zones.as_deref().map_or(0, n_zones) <= self.dimensions.n_zones,
             "zones: expected those of the dimensions"
         );
         self.zones = zones;
@@ -327,6 +333,11 @@ fn softmax(logits: &[f32]) -> Vec<f64> {
     exponentials.into_iter().map(|x| x / sum).collect()
 }
 
+/// Zones of a map, shape `[H, W]`, the first of which is 0.
+pub fn n_zones(map: &Grid<u8>) -> usize {
+    map.iter().max().map_or(0, |&last| usize::from(last) + 1)
+}
+
 fn softmax_gradient(logits: &[f32], by: &[f64]) -> Vec<f32> {
     let p = softmax(logits);
     let mean: f64 = p.iter().zip(by).map(|(p, by)| p * by).sum();
@@ -355,15 +366,32 @@ mod tests {
         for row in tables.likelihood.chunks_exact(4).chain([&*tables.initial]) {
             assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
         }
+        let of_rings = Dimensions {
+            n_rings: 2,
+            ..dimensions()
+        };
+        let tables_of_rings = Parameters::first(of_rings, 7).tables();
+        for row in tables_of_rings.likelihood.chunks_exact(2) {
+            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
+        }
         assert!(tables.kernel.iter().all(|&w| w > 0.0));
         assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
     }
 
     #[test]
     fn the_chain_rule_agrees_with_differences() {
-        let parameters = Parameters::first(dimensions(), 3);
+        check_chain_rule(dimensions());
+        check_chain_rule(Dimensions {
+            n_zones: 2,
+            n_rings: 2,
+            ..dimensions()
+        });
+    }
+
+    fn check_chain_rule(dimensions: Dimensions) {
+        let parameters = Parameters::first(dimensions, 3);
         // Any smooth function of the tables: a sum with arbitrary factors.
-        let factors: [Vec<f64>; 3] = dimensions().lengths().map(|length| {
+        let factors: [Vec<f64>; 3] = dimensions.lengths().map(|length| {
             let factor = |index| (index as f64 * 0.7).sin();
             (0..length).map(factor).collect()
         });
@@ -404,6 +432,7 @@ mod tests {
         };
         check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
         check(|it| it.n_observations = 65, "got 65");
+        check(|it| it.n_rings = 3, "each of 3 matrices, got 4");
         check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

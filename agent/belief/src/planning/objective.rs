@@ -113,13 +113,10 @@ impl Objective {
             ..CellValues::new(value, self.coverage_bonus)
         };
         let counts_in_sight = self.target == Target::Entropy || airspace.pays() == Pays::Seen;
-        let in_sight = counts_in_sight.then(|| values.value.mapv(|it| it + self.coverage_bonus));
-        match in_sight {
-            Some(in_sight) if airspace.radius() > 0 => {
-                let nothing = CellValues::new(Grid::zeros(belief.shape().dim()), 0.0);
-                nothing.within(airspace, Some(in_sight))
-            }
-            _ => values.within(airspace, None),
+        if counts_in_sight && airspace.radius() > 0 {
+            CellValues::in_sight_of(airspace, values.value + self.coverage_bonus)
+        } else {
+            values.within(airspace, None)
         }
     }
 }
@@ -156,6 +153,19 @@ impl CellValues {
         }
     }
 
+    /// What each distinct cell that is seen is worth, shape `[H, W]`, finite: those in sight of a path, or on it where the
+    /// sensor sees no further.
+    ///
+    /// # Panics
+    /// If the airspace is of another grid.
+    pub fn in_sight_of(airspace: &Airspace, value: Grid<f32>) -> Self {
+        if airspace.radius() == 0 {
+            return Self::new(value, 0.0).within(airspace, None);
+        }
+        let nothing = Self::new(Grid::zeros(value.dim()), 0.0);
+        nothing.within(airspace, Some(value))
+    }
+
     pub fn shape(&self) -> Shape {
         self.airspace.shape()
     }
@@ -185,6 +195,17 @@ impl CellValues {
     /// Adds `weight` times a layer of shape `[H, W]`, whose numbers are finite, to the cells' values.
     pub fn add(&mut self, weight: f32, layer: &Grid<f32>) {
         self.value.scaled_add(weight, layer);
+    }
+
+    /// Adds `weight` times a layer of shape `[H, W]`, whose numbers are finite, to what each cell that is seen is worth.
+    pub fn add_in_sight(&mut self, weight: f32, layer: &Grid<f32>) {
+        if self.airspace.radius() == 0 {
+            return self.add(weight, layer);
+        }
+        let zeros = || Grid::zeros(layer.dim());
+        self.in_sight
+            .get_or_insert_with(zeros)
+            .scaled_add(weight, layer);
     }
 
     /// The same, with nothing left to gain at cells that a teammate visits or sees, by the row-major indices of those

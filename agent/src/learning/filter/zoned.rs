@@ -4,6 +4,7 @@
 //! gathered into lanes, and what they owe to the cells that they read is added where it came from.
 
 use crate::learning::filter::layout::{LANES, Layout};
+use emberwatch_belief::estimation::parameters::n_zones;
 use emberwatch_protocol::Grid;
 
 /// A number for each cell of a chunk.
@@ -240,8 +241,7 @@ impl ZonedOperator {
 
 /// The cells of one zone after the other.
 fn chunks(layout: &Layout, zones: &Grid<u8>) -> Vec<Chunk> {
-    let n_zones = zones.iter().max().map_or(0, |&most| usize::from(most) + 1);
-    let mut of_zones = vec![Vec::new(); n_zones];
+    let mut of_zones = vec![Vec::new(); n_zones(zones)];
     for (cell, &zone) in zones.iter().enumerate() {
         of_zones[usize::from(zone)].push(layout.place(cell));
     }

@@ -229,11 +229,9 @@ impl Learner for NeuralLearner {
                 agent.plan_for(objective, &cells, k)
             } else {
                 let seen = || self.replay.present(first + index as u32);
-                match behaviour.values(objective, target, agent.basis_belief(), seen, &mut rng) {
-                    Some(values) => {
-                        let values = values.within(&self.worlds.airspace, None);
-                        agent.plan_values(&values, behaviour.label(), &cells, k)
-                    }
+                let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
+                match behaviour.values(objective, airspace, target, belief, seen, &mut rng) {
+                    Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
                     None => agent.walk(&cells, k),
                 }
             };

@@ -11,7 +11,7 @@ use crate::learning::learners::{Learner, Worlds};
 use crate::learning::train::spec::TrainingSpec;
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::BayesFilter;
-use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_belief::estimation::parameters::{Dimensions, n_zones};
 use emberwatch_protocol::control::{CoverageRule, ServerInfo};
 use emberwatch_protocol::{Client, Grid, Model, Shape};
 use std::path::Path;
@@ -144,14 +144,13 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
         0 => worlds.n_observations / n_rings,
         states => states,
     };
-    let most = worlds.zones.iter().flat_map(|map| map.iter()).max();
     let kernel = (learning.kernel[0], learning.kernel[1]);
     let dimensions = Dimensions {
         n_states,
         n_observations: worlds.n_observations,
         kernel,
         sees_own_state: config.learner == LearnerKind::OwnFilter,
-        n_zones: most.map_or(0, |&zone| usize::from(zone) + 1),
+        n_zones: worlds.zones.as_deref().map_or(0, n_zones),
         n_rings: if n_rings > 1 { n_rings } else { 0 },
     };
     Ok(dimensions.check()?)

@@ -224,12 +224,7 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_robots = check_settings(settings.server_flags(1))["robots"]
     robots = _robots(settings, n_rows, n_robots)
     checked = check_settings(settings.server_flags(len(robots) // n_robots))
-    if checked["states"]:
-        described = _description(local(checked["states"]))
-    else:
-        described = Model.checked(local(checked["model"]))
-    if checked["sensor_radius"] >= 0:
-        described = described.with_radius(checked["sensor_radius"])
+    described = _described(checked)
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
@@ -308,13 +303,24 @@ def _check_task(asked: str | Path, info: ServerInfo) -> None:
     for name, got in has.items():
         if own[name] != got:
             raise invalid(f"{name} of task {task.name!r}", f"{got}, as the server has", own[name])
-    if own["states"]:
-        described, served = _description(local(own["states"])), info.recorded_states
-    else:
-        described = Model.checked(local(own["model"]))
-        served = None if info.model is None else Model.from_toml(info.model)
+    described = _described(own)
+    served: Description | None = info.recorded_states
+    if served is not None:
+        served = served.with_radius(info.airspace.radius)
+    elif info.model is not None:
+        served = Model.from_toml(info.model)
     if served not in (None, described):
         raise invalid(f"states of task {task.name!r}", "those that the server has", described.name)
+
+
+def _described(checked: dict[str, Any]) -> Description:
+    """What states are called and how they are seen, by settings that the server has accepted."""
+    if checked["states"]:
+        described: Description = _description(local(checked["states"]))
+    else:
+        described = Model.checked(local(checked["model"]))
+    radius = checked["sensor_radius"]
+    return described.with_radius(radius) if radius >= 0 else described
 
 
 def _description(states: str) -> Description:

@@ -7,7 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
-use crate::learning::learners::filter::model::{read_parameters, zones_tensor};
+use crate::learning::learners::filter::model::{Form, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use anyhow::Result;
@@ -175,37 +175,22 @@ impl FilterFit {
             .collect()
     }
 
-    /// Takes the tensors of a checkpoint that it is of, as those of given dimensions.
+    /// Takes the tensors of a checkpoint that it is of.
     ///
     /// # Errors
     /// Names what is missing or of another form.
-    pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
-        let empty = read_parameters(dimensions, &contents.part(""))?;
-        let (expected, got) = (dimensions.shapes(), empty.dimensions.shapes());
-        check(
-            got == expected,
-            "tensors",
-            format!("shapes {expected:?}"),
-            format!("{got:?}"),
-        )?;
+    pub fn load(&mut self, contents: &Contents, form: &Form) -> Result<()> {
         let counts = [
             ("n_updates", self.n_updates()),
             ("world_steps", self.world_steps),
         ];
         check_counts(&counts)?;
-        let part = |suffix: &str| -> Result<Parameters> {
-            let mut part = empty.clone();
-            for (at, shape) in dimensions.shapes().iter().enumerate() {
-                let name = format!("{}{suffix}", Parameters::NAMES[at]);
-                part.tensors[at] = contents.tensor(&name, shape)?;
-            }
-            Ok(part)
-        };
-        let [parameters, first, second] = SUFFIXES.map(part);
+        let part = contents.part("");
+        let [parameters, first, second] = SUFFIXES.map(|suffix| form.parameters(&part, suffix));
         self.optimiser.set_parameters(parameters?);
         (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
         contents.check_squares()?;
-        self.reward.check(dimensions.n_states)
+        self.reward.check(form.dimensions.n_states)
     }
 
     /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
@@ -221,9 +206,17 @@ impl FilterFit {
         shape: Shape,
         config: &AgentConfig,
     ) -> Result<Self> {
-        saved.load(contents, dimensions)?;
-        let is_same = saved.optimiser.parameters().zones == zones;
-        check(is_same, "zones", "those of the server", "others")?;
+        let form = Form::read(dimensions, &contents.part(""))?;
+        let got = form.dimensions.n_rings.max(1);
+        let expected = dimensions.n_rings.max(1);
+        check(got == expected, "observation matrices", expected, got)?;
+        check(
+            form.zones == zones,
+            "zones",
+            "those of the server",
+            "others",
+        )?;
+        saved.load(contents, &form)?;
         let mut fit = Self::new(dimensions, zones, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
             let fits = (0.0..MAX_EARNED).contains(&saved.earned);
@@ -253,6 +246,7 @@ fn replay(config: &LearningConfig) -> Replay {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::learning::checkpoint::Tensor;
     use emberwatch_belief::estimation::belief::Belief;
 
     const DIMENSIONS: Dimensions = Dimensions {
@@ -326,6 +320,63 @@ mod tests {
         let other = resume(&stored, DIMENSIONS, &config).expect("whole");
         assert!(!other.has_track(4), "an empty replay");
         assert_eq!(contents(&other).tensors, stored.tensors);
+    }
+
+    fn zones(zones: [u8; 3]) -> Option<Arc<Grid<u8>>> {
+        let zones = Grid::from_shape_vec((1, 3), zones.to_vec());
+        Some(Arc::new(zones.expect("a map")))
+    }
+
+    #[test]
+    fn zones_and_matrices_are_kept_in_checkpoints() {
+        let dimensions = Dimensions {
+            n_zones: 2,
+            n_rings: 2,
+            ..DIMENSIONS
+        };
+        let mut fit = FilterFit::new(dimensions, zones([0, 1, 1]), shape(), &config());
+        fit.begin(4);
+        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
+        assert!(fit.n_updates() > 0);
+        let stored = contents(&fit);
+        let resume = |contents: &Contents, dimensions, zones| {
+            let saved = contents.state();
+            let fit = saved.and_then(|saved| {
+                FilterFit::resume(saved, contents, dimensions, zones, shape(), &config())
+            });
+            fit.map_err(|error| error.to_string())
+        };
+        let same = resume(&stored, dimensions, zones([0, 1, 1])).expect("whole");
+        assert!(contents(&same) == stored);
+        let error = |contents: &Contents, dimensions, map| {
+            resume(contents, dimensions, map).expect_err("others")
+        };
+        assert_eq!(
+            error(&stored, dimensions, zones([0, 0, 1])),
+            "zones: expected those of the server, got others"
+        );
+        assert_eq!(
+            error(&stored, DIMENSIONS, zones([0, 1, 1])),
+            "observation matrices: expected 1, got 2"
+        );
+        let forged = |change: fn(&mut Tensor), words: &str| {
+            let mut contents = stored.clone();
+            change(contents.tensors.get_mut("zones").expect("a map"));
+            let error = error(&contents, dimensions, zones([0, 1, 1]));
+            assert!(error.starts_with(words), "{error}");
+        };
+        forged(
+            |map| map.numbers[1] = 0.5,
+            "zones: expected zones from 0 to 255, got 0.5",
+        );
+        forged(
+            |map| map.numbers[1] = 255.0,
+            "zones: expected those of the server, got others",
+        );
+        forged(
+            |map| map.shape = vec![3],
+            "zones: expected a map of a grid, got [3]",
+        );
     }
 
     #[test]

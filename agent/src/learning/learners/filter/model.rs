@@ -3,7 +3,7 @@
 use crate::learning::checkpoint::{Part, check, wrong};
 use crate::learning::learners::filter::fit::LearnedModel;
 use anyhow::Result;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, n_zones};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::{Grid, Shape};
@@ -72,12 +72,8 @@ impl SavedModel {
             sees_own_state,
             ..self.dimensions
         };
-        let mut parameters = read_parameters(dimensions, part)?;
-        let dimensions = parameters.dimensions;
-        check_target(self.target, dimensions.n_states)?;
-        for (at, shape) in dimensions.shapes().iter().enumerate() {
-            parameters.tensors[at] = part.tensor(Parameters::NAMES[at], shape)?;
-        }
+        let parameters = Form::read(dimensions, part)?.parameters(part, "")?;
+        check_target(self.target, parameters.dimensions.n_states)?;
         let correlations = self.correlations.clone();
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
@@ -98,25 +94,47 @@ pub fn zones_tensor(parameters: &Parameters) -> Option<NamedTensor> {
     Some((ZONES.into(), vec![height, width], numbers))
 }
 
-/// Parameters of a filter's dimensions, with the zones and the observation matrices that its tensors tell of; all zeros.
-pub fn read_parameters(dimensions: Dimensions, part: &Part<'_>) -> Result<Parameters> {
-    let zones = part
-        .shape(ZONES)
-        .map(|shape| read_zones(shape, part))
-        .transpose()?;
-    let n_rings = match part.shape(Parameters::NAMES[1]) {
-        Some(&[_, n_rings, _]) => n_rings,
-        _ => 0,
-    };
-    let most = zones.iter().flat_map(|map| map.iter()).max();
-    let dimensions = Dimensions {
-        n_zones: most.map_or(0, |&zone| usize::from(zone) + 1),
-        n_rings,
-        ..dimensions
-    };
-    let dimensions = dimensions.check();
-    let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-    Ok(Parameters::zeros(dimensions).on_land(zones.map(Arc::new)))
+/// A filter's dimensions with what its tensors alone tell of: zones of land, and observation matrices.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Form {
+    pub dimensions: Dimensions,
+    /// The zone of each cell, where zones have kernels of their own.
+    pub zones: Option<Arc<Grid<u8>>>,
+}
+
+impl Form {
+    pub fn read(dimensions: Dimensions, part: &Part<'_>) -> Result<Self> {
+        let shape = part.shape(ZONES);
+        let zones = shape.map(|shape| read_zones(shape, part)).transpose()?;
+        let n_rings = match part.shape(Parameters::NAMES[1]) {
+            Some(&[_, n_rings, _]) => n_rings,
+            _ => 0,
+        };
+        let dimensions = Dimensions {
+            n_zones: zones.as_ref().map_or(0, n_zones),
+            n_rings,
+            ..dimensions
+        };
+        let dimensions = dimensions.check();
+        let dimensions =
+            dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+        Ok(Self {
+            dimensions,
+            zones: zones.map(Arc::new),
+        })
+    }
+
+    /// Parameters or moments, whose names end alike.
+    pub fn parameters(&self, part: &Part<'_>, suffix: &str) -> Result<Parameters> {
+        let shapes = self.dimensions.shapes();
+        let tensor =
+            |at: usize| part.tensor(&format!("{}{suffix}", Parameters::NAMES[at]), &shapes[at]);
+        Ok(Parameters {
+            dimensions: self.dimensions,
+            tensors: [tensor(0)?, tensor(1)?, tensor(2)?],
+            zones: self.zones.clone(),
+        })
+    }
 }
 
 fn read_zones(shape: &[usize], part: &Part<'_>) -> Result<Grid<u8>> {

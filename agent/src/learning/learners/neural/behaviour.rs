@@ -3,7 +3,7 @@
 use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::planning::{CellValues, Objective};
 use emberwatch_network::Sightings;
-use emberwatch_protocol::{Grid, Shape};
+use emberwatch_protocol::{Airspace, Grid, Shape};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
@@ -71,10 +71,12 @@ impl Behaviour {
         Self { aim, goal }
     }
 
-    /// What each cell is worth; `None` for random moves. `target`: the value that pays most; `seen`: what was seen by now.
+    /// What each cell is worth in an airspace; `None` for random moves. `target`: the value that pays most; `seen`: what was
+    /// seen by now.
     pub fn values(
         &self,
         objective: Objective,
+        airspace: &Airspace,
         target: usize,
         belief: &Belief,
         seen: impl Fn() -> Sightings,
@@ -82,15 +84,19 @@ impl Behaviour {
     ) -> Option<CellValues> {
         match self.aim {
             Aim::Walk => None,
-            Aim::Cover | Aim::Far | Aim::Last => {
+            Aim::Cover => {
                 let value = self.value(&seen(), target, rng);
-                Some(CellValues::new(value, 0.0))
+                Some(CellValues::in_sight_of(airspace, value))
+            }
+            Aim::Far | Aim::Last => {
+                let value = self.value(&seen(), target, rng);
+                Some(CellValues::new(value, 0.0).within(airspace, None))
             }
             Aim::Exploit { entropy } => {
-                let mut values = objective.values(belief);
+                let mut values = objective.values_in(belief, airspace);
                 if entropy > 0 {
                     let weight = f32::from(entropy) / 10.0;
-                    values.add(weight, &belief.entropy(EntropyKind::Sum));
+                    values.add_in_sight(weight, &belief.entropy(EntropyKind::Sum));
                 }
                 Some(values)
             }
@@ -189,7 +195,9 @@ mod tests {
         let best = |aim| {
             let mut rng = stream(1, Purpose::Exploration, 0);
             let behaviour = Behaviour { aim, goal: 11 };
-            let values = behaviour.values(objective, 1, &belief, || seen.clone(), &mut rng);
+            let airspace = Airspace::open(shape());
+            let values =
+                behaviour.values(objective, &airspace, 1, &belief, || seen.clone(), &mut rng);
             let values = values.expect("values");
             let values = values.value().iter().copied().collect::<Vec<_>>();
             let best = (0..12).max_by(|&a, &b| values[a].total_cmp(&values[b]));
