@@ -9,7 +9,7 @@ use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_protocol::path::fly;
 use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Move, Shape};
+use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
 
 const N_MOVES: u64 = 64;
 
@@ -17,16 +17,19 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-fn parameters(sees_own_state: bool) -> Parameters {
+/// With kernels of each of 35 zones if `is_land`, scattered as those of `wildfire-terrain`.
+fn parameters(sees_own_state: bool, is_land: bool) -> Parameters {
     let dimensions = Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_zones: 0,
+        n_zones: if is_land { 35 } else { 0 },
         n_rings: 0,
     };
-    Parameters::first(dimensions, 0)
+    let model = Model::built_in("wildfire-terrain").expect("a model");
+    let zones = model.zone_map().filter(|_| is_land).cloned();
+    Parameters::first(dimensions, 0).on_land(zones)
 }
 
 /// What random walks, or straight flights, see of a made-up world.
@@ -60,13 +63,15 @@ fn frame(visited: &[usize]) -> Frame {
 }
 
 fn updates(c: &mut Criterion) {
-    for (n_threads, is_straight, sees_own_state) in [
-        (1, false, false),
-        (2, false, false),
-        (1, true, false),
-        (2, true, false),
-        (1, false, true),
-        (1, true, true),
+    for (n_threads, is_straight, sees_own_state, is_land) in [
+        (1, false, false, false),
+        (2, false, false, false),
+        (1, true, false, false),
+        (2, true, false, false),
+        (1, false, true, false),
+        (1, true, true, false),
+        (1, false, false, true),
+        (1, false, true, true),
     ] {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(n_threads)
@@ -74,15 +79,17 @@ fn updates(c: &mut Criterion) {
         let pool = pool.expect("threads");
         let mut replay = replay(is_straight);
         let config = AgentConfig::default().learning;
-        let mut optimiser = Optimiser::new(parameters(sees_own_state), shape(), config, 0);
+        let mut optimiser = Optimiser::new(parameters(sees_own_state, is_land), shape(), config, 0);
         let paths = if is_straight {
             "straight flights"
         } else {
             "random walks"
         };
         let kernels = if sees_own_state { ", own kernels" } else { "" };
-        let name =
-            format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2){kernels}");
+        let land = if is_land { ", 35 zones" } else { "" };
+        let name = format!(
+            "update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2){kernels}{land}"
+        );
         c.bench_function(&name, |b| {
             b.iter(|| {
                 pool.install(|| optimiser.update(&mut replay, Some(2)))
@@ -95,7 +102,7 @@ fn updates(c: &mut Criterion) {
 fn filter(c: &mut Criterion) {
     let frame = frame(&(0..40).collect::<Vec<_>>());
     for (sees_own_state, kernels) in [(false, ""), (true, ", own kernels")] {
-        let tables: Tables = parameters(sees_own_state).tables();
+        let tables: Tables = parameters(sees_own_state, false).tables();
         let mut filter = BayesFilter::learned(&tables, tables.prior(shape()));
         c.bench_function(
             &format!("learned filter: correct + predict{kernels}"),

@@ -119,13 +119,8 @@ impl Operator {
     /// A centre that sees the cell's own state has the sum of `h` as its derivative. As beliefs sum to one, that is the sum
     /// of what the states that it could see have.
     pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
-        if self.centres.is_none() {
-            return;
-        }
-        for (own, all) in centres(&self.layout) {
-            let sum: f64 = all.iter().map(|&at| gradient[at]).sum();
-            all.into_iter().for_each(|at| gradient[at] = 0.0);
-            gradient[own] = sum;
+        if self.centres.is_some() {
+            end_gradient(&self.layout, gradient);
         }
     }
 
@@ -263,7 +258,7 @@ impl Operator {
 
 /// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
 /// all states that it could see.
-fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
+pub(super) fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     let (n_states, n_taps) = (layout.n_states, layout.n_taps());
     (0..n_states * n_states).map(move |weighed| {
         let place = |from| (weighed * n_states + from) * n_taps + n_taps / 2;
@@ -272,4 +267,13 @@ fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
             (0..n_states).map(place).collect(),
         )
     })
+}
+
+/// [`Operator::end_gradient`] of kernels that see the cell's own state.
+pub(super) fn end_gradient(layout: &Layout, gradient: &mut [f64]) {
+    for (own, all) in centres(layout) {
+        let sum: f64 = all.iter().map(|&at| gradient[at]).sum();
+        all.into_iter().for_each(|at| gradient[at] = 0.0);
+        gradient[own] = sum;
+    }
 }

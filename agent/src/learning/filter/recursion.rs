@@ -289,8 +289,10 @@ impl WithSimd for Pass<'_> {
             .layout()
             .unload(&recursion.planes[n_frames], self.end);
         recursion.backward(simd, n_frames, &mut outcome);
-        if let Phi::Alike(operator) = &recursion.operator {
-            operator.end_gradient(&mut outcome.gradient[0]);
+        let gradient = &mut outcome.gradient[0];
+        match &recursion.operator {
+            Phi::Alike(operator) => operator.end_gradient(gradient),
+            Phi::Zoned(operator) => operator.end_gradient(gradient),
         }
         if self.start.is_none() {
             recursion.add_initial_gradient(&mut outcome);

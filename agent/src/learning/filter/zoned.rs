@@ -1,11 +1,16 @@
 //! The operator `Phi_w` on land whose zones have kernels of their own, and its derivatives.
 //!
-//! The formulas are those of [`super::operator`]. Cells of one zone are computed side by side: what their kernels read is
-//! gathered into lanes, and what they owe to the cells that they read is added where it came from.
+//! The formulas are those of [`super::operator`]. Cells of one zone are computed side by side, in lanes: what their kernels
+//! read is gathered, and what they owe to the cells that they read is added where it came from.
 
 use crate::learning::filter::layout::{LANES, Layout};
+use crate::learning::filter::operator::{centres, end_gradient};
 use emberwatch_belief::estimation::parameters::n_zones;
 use emberwatch_protocol::Grid;
+use std::ops::Range;
+
+/// Rows and columns of the parts of a grid whose cells come one after the other: many chunks owe nothing then.
+const TILE: usize = 8;
 
 /// A number for each cell of a chunk.
 type Lanes = [f32; LANES];
@@ -16,74 +21,97 @@ pub(super) struct ZonedOperator {
     pub(super) layout: Layout,
     /// Kernels of a zone: 1, or one for each state that a cell itself can be in.
     n_own: usize,
+    /// Those of centres that see the cell's own state are 0 here.
     weights: Vec<f32>,
+    /// What stands for these: the weights of the centres, `[zone, own, to]`; else zeros.
+    biases: Vec<f32>,
+    /// Up to [`LANES`] cells of one zone each, zone by zone.
     chunks: Vec<Chunk>,
-    /// Where each tap reads, from a cell's place less [`Self::corner`].
+    of_zones: Vec<Range<usize>>,
+    /// Where the kernels read, from a cell's home on: `[from, row, col]`.
     offsets: Vec<usize>,
+    /// From a cell's home, which is under the upper left of its kernel, to the cell.
     corner: usize,
-    /// What the kernels of a chunk read, `[from, tap]`, and its derivatives.
-    inputs: Vec<Lanes>,
-    by_inputs: Vec<Lanes>,
-    /// Weights of the next states, or their derivatives.
-    weighed: Vec<Lanes>,
-    next: Vec<Lanes>,
-    /// `dL/du` while `dL/dp` is written.
-    by_next: Vec<f32>,
+    work: Work,
 }
 
-/// Up to [`LANES`] cells of one zone.
+/// Homes of cells; those missing are the first again.
 #[derive(Debug, Clone)]
 struct Chunk {
-    zone: usize,
     n_cells: usize,
-    /// Their places; those missing are the first again.
-    places: [usize; LANES],
+    homes: [usize; LANES],
+}
+
+/// Work space of one chunk, and of one zone.
+#[derive(Debug, Clone)]
+struct Work {
+    /// What the kernels read, `[from, row, col]`.
+    inputs: Vec<Lanes>,
+    by_inputs: Vec<Lanes>,
+    /// Weights of the next states, then their derivatives.
+    weighed: Vec<Lanes>,
+    /// Next states, or the derivatives by them.
+    next: Vec<Lanes>,
+    /// Derivatives by the weights of a zone, in the order of these.
+    by_weights: Vec<Lanes>,
+    /// `dL/du` while `dL/dp` is written.
+    by_next: Vec<f32>,
 }
 
 impl ZonedOperator {
     /// The zone of each cell is `zones`, shape `[H, W]`.
     pub(super) fn new(layout: Layout, zones: &Grid<u8>, n_own: usize, weights: &[f32]) -> Self {
-        let n_inputs = layout.n_states * layout.n_taps();
+        let mut weights = weights.to_vec();
+        let n_of_zone = n_own * layout.n_states * layout.n_states * layout.n_taps();
+        let mut biases = vec![0.0; n_zones(zones) * n_own * layout.n_states];
+        if n_own > 1 {
+            let of_zones = weights.chunks_exact_mut(n_of_zone);
+            let n_biases = n_own * layout.n_states;
+            for (weights, biases) in of_zones.zip(biases.chunks_exact_mut(n_biases)) {
+                for ((own, all), bias) in centres(&layout).zip(biases) {
+                    *bias = weights[own];
+                    all.into_iter().for_each(|at| weights[at] = 0.0);
+                }
+            }
+        }
         let taps = (0..layout.kernel_height)
             .flat_map(|row| (0..layout.kernel_width).map(move |col| row * layout.stride + col));
+        let plane = |from| taps.clone().map(move |tap| from * layout.plane + tap);
+        let (chunks, of_zones) = chunks(&layout, zones);
         Self {
             layout,
             n_own,
-            weights: weights.to_vec(),
-            chunks: chunks(&layout, zones),
-            offsets: taps.collect(),
-            corner: layout.above * layout.stride + layout.left,
-            inputs: vec![[0.0; LANES]; n_inputs],
-            by_inputs: vec![[0.0; LANES]; n_inputs],
-            weighed: vec![[0.0; LANES]; layout.n_states],
-            next: vec![[0.0; LANES]; layout.n_states],
-            by_next: layout.planes(),
+            weights,
+            biases,
+            chunks,
+            of_zones,
+            offsets: (0..layout.n_states).flat_map(plane).collect(),
+            corner: layout.row(0),
+            work: Work::new(&layout, n_of_zone),
         }
     }
 
     /// `u = Phi_w(p)` in planes.
     #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     pub(super) fn forward(&mut self, p: &[f32], u: &mut [f32]) {
-        let n_states = self.layout.n_states;
-        for at in 0..self.chunks.len() {
-            self.gather(p, at);
-            self.next.fill([0.0; LANES]);
-            for own in 0..self.n_own {
-                let total = self.weigh(at, own);
-                let share = self.share(own, &total);
-                for state in 0..n_states {
-                    let lanes = self.next[state].iter_mut().zip(&self.weighed[state]);
-                    lanes
-                        .zip(&share)
-                        .for_each(|((next, v), share)| *next += v * share);
+        for zone in 0..self.of_zones.len() {
+            for at in self.of_zones[zone].clone() {
+                self.gather(p, at);
+                self.work.next.fill([0.0; LANES]);
+                for own in 0..self.n_own {
+                    let share = self.weigh(zone, own).1;
+                    for (next, v) in self.work.next.iter_mut().zip(&self.work.weighed) {
+                        for lane in 0..LANES {
+                            next[lane] += v[lane] * share[lane];
+                        }
+                    }
                 }
-            }
-            let Chunk {
-                n_cells, places, ..
-            } = &self.chunks[at];
-            for (state, next) in self.next.iter().enumerate() {
-                for (place, next) in places[..*n_cells].iter().zip(next) {
-                    u[state * self.layout.plane + place] = *next;
+                let chunk = &self.chunks[at];
+                for (state, next) in self.work.next.iter().enumerate() {
+                    let first = state * self.layout.plane + self.corner;
+                    for (home, next) in chunk.homes[..chunk.n_cells].iter().zip(next) {
+                        u[first + home] = *next;
+                    }
                 }
             }
         }
@@ -92,39 +120,49 @@ impl ZonedOperator {
     /// From `dL/du` in `g` to `dL/dp`; adds `dL/dw` to `gradient`.
     #[inline(always)]
     pub(super) fn backward(&mut self, p: &[f32], g: &mut [f32], gradient: &mut [f64]) {
-        self.by_next.copy_from_slice(g);
+        self.work.by_next.copy_from_slice(g);
         g.fill(0.0);
-        for at in 0..self.chunks.len() {
-            if !self.gather_next(at) {
-                continue;
-            }
-            self.gather(p, at);
-            self.by_inputs.fill([0.0; LANES]);
-            for own in 0..self.n_own {
-                self.unweigh(at, own, gradient);
-            }
-            let Chunk {
-                n_cells, places, ..
-            } = &self.chunks[at];
-            for (input, by) in self.by_inputs.iter().enumerate() {
-                let (from, tap) = (input / self.offsets.len(), input % self.offsets.len());
-                let first = from * self.layout.plane + self.offsets[tap];
-                for (place, by) in places[..*n_cells].iter().zip(by) {
-                    g[first + place - self.corner] += by;
+        let n_of_zone = self.work.by_weights.len();
+        for zone in 0..self.of_zones.len() {
+            self.work.by_weights.fill([0.0; LANES]);
+            for at in self.of_zones[zone].clone() {
+                if !self.gather_next(at) {
+                    continue;
+                }
+                self.gather(p, at);
+                self.work.by_inputs.fill([0.0; LANES]);
+                for own in 0..self.n_own {
+                    self.unweigh(zone, own);
+                }
+                let chunk = &self.chunks[at];
+                for (offset, by) in self.offsets.iter().zip(&self.work.by_inputs) {
+                    for (home, by) in chunk.homes[..chunk.n_cells].iter().zip(by) {
+                        g[home + offset] += by;
+                    }
                 }
             }
+            let gradient = &mut gradient[zone * n_of_zone..][..n_of_zone];
+            for (sum, by) in gradient.iter_mut().zip(&self.work.by_weights) {
+                *sum += by.iter().map(|&lane| f64::from(lane)).sum::<f64>();
+            }
+        }
+    }
+
+    /// The last step of a gradient, as [`super::operator::Operator::end_gradient`].
+    pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
+        if self.n_own > 1 {
+            let of_zones = gradient.chunks_exact_mut(self.work.by_weights.len());
+            of_zones.for_each(|gradient| end_gradient(&self.layout, gradient));
         }
     }
 
     /// Reads what the kernels of a chunk see.
     #[inline(always)]
     fn gather(&mut self, p: &[f32], at: usize) {
-        let places = &self.chunks[at].places;
-        for (input, lanes) in self.inputs.iter_mut().enumerate() {
-            let (from, tap) = (input / self.offsets.len(), input % self.offsets.len());
-            let first = from * self.layout.plane + self.offsets[tap];
-            for (lane, place) in lanes.iter_mut().zip(places) {
-                *lane = p[first + place - self.corner];
+        let homes = &self.chunks[at].homes;
+        for (offset, lanes) in self.offsets.iter().zip(&mut self.work.inputs) {
+            for (lane, home) in lanes.iter_mut().zip(homes) {
+                *lane = p[home + offset];
             }
         }
     }
@@ -132,130 +170,151 @@ impl ZonedOperator {
     /// Reads `dL/du` of a chunk; whether any is not 0.
     #[inline(always)]
     fn gather_next(&mut self, at: usize) -> bool {
-        let Chunk {
-            n_cells, places, ..
-        } = &self.chunks[at];
+        let chunk = &self.chunks[at];
         let mut any = false;
-        for (state, lanes) in self.next.iter_mut().enumerate() {
+        for (state, lanes) in self.work.next.iter_mut().enumerate() {
             *lanes = [0.0; LANES];
-            for (lane, place) in lanes.iter_mut().zip(places).take(*n_cells) {
-                *lane = self.by_next[state * self.layout.plane + place];
+            let first = state * self.layout.plane + self.corner;
+            for (lane, home) in lanes.iter_mut().zip(&chunk.homes).take(chunk.n_cells) {
+                *lane = self.work.by_next[first + home];
                 any |= *lane != 0.0;
             }
         }
         any
     }
 
-    /// The weights of the next states, for cells in state `own` or for all, and their sums.
+    /// The weights of the next states, for cells in state `own` or for all; one over their sums, and what they count in the
+    /// prediction.
     #[inline(always)]
-    fn weigh(&mut self, at: usize, own: usize) -> Lanes {
-        let first = self.kernel(at, own);
-        let (n_inputs, centre) = (self.inputs.len(), self.offsets.len() / 2);
+    fn weigh(&mut self, zone: usize, own: usize) -> (Lanes, Lanes) {
+        let ((weights, biases), centre) = (self.kernel(zone, own), self.centre(own));
+        let Work {
+            inputs, weighed, ..
+        } = &mut self.work;
+        let rows = self.weights[weights].chunks_exact(inputs.len());
+        let rows = rows.zip(&self.biases[biases]);
         let mut total = [0.0; LANES];
-        for (to, weighed) in self.weighed.iter_mut().enumerate() {
-            let weights = &self.weights[first + to * n_inputs..][..n_inputs];
-            *weighed = [0.0; LANES];
-            for (input, (weight, lanes)) in weights.iter().zip(&self.inputs).enumerate() {
-                if self.n_own > 1 && input % self.offsets.len() == centre {
-                    // A cell's centre is the cell itself, whose state is `own`.
-                    if input / self.offsets.len() == own {
-                        weighed.iter_mut().for_each(|v| *v += weight);
-                    }
-                    continue;
+        for ((weights, bias), weighed) in rows.zip(weighed) {
+            let mut sum = [*bias; LANES];
+            for (weight, x) in weights.iter().zip(&*inputs) {
+                for lane in 0..LANES {
+                    sum[lane] += weight * x[lane];
                 }
-                weighed
-                    .iter_mut()
-                    .zip(lanes)
-                    .for_each(|(v, x)| *v += weight * x);
             }
-            total
-                .iter_mut()
-                .zip(&*weighed)
-                .for_each(|(total, v)| *total += v);
+            for lane in 0..LANES {
+                total[lane] += sum[lane];
+            }
+            *weighed = sum;
         }
-        total
-    }
-
-    /// What the weights of cells in state `own` count in their prediction.
-    #[inline(always)]
-    fn share(&self, own: usize, total: &Lanes) -> Lanes {
-        let p = &self.inputs[own * self.offsets.len() + self.offsets.len() / 2];
-        let mut share = total.map(|total| 1.0 / total);
+        let factor = total.map(|total| 1.0 / total);
+        let mut share = factor;
         if self.n_own > 1 {
+            let p = &inputs[centre];
             share.iter_mut().zip(p).for_each(|(share, p)| *share *= p);
         }
-        share
+        (factor, share)
     }
 
     /// The reverse of [`Self::weigh`] and of what follows.
     #[inline(always)]
-    fn unweigh(&mut self, at: usize, own: usize, gradient: &mut [f64]) {
-        let total = self.weigh(at, own);
-        let share = self.share(own, &total);
+    fn unweigh(&mut self, zone: usize, own: usize) {
+        let (factor, share) = self.weigh(zone, own);
+        let (weights, centre) = (self.kernel(zone, own).0, self.centre(own));
+        let Work {
+            inputs,
+            by_inputs,
+            weighed,
+            next,
+            by_weights,
+            ..
+        } = &mut self.work;
         let mut mean = [0.0; LANES];
-        for (g, v) in self.next.iter().zip(&self.weighed) {
+        for (g, v) in next.iter().zip(&*weighed) {
             for lane in 0..LANES {
-                mean[lane] += g[lane] * v[lane] / total[lane];
+                mean[lane] += g[lane] * v[lane] * factor[lane];
             }
         }
-        let (n_inputs, n_taps, centre) = (
-            self.inputs.len(),
-            self.offsets.len(),
-            self.offsets.len() / 2,
-        );
-        let first = self.kernel(at, own);
-        for (to, g) in self.next.iter().enumerate() {
-            let mut h = [0.0; LANES];
+        for (g, h) in next.iter().zip(&mut *weighed) {
             for lane in 0..LANES {
                 h[lane] = (g[lane] - mean[lane]) * share[lane];
             }
-            for input in 0..n_inputs {
-                let place = first + to * n_inputs + input;
-                if self.n_own > 1 && input % n_taps == centre {
-                    if input / n_taps == own {
-                        gradient[place] += f64::from(h.iter().sum::<f32>());
-                    }
-                    continue;
-                }
-                let (x, by) = (&self.inputs[input], &mut self.by_inputs[input]);
-                let weight = self.weights[place];
-                let mut sum = 0.0;
+        }
+        let n_inputs = inputs.len();
+        let first = weights.start % by_weights.len();
+        let (by_weights, weights) = (
+            &mut by_weights[first..][..weights.len()],
+            &self.weights[weights],
+        );
+        for (input, (x, by)) in inputs.iter().zip(by_inputs.iter_mut()).enumerate() {
+            let (x, mut sum) = (*x, *by);
+            let places = (input..weights.len()).step_by(n_inputs);
+            for (h, at) in weighed.iter().zip(places) {
+                let (weight, h) = (weights[at], *h);
+                let mut by_weight = by_weights[at];
                 for lane in 0..LANES {
-                    sum += h[lane] * x[lane];
-                    by[lane] += weight * h[lane];
+                    sum[lane] += weight * h[lane];
+                    by_weight[lane] += h[lane] * x[lane];
                 }
-                gradient[place] += f64::from(sum);
+                by_weights[at] = by_weight;
             }
+            *by = sum;
         }
         if self.n_own > 1 {
-            let by = &mut self.by_inputs[own * n_taps + centre];
+            let by = &mut by_inputs[centre];
             by.iter_mut().zip(mean).for_each(|(by, mean)| *by += mean);
         }
     }
 
-    /// The first weight of the kernel of a chunk's cells in state `own`, or of all.
-    fn kernel(&self, at: usize, own: usize) -> usize {
-        (self.chunks[at].zone * self.n_own + own) * self.layout.n_states * self.inputs.len()
+    /// Places of weights and biases of a zone's kernel, of cells in state `own` or of all.
+    fn kernel(&self, zone: usize, own: usize) -> (Range<usize>, Range<usize>) {
+        let (kernel, n_states) = (zone * self.n_own + own, self.layout.n_states);
+        let n_weights = n_states * self.offsets.len();
+        let weights = kernel * n_weights..(kernel + 1) * n_weights;
+        (weights, kernel * n_states..(kernel + 1) * n_states)
+    }
+
+    /// The input that is the cell's own probability of a state.
+    fn centre(&self, state: usize) -> usize {
+        let n_taps = self.layout.n_taps();
+        state * n_taps + n_taps / 2
     }
 }
 
-/// The cells of one zone after the other.
-fn chunks(layout: &Layout, zones: &Grid<u8>) -> Vec<Chunk> {
-    let mut of_zones = vec![Vec::new(); n_zones(zones)];
-    for (cell, &zone) in zones.iter().enumerate() {
-        of_zones[usize::from(zone)].push(layout.place(cell));
+impl Work {
+    fn new(layout: &Layout, n_of_zone: usize) -> Self {
+        let lanes = |n| vec![[0.0; LANES]; n];
+        Self {
+            inputs: lanes(layout.n_states * layout.n_taps()),
+            by_inputs: lanes(layout.n_states * layout.n_taps()),
+            weighed: lanes(layout.n_states),
+            next: lanes(layout.n_states),
+            by_weights: lanes(n_of_zone),
+            by_next: layout.planes(),
+        }
     }
-    let of_zone = |(zone, all): (usize, Vec<usize>)| {
-        let chunks = all.chunks(LANES).map(move |cells| {
-            let mut places = [cells[0]; LANES];
-            places[..cells.len()].copy_from_slice(cells);
+}
+
+/// The cells of one zone after the other, those of a chunk near each other, and which chunks each zone has.
+fn chunks(layout: &Layout, zones: &Grid<u8>) -> (Vec<Chunk>, Vec<Range<usize>>) {
+    let mut cells: Vec<(usize, usize)> = zones.indexed_iter().map(|(cell, _)| cell).collect();
+    cells.sort_by_key(|(row, col)| (row / TILE, col / TILE));
+    let mut homes = vec![Vec::new(); n_zones(zones)];
+    for (row, col) in cells {
+        homes[usize::from(zones[(row, col)])].push(row * layout.stride + col);
+    }
+    let mut chunks = Vec::new();
+    let of_zone = |homes: Vec<usize>| {
+        let first = chunks.len();
+        chunks.extend(homes.chunks(LANES).map(|cells| {
+            let mut homes = [cells[0]; LANES];
+            homes[..cells.len()].copy_from_slice(cells);
             Chunk {
-                zone,
                 n_cells: cells.len(),
-                places,
+                homes,
             }
-        });
-        chunks.collect::<Vec<_>>()
+        }));
+        first..chunks.len()
     };
-    of_zones.into_iter().enumerate().flat_map(of_zone).collect()
+    let of_zones = homes.into_iter().map(of_zone).collect();
+    (chunks, of_zones)
 }
