@@ -5,7 +5,7 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learners::decisions::{self, LearnedDecisions};
 use crate::learning::learners::filter::SavedFilter;
 use crate::learning::learners::filter::fit::{self, LearnedModel};
-use crate::learning::learners::filter::model::Form;
+use crate::learning::learners::filter::form::Form;
 use crate::learning::learners::network;
 use crate::learning::learners::neural::{self, NeuralModel};
 use crate::policy::{Choice, EstimatorKind, Policy};

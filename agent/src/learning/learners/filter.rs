@@ -2,6 +2,7 @@
 //! the belief of the filter as it is.
 
 pub mod fit;
+pub mod form;
 pub mod model;
 mod saved;
 

@@ -7,7 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
-use crate::learning::learners::filter::model::{Form, zones_tensor};
+use crate::learning::learners::filter::form::{Form, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use anyhow::Result;

@@ -1,0 +1,77 @@
+//! What a filter's tensors alone tell of it in a checkpoint: zones of land, and observation matrices.
+
+use crate::learning::checkpoint::{Part, wrong};
+use anyhow::Result;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, n_zones};
+use emberwatch_network::NamedTensor;
+use emberwatch_protocol::{Grid, Shape};
+use std::sync::Arc;
+
+/// The name of the tensor that holds the zone of each cell.
+pub const ZONES: &str = "zones";
+
+/// The zones that a filter was learned on, where it has kernels for each.
+pub fn zones_tensor(parameters: &Parameters) -> Option<NamedTensor> {
+    let map = parameters.zones.as_ref()?;
+    let (height, width) = map.dim();
+    let numbers = map.iter().map(|&zone| f32::from(zone)).collect();
+    Some((ZONES.into(), vec![height, width], numbers))
+}
+
+/// A filter's dimensions with what its tensors alone tell of: zones of land, and observation matrices.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Form {
+    pub dimensions: Dimensions,
+    /// The zone of each cell, where zones have kernels of their own.
+    pub zones: Option<Arc<Grid<u8>>>,
+}
+
+impl Form {
+    pub fn read(dimensions: Dimensions, part: &Part<'_>) -> Result<Self> {
+        let shape = part.shape(ZONES);
+        let zones = shape.map(|shape| read_zones(shape, part)).transpose()?;
+        let n_rings = match part.shape(Parameters::NAMES[1]) {
+            Some(&[_, n_rings, _]) => n_rings,
+            _ => 0,
+        };
+        let dimensions = Dimensions {
+            n_zones: zones.as_ref().map_or(0, n_zones),
+            n_rings,
+            ..dimensions
+        };
+        let dimensions = dimensions.check();
+        let dimensions =
+            dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+        Ok(Self {
+            dimensions,
+            zones: zones.map(Arc::new),
+        })
+    }
+
+    /// Parameters or moments, whose names end alike.
+    pub fn parameters(&self, part: &Part<'_>, suffix: &str) -> Result<Parameters> {
+        let shapes = self.dimensions.shapes();
+        let tensor =
+            |at: usize| part.tensor(&format!("{}{suffix}", Parameters::NAMES[at]), &shapes[at]);
+        Ok(Parameters {
+            dimensions: self.dimensions,
+            tensors: [tensor(0)?, tensor(1)?, tensor(2)?],
+            zones: self.zones.clone(),
+        })
+    }
+}
+
+fn read_zones(shape: &[usize], part: &Part<'_>) -> Result<Grid<u8>> {
+    let &[height, width] = shape else {
+        return Err(wrong(ZONES, "a map of a grid", format!("{shape:?}")));
+    };
+    let grid = Shape::new(height, width).map_err(|error| wrong(ZONES, "a map of a grid", error))?;
+    let numbers = part.tensor(ZONES, shape)?;
+    let is_zone = |number: &f32| (0.0..256.0).contains(number) && number.fract() == 0.0;
+    if let Some(got) = numbers.iter().find(|number| !is_zone(number)) {
+        return Err(wrong(ZONES, "zones from 0 to 255", got));
+    }
+    let zones = numbers.iter().map(|&number| number as u8).collect();
+    let zones = Grid::from_shape_vec(grid.dim(), zones);
+    Ok(zones.expect("invariant: the tensor has this shape"))
+}
