@@ -25,7 +25,7 @@ fn parameters(sees_own_state: bool, is_land: bool) -> Parameters {
         kernel: (3, 3),
         sees_own_state,
         n_zones: if is_land { 35 } else { 0 },
-        n_rings: 0,
+        n_matrices: 1,
     };
     let model = Model::built_in("wildfire-terrain").expect("a model");
     let zones = model.zone_map().filter(|_| is_land).cloned();

@@ -218,7 +218,7 @@ fn every_gradient_agrees_with_finite_differences() {
                 kernel,
                 sees_own_state,
                 n_zones,
-                n_rings: 0,
+                n_matrices: 1,
             };
             check_gradients(dimensions, size, from_belief);
         };
@@ -309,7 +309,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         kernel: (3, 3),
         sees_own_state,
         n_zones: 0,
-        n_rings: 0,
+        n_matrices: 1,
     }
 }
 

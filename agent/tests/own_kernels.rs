@@ -24,7 +24,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         kernel: (3, 3),
         sees_own_state,
         n_zones: 0,
-        n_rings: 0,
+        n_matrices: 1,
     }
 }
 

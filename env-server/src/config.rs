@@ -197,7 +197,7 @@ impl ServerConfig {
         }
         let task = Task::named(&self.task)?;
         (self.model, self.states) = (task.model, task.states);
-        self.sensor_radius = task.sensor_radius.map_or(-1, i64::from);
+        self.sensor_radius = task.sensor_radius;
         (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
         (self.height, self.width) = (task.height, task.width);
         (self.moves, self.robots) = (task.moves, task.robots);

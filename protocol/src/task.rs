@@ -54,9 +54,9 @@ pub struct Task {
     /// Grid width, likewise.
     #[serde(default)]
     pub width: usize,
-    /// Rows and columns that robots see beyond each cell of their path; as the model says if it is not given.
-    #[serde(default)]
-    pub sensor_radius: Option<u8>,
+    /// Rows and columns that robots see beyond each cell of their path; -1: as the model says.
+    #[serde(default = "as_model_says")]
+    pub sensor_radius: i64,
     /// Moves in a path.
     pub moves: usize,
     /// Robots of each world.
@@ -99,6 +99,11 @@ pub struct TaskError {
 }
 
 impl Task {
+    /// The radius of the sensor, if it is not as the model says.
+    pub fn radius(&self) -> Option<usize> {
+        self.sensor_radius.try_into().ok()
+    }
+
     /// The built-in task of a name, or that of a file.
     ///
     /// # Errors
@@ -223,6 +228,10 @@ fn check_kind(path: &Path) -> Result<(), String> {
 pub fn is_file_name(name: &str) -> bool {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     (1..=64).contains(&name.len()) && name.bytes().all(is_plain) && !name.starts_with('.')
+}
+
+fn as_model_says() -> i64 {
+    -1
 }
 
 fn one() -> u32 {

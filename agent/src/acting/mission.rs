@@ -81,6 +81,12 @@ impl Mission {
         same(&of_task("moves"), &task.moves, &info.n_moves)?;
         same(&of_task("robots"), &task.robots, &info.n_robots)?;
         same(&of_task("max_steps"), &task.max_steps, &info.max_steps)?;
+        let radius = |model: &Model| model.file().sensor.as_ref().map_or(0, |it| it.radius);
+        let of_model = || model.as_ref().map(radius);
+        if let Some(radius) = task.radius().or_else(of_model) {
+            let got = info.airspace().map_err(anyhow::Error::msg)?.radius();
+            same(&of_task("sensor_radius"), &radius, &got)?;
+        }
         let Some(model) = model else {
             return Ok(()); // a grid and states of the server's own
         };

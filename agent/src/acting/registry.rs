@@ -4,6 +4,7 @@ use crate::config::AgentConfig;
 use crate::estimation::AutoencoderEstimator;
 use crate::learning::learned::Learned;
 use crate::learning::learners::decisions::LearnedDecisions;
+use crate::learning::learners::filter::form::WorldForm;
 use crate::policy::{Choice, EstimatorKind, Policy, numbered_states};
 use crate::rollout::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use anyhow::{Context, Result, ensure};
@@ -12,6 +13,7 @@ use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_belief::planning::{BasisKind, Objective, Target};
 use emberwatch_protocol::{Model, Shape};
+use std::sync::Arc;
 
 /// What a misfit is told of.
 const CHECKPOINT: &str = "checkpoint";
@@ -67,7 +69,7 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
         }
         kind @ (EstimatorKind::Learned { .. } | EstimatorKind::Neural) => {
             let learned = present(policy, task.learned.belief(kind))?;
-            same_observations(task, learned.n_observations())?;
+            learned.check_world(&world_form(task.model))?;
             let estimator = learned.estimator(kind.is_spatial(), task.shape);
             estimator.context(CHECKPOINT)?
         }
@@ -135,7 +137,7 @@ fn decisions<'a>(policy: &Policy, learned: &'a Learned) -> Result<&'a LearnedDec
 fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator> {
     let learned = present(policy, task.learned.network.as_ref())?;
     let shape = learned.autoencoder.shape();
-    same_observations(task, shape.n_observations)?;
+    world_form(task.model).check_observations(shape.n_observations, 1)?;
     ensure!(
         shape.grid == task.shape,
         "checkpoint: expected a network for {} cells as the world's, got one for {}",
@@ -176,13 +178,12 @@ pub fn needs_model(policy: &Policy) -> String {
     )
 }
 
-fn same_observations(task: &Task<'_>, got: usize) -> Result<()> {
-    let expected = task.model.n_observations();
-    ensure!(
-        got == expected,
-        "checkpoint: expected {expected} observations as the world's, got {got}"
-    );
-    Ok(())
+fn world_form(model: &Model) -> WorldForm<'_> {
+    WorldForm {
+        n_observations: model.n_observations(),
+        n_matrices: model.n_rings(),
+        zones: model.zone_map().map(Arc::as_ref),
+    }
 }
 
 #[cfg(test)]

@@ -62,13 +62,13 @@ pub fn model_named(name: &str) -> Result<Model> {
 
 /// The model of a task that has one, with the task's sensor.
 pub fn model_of(task: &Task) -> Result<Model> {
-    with_sensor(model_named(&task.model)?, task.sensor_radius)
+    with_sensor(model_named(&task.model)?, task.radius())
 }
 
 /// A model whose robots see so many rows and columns beyond their path; `None`: as it says.
-pub fn with_sensor(model: Model, radius: Option<u8>) -> Result<Model> {
+pub fn with_sensor(model: Model, radius: Option<usize>) -> Result<Model> {
     Ok(match radius {
-        Some(radius) => model.with_radius(radius.into())?,
+        Some(radius) => model.with_radius(radius)?,
         None => model,
     })
 }

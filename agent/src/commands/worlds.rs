@@ -185,7 +185,10 @@ impl GridFlags {
             Some(task) => (model_of(task)?, task.height, task.width),
             None if self.states.is_some() => return Ok(None),
             None => {
-                let model = with_sensor(model_named(&self.model)?, self.sensor_radius)?;
+                let model = with_sensor(
+                    model_named(&self.model)?,
+                    self.sensor_radius.map(usize::from),
+                )?;
                 (model, self.height, self.width)
             }
         };

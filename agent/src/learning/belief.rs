@@ -2,6 +2,7 @@
 
 use crate::learning::checkpoint::Part;
 use crate::learning::learners::filter::fit::LearnedModel;
+use crate::learning::learners::filter::form::WorldForm;
 use crate::learning::learners::filter::model::{SavedModel, check_target};
 use crate::learning::learners::neural::{NeuralModel, new_network};
 use anyhow::Result;
@@ -32,11 +33,15 @@ impl LearnedBelief {
         }
     }
 
-    /// Number of values that a cell may show to it.
-    pub fn n_observations(&self) -> usize {
+    /// Refuses worlds of another form than those that it was learned in.
+    pub fn check_world(&self, world: &WorldForm<'_>) -> Result<()> {
         match self {
-            Self::Filter(model) => model.tables.dimensions.n_observations,
-            Self::Neural(model) => model.network.n_observations(),
+            Self::Filter(model) => model.check_world(world),
+            Self::Neural(model) => {
+                world.check_observations(model.network.n_observations(), 1)?;
+                let mut filters = model.filter.iter();
+                filters.try_for_each(|filter| filter.check_world(world))
+            }
         }
     }
 

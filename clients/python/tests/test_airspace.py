@@ -299,7 +299,7 @@ def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
     with serving(**none, task=far) as instance:
         env = closed_later(gymnasium.make(WILDFIRE, task=far, instance=instance))
         assert env.unwrapped.model.sensor_radius == 2
-        with refuses("states of task 'far': expected those that the server has"):
+        with refuses("sensor_radius of task 'far': expected 2, as the server has, got 1"):
             gymnasium.make(WILDFIRE, task=near, instance=instance)
     near.write_text(near.read_text().replace("radius = 1", "radius = 9"))
     with refuses("sensor_radius: expected -1 to 8, got 9"):

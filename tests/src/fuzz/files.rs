@@ -120,7 +120,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     for (filter, kind, dimensions) in [one, own] {
         let Some(filter) = filter else { continue };
         let likelihood = filter.tables.likelihood_array();
-        let sums = likelihood.sum_axis(Axis(1));
+        let n_matrices = filter.tables.dimensions.n_matrices as f64;
+        let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
         assert!(
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
             "likelihoods sum to {sums}"
@@ -154,7 +155,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         kernel: (1, 3),
         sees_own_state,
         n_zones: 0,
-        n_rings: 0,
+        n_matrices: 1,
     }
 }
 

@@ -41,9 +41,9 @@ pub struct Dimensions {
     /// Zones of land with kernels of their own; 0: all cells are alike. A checkpoint's tensors tell it.
     #[serde(skip)]
     pub n_zones: usize,
-    /// Observation matrices of the sensor; 0: one. A checkpoint's tensors tell it.
-    #[serde(skip)]
-    pub n_rings: usize,
+    /// Observation matrices of the sensor, at least 1. A checkpoint's tensors tell it.
+    #[serde(skip, default = "one")]
+    pub n_matrices: usize,
 }
 
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
@@ -89,9 +89,9 @@ pub enum DimensionsError {
     )]
     Kernel { height: usize, width: usize },
     #[error(
-        "learned filter: observations: expected as many for each of {n_rings} matrices, got {got}"
+        "learned filter: observations: expected a multiple of {n_matrices}, the number of matrices, got {got}"
     )]
-    Rings { n_rings: usize, got: usize },
+    Matrices { n_matrices: usize, got: usize },
 }
 
 impl Dimensions {
@@ -114,9 +114,9 @@ impl Dimensions {
         if !(is_side(height) && is_side(width)) {
             return Err(DimensionsError::Kernel { height, width });
         }
-        let (n_rings, got) = (self.n_rings, self.n_observations);
-        if n_rings > 0 && got % n_rings != 0 {
-            return Err(DimensionsError::Rings { n_rings, got });
+        let (n_matrices, got) = (self.n_matrices, self.n_observations);
+        if !got.is_multiple_of(n_matrices) {
+            return Err(DimensionsError::Matrices { n_matrices, got });
         }
         Ok(self)
     }
@@ -131,9 +131,9 @@ impl Dimensions {
         if self.n_zones > 0 {
             kernel.insert(0, self.n_zones);
         }
-        let likelihood = match self.n_rings {
-            0 => vec![states, self.n_observations],
-            n_rings => vec![states, n_rings, self.n_observations / n_rings],
+        let likelihood = match self.n_matrices {
+            1 => vec![states, self.n_observations],
+            n_matrices => vec![states, n_matrices, self.n_of_matrix()],
         };
         [kernel, likelihood, vec![states]]
     }
@@ -148,8 +148,8 @@ impl Dimensions {
     }
 
     /// Observations of each matrix of the sensor.
-    pub fn n_named(&self) -> usize {
-        self.n_observations / self.n_rings.max(1)
+    pub fn n_of_matrix(&self) -> usize {
+        self.n_observations / self.n_matrices
     }
 
     pub fn lengths(&self) -> [usize; 3] {
@@ -176,7 +176,7 @@ impl Parameters {
         };
         let logit = |index: usize| {
             let state = index / dimensions.n_observations;
-            let seen = index % dimensions.n_observations % dimensions.n_named();
+            let seen = index % dimensions.n_observations % dimensions.n_of_matrix();
             let own = if state == seen { OWN_OBSERVATION } else { 0.0 };
             own + noise(n_kernel + index)
         };
@@ -194,10 +194,10 @@ impl Parameters {
     /// The same on land with kernels for each zone, which the map tells of each cell.
     ///
     /// # Panics
-    /// If the dimensions are of fewer zones.
+    /// If the dimensions are of other numbers of zones.
     pub fn on_land(mut self, zones: Option<Arc<Grid<u8>>>) -> Self {
         assert!(
-            zones.as_deref().map_or(0, n_zones) <= self.dimensions.n_zones,
+            zones.as_deref().map_or(0, n_zones) == self.dimensions.n_zones,
             "zones: expected those of the dimensions"
         );
         self.zones = zones;
@@ -228,7 +228,7 @@ impl Parameters {
 
     /// `P(y | x)`, shape `[S, O]`.
     pub fn likelihood(&self) -> Vec<f64> {
-        let rows = self.tensors[1].chunks_exact(self.dimensions.n_named());
+        let rows = self.tensors[1].chunks_exact(self.dimensions.n_of_matrix());
         rows.flat_map(softmax).collect()
     }
 
@@ -237,10 +237,10 @@ impl Parameters {
         let [kernel, likelihood, initial] = &self.tensors;
         let [by_kernel, by_likelihood, by_initial] = by_tables;
         let slope = |(&free, by): (&f32, &f64)| (by / (1.0 + (-f64::from(free)).exp())) as f32;
-        let n_named = self.dimensions.n_named();
+        let n_of_matrix = self.dimensions.n_of_matrix();
         let rows = likelihood
-            .chunks_exact(n_named)
-            .zip(by_likelihood.chunks_exact(n_named));
+            .chunks_exact(n_of_matrix)
+            .zip(by_likelihood.chunks_exact(n_of_matrix));
         Self {
             zones: None,
             dimensions: self.dimensions,
@@ -285,11 +285,7 @@ impl Tables {
                 kernel: (height, width),
                 sees_own_state: model.sees_own_state(),
                 n_zones: model.zone_map().map_or(0, |_| model.n_zones()),
-                n_rings: if model.n_rings() > 1 {
-                    model.n_rings()
-                } else {
-                    0
-                },
+                n_matrices: model.n_rings(),
             },
             zones: model.zone_map().cloned(),
             kernel: model.kernels().iter().flatten().map(cast).collect(),
@@ -333,6 +329,10 @@ fn softmax(logits: &[f32]) -> Vec<f64> {
     exponentials.into_iter().map(|x| x / sum).collect()
 }
 
+fn one() -> usize {
+    1
+}
+
 /// Zones of a map, shape `[H, W]`, the first of which is 0.
 pub fn n_zones(map: &Grid<u8>) -> usize {
     map.iter().max().map_or(0, |&last| usize::from(last) + 1)
@@ -356,7 +356,7 @@ mod tests {
             kernel: (3, 1),
             sees_own_state: false,
             n_zones: 0,
-            n_rings: 0,
+            n_matrices: 1,
         }
     }
 
@@ -367,7 +367,7 @@ mod tests {
             assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
         }
         let of_rings = Dimensions {
-            n_rings: 2,
+            n_matrices: 2,
             ..dimensions()
         };
         let tables_of_rings = Parameters::first(of_rings, 7).tables();
@@ -383,7 +383,7 @@ mod tests {
         check_chain_rule(dimensions());
         check_chain_rule(Dimensions {
             n_zones: 2,
-            n_rings: 2,
+            n_matrices: 2,
             ..dimensions()
         });
     }
@@ -432,7 +432,10 @@ mod tests {
         };
         check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
         check(|it| it.n_observations = 65, "got 65");
-        check(|it| it.n_rings = 3, "each of 3 matrices, got 4");
+        check(
+            |it| it.n_matrices = 3,
+            "a multiple of 3, the number of matrices, got 4",
+        );
         check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

@@ -105,7 +105,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
             kernel: (3, 3),
             sees_own_state,
             n_zones: 0,
-            n_rings: 0,
+            n_matrices: 1,
         };
         Some(FilterFit::new(dimensions, None, shape(), &AgentConfig::default()).learned())
     };

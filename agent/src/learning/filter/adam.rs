@@ -63,7 +63,7 @@ mod tests {
             kernel: (1, 1),
             sees_own_state: false,
             n_zones: 0,
-            n_rings: 0,
+            n_matrices: 1,
         };
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);

@@ -25,16 +25,9 @@ pub(super) struct Operator {
 }
 
 impl Operator {
-    pub(super) fn new(layout: Layout, n_kernels: usize, weights: &[f32]) -> Self {
+    pub(super) fn new(layout: Layout, n_own: usize, weights: &[f32]) -> Self {
         let mut weights = weights.to_vec();
-        let centres = (n_kernels > 1).then(|| {
-            let take = |(own, all): (usize, Vec<usize>)| {
-                let weight = weights[own];
-                all.into_iter().for_each(|at| weights[at] = 0.0);
-                weight
-            };
-            centres(&layout).map(take).collect()
-        });
+        let centres = (n_own > 1).then(|| take_centres(&layout, &mut weights));
         let forward = Convolution::new(layout, layout.n_states, weights);
         Self {
             layout,
@@ -258,7 +251,7 @@ impl Operator {
 
 /// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
 /// all states that it could see.
-pub(super) fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
+fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     let (n_states, n_taps) = (layout.n_states, layout.n_taps());
     (0..n_states * n_states).map(move |weighed| {
         let place = |from| (weighed * n_states + from) * n_taps + n_taps / 2;
@@ -267,6 +260,16 @@ pub(super) fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize
             (0..n_states).map(place).collect(),
         )
     })
+}
+
+/// Takes the weights of centres that see the cell's own state out of kernels, `[own, to]`; zeros are left.
+pub(super) fn take_centres(layout: &Layout, weights: &mut [f32]) -> Vec<f32> {
+    let take = |(own, all): (usize, Vec<usize>)| {
+        let weight = weights[own];
+        all.into_iter().for_each(|at| weights[at] = 0.0);
+        weight
+    };
+    centres(layout).map(take).collect()
 }
 
 /// [`Operator::end_gradient`] of kernels that see the cell's own state.

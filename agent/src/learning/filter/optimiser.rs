@@ -250,12 +250,13 @@ impl Optimiser {
     }
 
     /// The prior `anchor * ln P(y | x)` on the observation that a state shows most: "there is a
-    /// state which is observable with negligible uncertainties" (paper section III.E, remark).
+    /// state which is observable with negligible uncertainties" (paper section III.E, remark), from the path.
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
-        let n_observations = self.dimensions().n_observations;
+        let dimensions = self.dimensions();
+        let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());
         let likelihood = self.parameters.likelihood();
-        let row = &likelihood[state * n_observations..][..n_observations];
-        let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
+        let row = &likelihood[state * n_observations..][..n_of_matrix];
+        let shown = (0..n_of_matrix).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
             by_likelihood[state * n_observations + shown] -= self.config.anchor / row[shown];
         }

@@ -57,7 +57,7 @@ impl Phi {
         }
     }
 
-    /// Room for the weights' planes, where there are such.
+    /// Room for the weights' planes, if there are any.
     fn weighed_planes(&self) -> Vec<f32> {
         match self {
             Self::Alike(operator) => operator.weighed_planes(),
@@ -94,7 +94,13 @@ impl Recursion {
 
     /// Takes other parameters of the same dimensions.
     pub fn set(&mut self, tables: &Tables) {
-        self.operator = Phi::new(self.layout(), tables);
+        match &mut self.operator {
+            Phi::Alike(operator) => {
+                *operator =
+                    Operator::new(operator.layout, tables.dimensions.n_own(), &tables.kernel);
+            }
+            Phi::Zoned(operator) => operator.set(&tables.kernel),
+        }
         self.tables.clone_from(tables);
     }
 

@@ -4,7 +4,7 @@
 //! read is gathered, and what they owe to the cells that they read is added where it came from.
 
 use crate::learning::filter::layout::{LANES, Layout};
-use crate::learning::filter::operator::{centres, end_gradient};
+use crate::learning::filter::operator::{end_gradient, take_centres};
 use emberwatch_belief::estimation::parameters::n_zones;
 use emberwatch_protocol::Grid;
 use std::ops::Range;
@@ -35,7 +35,7 @@ pub(super) struct ZonedOperator {
     work: Work,
 }
 
-/// Homes of cells; those missing are the first again.
+/// Homes of cells; missing ones repeat the first.
 #[derive(Debug, Clone)]
 struct Chunk {
     n_cells: usize,
@@ -61,33 +61,33 @@ struct Work {
 impl ZonedOperator {
     /// The zone of each cell is `zones`, shape `[H, W]`.
     pub(super) fn new(layout: Layout, zones: &Grid<u8>, n_own: usize, weights: &[f32]) -> Self {
-        let mut weights = weights.to_vec();
-        let n_of_zone = n_own * layout.n_states * layout.n_states * layout.n_taps();
-        let mut biases = vec![0.0; n_zones(zones) * n_own * layout.n_states];
-        if n_own > 1 {
-            let of_zones = weights.chunks_exact_mut(n_of_zone);
-            let n_biases = n_own * layout.n_states;
-            for (weights, biases) in of_zones.zip(biases.chunks_exact_mut(n_biases)) {
-                for ((own, all), bias) in centres(&layout).zip(biases) {
-                    *bias = weights[own];
-                    all.into_iter().for_each(|at| weights[at] = 0.0);
-                }
-            }
-        }
         let taps = (0..layout.kernel_height)
             .flat_map(|row| (0..layout.kernel_width).map(move |col| row * layout.stride + col));
         let plane = |from| taps.clone().map(move |tap| from * layout.plane + tap);
         let (chunks, of_zones) = chunks(&layout, zones);
-        Self {
+        let n_of_zone = n_own * layout.n_states * layout.n_states * layout.n_taps();
+        let mut operator = Self {
             layout,
             n_own,
-            weights,
-            biases,
+            weights: Vec::new(),
+            biases: vec![0.0; of_zones.len() * n_own * layout.n_states],
             chunks,
             of_zones,
             offsets: (0..layout.n_states).flat_map(plane).collect(),
             corner: layout.row(0),
             work: Work::new(&layout, n_of_zone),
+        };
+        operator.set(weights);
+        operator
+    }
+
+    /// Takes other weights.
+    pub(super) fn set(&mut self, weights: &[f32]) {
+        self.weights = weights.to_vec();
+        if self.n_own > 1 {
+            let of_zones = self.weights.chunks_exact_mut(self.work.by_weights.len());
+            let biases = of_zones.flat_map(|weights| take_centres(&self.layout, weights));
+            self.biases = biases.collect();
         }
     }
 

@@ -2,6 +2,7 @@
 
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::Contents;
+use crate::learning::learners::filter::form::WorldForm;
 use anyhow::Result;
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
@@ -22,7 +23,7 @@ use std::time::Duration;
 pub struct Worlds {
     /// Where robots may fly and what they see.
     pub airspace: Airspace,
-    /// The zone of each cell, shape `[H, W]`, where lands differ and learners are told.
+    /// The zone of each cell, shape `[H, W]`, where land differs and learners are told.
     pub zones: Option<Arc<Grid<u8>>>,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
@@ -31,6 +32,15 @@ pub struct Worlds {
 }
 
 impl Worlds {
+    /// What beliefs must have been learned of.
+    pub fn form(&self) -> WorldForm<'_> {
+        WorldForm {
+            n_observations: self.n_observations,
+            n_matrices: self.airspace.n_rings(),
+            zones: self.zones.as_deref(),
+        }
+    }
+
     pub fn shape(&self) -> Shape {
         self.airspace.shape()
     }

@@ -86,6 +86,8 @@ impl NeuralLearner {
         if let Some(contents) = contents {
             learner.load(contents)?;
         }
+        let mut filters = learner.filter.iter();
+        filters.try_for_each(|filter| filter.check_world(&learner.worlds.form()))?;
         Ok(learner)
     }
 

@@ -142,7 +142,7 @@ fn learners_plan_on_the_belief_that_settings_say() {
             kernel: (3, 3),
             sees_own_state: false,
             n_zones: 0,
-            n_rings: 0,
+            n_matrices: 1,
         };
         let learner = FilterLearner::new(dimensions, worlds(), config);
         let beam = |belief: &Belief, target: usize, step: u64| {
@@ -214,7 +214,7 @@ fn learned_filter(sees_own_state: bool) -> LearnedModel {
         kernel: (3, 3),
         sees_own_state,
         n_zones: 0,
-        n_rings: 0,
+        n_matrices: 1,
     };
     FilterFit::new(
         dimensions,

@@ -53,10 +53,6 @@ pub fn learner(
         }
         LearnerKind::Neural => {
             let filter = spec.learned.filter.as_ref();
-            if let Some(filter) = filter {
-                let got = filter.tables.dimensions.n_observations;
-                same_observations(worlds.n_observations, got)?;
-            }
             let learner = NeuralLearner::new(contents, filter, worlds, config, &spec.device);
             Box::new(learner.with_context(of_file)?)
         }
@@ -75,19 +71,11 @@ pub fn learner(
                 Some(base) => base,
                 None => base(spec, info, worlds.shape())?,
             };
-            same_observations(worlds.n_observations, base.n_observations())?;
+            base.check_world(&worlds.form())?;
             let learner = DecisionsLearner::new(base, contents, worlds, config);
             Box::new(learner.with_context(of_file)?)
         }
     })
-}
-
-fn same_observations(expected: usize, got: usize) -> Result<()> {
-    ensure!(
-        got == expected,
-        "checkpoint: expected {expected} observations as the world's, got {got}"
-    );
-    Ok(())
 }
 
 /// Refuses a server without the first frames that the settings ask for, which show every cell.
@@ -151,7 +139,7 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
         kernel,
         sees_own_state: config.learner == LearnerKind::OwnFilter,
         n_zones: worlds.zones.as_deref().map_or(0, n_zones),
-        n_rings: if n_rings > 1 { n_rings } else { 0 },
+        n_matrices: n_rings,
     };
     Ok(dimensions.check()?)
 }

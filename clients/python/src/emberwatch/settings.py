@@ -304,6 +304,10 @@ def _check_task(asked: str | Path, info: ServerInfo) -> None:
         if own[name] != got:
             raise invalid(f"{name} of task {task.name!r}", f"{got}, as the server has", own[name])
     described = _described(own)
+    if described.sensor_radius != info.airspace.radius:
+        expected = f"{info.airspace.radius}, as the server has"
+        name = f"sensor_radius of task {task.name!r}"
+        raise invalid(name, expected, described.sensor_radius)
     served: Description | None = info.recorded_states
     if served is not None:
         served = served.with_radius(info.airspace.radius)

@@ -3,6 +3,7 @@
 use super::saved::SavedDecisions;
 use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::Contents;
+use crate::learning::learners::filter::form::WorldForm;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
@@ -44,11 +45,12 @@ impl Base {
         }
     }
 
-    /// Number of values that a cell may show to it.
-    pub fn n_observations(&self) -> usize {
+    /// Refuses worlds of another form.
+    pub fn check_world(&self, world: &WorldForm<'_>) -> Result<()> {
         match &self.start {
-            Start::Known(filter) => filter.likelihood().map_or(0, |it| it.ncols()),
-            Start::Learned(belief, _) => belief.n_observations(),
+            // Made of the world's own model.
+            Start::Known(_) => Ok(()),
+            Start::Learned(belief, _) => belief.check_world(world),
         }
     }
 

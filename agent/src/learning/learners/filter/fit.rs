@@ -7,7 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
-use crate::learning::learners::filter::form::{Form, zones_tensor};
+use crate::learning::learners::filter::form::{Form, check_zones, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use anyhow::Result;
@@ -207,15 +207,9 @@ impl FilterFit {
         config: &AgentConfig,
     ) -> Result<Self> {
         let form = Form::read(dimensions, &contents.part(""))?;
-        let got = form.dimensions.n_rings.max(1);
-        let expected = dimensions.n_rings.max(1);
+        let (expected, got) = (dimensions.n_matrices, form.dimensions.n_matrices);
         check(got == expected, "observation matrices", expected, got)?;
-        check(
-            form.zones == zones,
-            "zones",
-            "those of the server",
-            "others",
-        )?;
+        check_zones(zones.as_deref(), form.zones.as_deref())?;
         saved.load(contents, &form)?;
         let mut fit = Self::new(dimensions, zones, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
@@ -255,7 +249,7 @@ mod tests {
         kernel: (1, 3),
         sees_own_state: false,
         n_zones: 0,
-        n_rings: 0,
+        n_matrices: 1,
     };
 
     fn shape() -> Shape {
@@ -331,7 +325,7 @@ mod tests {
     fn zones_and_matrices_are_kept_in_checkpoints() {
         let dimensions = Dimensions {
             n_zones: 2,
-            n_rings: 2,
+            n_matrices: 2,
             ..DIMENSIONS
         };
         let mut fit = FilterFit::new(dimensions, zones([0, 1, 1]), shape(), &config());
@@ -353,7 +347,7 @@ mod tests {
         };
         assert_eq!(
             error(&stored, dimensions, zones([0, 0, 1])),
-            "zones: expected those of the server, got others"
+            "zones: expected 2 on 1 x 3 cells, got another map"
         );
         assert_eq!(
             error(&stored, DIMENSIONS, zones([0, 1, 1])),
@@ -371,7 +365,7 @@ mod tests {
         );
         forged(
             |map| map.numbers[1] = 255.0,
-            "zones: expected those of the server, got others",
+            "zones: expected 2 on 1 x 3 cells, got another map",
         );
         forged(
             |map| map.shape = vec![3],

@@ -1,14 +1,15 @@
-//! What a filter's tensors alone tell of it in a checkpoint: zones of land, and observation matrices.
+//! What a filter's tensors alone tell of it in a checkpoint, zones of land and observation matrices, and whether a world has
+//! the same.
 
-use crate::learning::checkpoint::{Part, wrong};
-use anyhow::Result;
+use crate::learning::checkpoint::{Part, check, wrong};
+use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, n_zones};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::{Grid, Shape};
 use std::sync::Arc;
 
 /// The name of the tensor that holds the zone of each cell.
-pub const ZONES: &str = "zones";
+const ZONES: &str = "zones";
 
 /// The zones that a filter was learned on, where it has kernels for each.
 pub fn zones_tensor(parameters: &Parameters) -> Option<NamedTensor> {
@@ -30,13 +31,13 @@ impl Form {
     pub fn read(dimensions: Dimensions, part: &Part<'_>) -> Result<Self> {
         let shape = part.shape(ZONES);
         let zones = shape.map(|shape| read_zones(shape, part)).transpose()?;
-        let n_rings = match part.shape(Parameters::NAMES[1]) {
-            Some(&[_, n_rings, _]) => n_rings,
-            _ => 0,
+        let n_matrices = match part.shape(Parameters::NAMES[1]) {
+            Some(&[_, n_matrices, _]) => n_matrices.max(1),
+            _ => 1,
         };
         let dimensions = Dimensions {
             n_zones: zones.as_ref().map_or(0, n_zones),
-            n_rings,
+            n_matrices,
             ..dimensions
         };
         let dimensions = dimensions.check();
@@ -74,4 +75,54 @@ fn read_zones(shape: &[usize], part: &Part<'_>) -> Result<Grid<u8>> {
     let zones = numbers.iter().map(|&number| number as u8).collect();
     let zones = Grid::from_shape_vec(grid.dim(), zones);
     Ok(zones.expect("invariant: the tensor has this shape"))
+}
+
+/// What a world must have in common with that of a belief that was learned.
+#[derive(Debug, Clone, Copy)]
+pub struct WorldForm<'a> {
+    pub n_observations: usize,
+    pub n_matrices: usize,
+    /// The zone of each cell, as far as it is known.
+    pub zones: Option<&'a Grid<u8>>,
+}
+
+impl WorldForm<'_> {
+    /// Refuses a belief about other observations.
+    pub fn check_observations(&self, n_observations: usize, n_matrices: usize) -> Result<()> {
+        let (expected, got) = (self.n_observations, n_observations);
+        ensure!(
+            got == expected,
+            "checkpoint: expected {expected} observations as the world's, got {got}"
+        );
+        let (expected, got) = (self.n_matrices, n_matrices);
+        ensure!(
+            got == expected,
+            "checkpoint: expected {expected} observation matrices as the world's sensor has, got {got}"
+        );
+        Ok(())
+    }
+
+    /// Refuses a filter about other observations, or learned on zones that are not the world's.
+    pub fn check_filter(&self, dimensions: &Dimensions, zones: Option<&Grid<u8>>) -> Result<()> {
+        self.check_observations(dimensions.n_observations, dimensions.n_matrices)?;
+        zones.map_or(Ok(()), |zones| check_zones(self.zones, Some(zones)))
+    }
+}
+
+/// Refuses another map of zones, or none, or any, than is expected.
+pub fn check_zones(expected: Option<&Grid<u8>>, got: Option<&Grid<u8>>) -> Result<()> {
+    let told = |map: Option<&Grid<u8>>| match map {
+        None => "none".to_owned(),
+        Some(map) => {
+            let (height, width) = map.dim();
+            format!("{} on {height} x {width} cells", n_zones(map))
+        }
+    };
+    let (wants, has) = (told(expected), told(got));
+    let has = if has == wants {
+        "another map".into()
+    } else {
+        has
+    };
+    check(got == expected, ZONES, wants, has)
 }

@@ -2,9 +2,9 @@
 
 use crate::learning::checkpoint::{Part, check};
 use crate::learning::learners::filter::fit::LearnedModel;
-use crate::learning::learners::filter::form::{Form, ZONES, zones_tensor};
+use crate::learning::learners::filter::form::{Form, WorldForm, zones_tensor};
 use anyhow::Result;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::Shape;
@@ -17,19 +17,29 @@ impl LearnedModel {
     /// Before the first frame. `is_spatial`: whether its corrections reach the neighbours of visited cells.
     ///
     /// # Errors
-    /// If it was learned on land of another grid.
+    /// If it was learned on zones of another grid.
     pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Result<Box<dyn Estimator>> {
-        let of_zones = self.tables.zones.as_ref().map(|zones| zones.dim());
-        let got = of_zones.unwrap_or(shape.dim());
-        check(
-            got == shape.dim(),
-            ZONES,
-            format!("those of a {shape} grid"),
-            format!("{got:?}"),
-        )?;
+        if let Some(zones) = &self.tables.zones {
+            let (height, width) = zones.dim();
+            let (expected, got) = (shape.to_string(), Shape::new(height, width)?.to_string());
+            check(
+                got == expected,
+                "zones",
+                format!("a map of {expected} cells"),
+                got,
+            )?;
+        }
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
         let neighbours = || (self.target, self.correlations.clone());
         Ok(correcting(filter, is_spatial.then(neighbours)))
+    }
+
+    /// Refuses worlds of another form than those that it was learned in.
+    pub fn check_world(&self, world: &WorldForm<'_>) -> Result<()> {
+        let Tables {
+            dimensions, zones, ..
+        } = &self.tables;
+        world.check_filter(dimensions, zones.as_deref())
     }
 
     pub fn tensors(&self) -> Vec<NamedTensor> {
