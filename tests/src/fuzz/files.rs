@@ -17,9 +17,10 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
-use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape, Transition};
+use emberwatch_protocol::{Airspace, Dynamics, Frame, Grid, Model, Move, Shape, Transition};
 use ndarray::{Array3, Axis};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Steps that a model is simulated for.
 const N_STEPS: u64 = 8;
@@ -209,16 +210,27 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
             encoded(fit::OWN_KIND, filter(dimensions(true))),
         ),
         ("autoencoder", encoded(network::KIND, small)),
+        ("filter_of_zones", encoded(fit::KIND, filter(of_zones()))),
         // Asked for 30 GiB once.
         ("autoencoder_large", encoded(network::KIND, large)),
         ("decisions", encoded(decisions::KIND, decisions())),
     ]
 }
 
+fn of_zones() -> Dimensions {
+    Dimensions {
+        n_zones: 2,
+        n_matrices: 2,
+        ..dimensions(false)
+    }
+}
+
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape(), config());
-    let mut fit = FilterFit::new(dimensions, None, shape, &config);
+    let zones = Grid::from_shape_vec(shape.dim(), vec![0, 1, 1]).expect("a map");
+    let zones = (dimensions.n_zones > 0).then(|| Arc::new(zones));
+    let mut fit = FilterFit::new(dimensions, zones, shape, &config);
     let belief = Belief::uniform(2, shape);
     fit.begin(0);
     for value in [0, 1, 1, 0, 1] {

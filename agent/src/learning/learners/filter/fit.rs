@@ -365,7 +365,7 @@ mod tests {
         );
         forged(
             |map| map.numbers[1] = 255.0,
-            "zones: expected 2 on 1 x 3 cells, got another map",
+            "zones: expected 2 on 1 x 3 cells, got 256 on 1 x 3 cells",
         );
         forged(
             |map| map.shape = vec![3],
