@@ -57,10 +57,16 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
         Model::wildfire(),
         Model::from_toml(road_ice).expect("valid"),
         burnout(),
+        Model::built_in("wildfire-terrain").expect("a built-in model"),
     ];
     for model in models {
-        for (height, width) in [(1, 1), (5, 9), (20, 33), (64, 64)] {
-            let shape = Shape::new(height, width).expect("test shape");
+        let shapes = [(1, 1), (5, 9), (20, 33), (64, 64)];
+        let shapes = shapes.map(|(height, width)| Shape::new(height, width).expect("test shape"));
+        // A map of zones is of one grid.
+        for shape in shapes
+            .into_iter()
+            .filter(|shape| model.check_on(*shape).is_ok())
+        {
             let prior = Belief::uniform(model.n_states(), shape);
             let mut known = BayesFilter::known(&model, prior.clone()).expect("valid model");
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);

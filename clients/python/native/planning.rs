@@ -81,11 +81,10 @@ pub fn beam_search<'py>(
 
 /// Values of the cells on the path, or of those in sight of it where these pay.
 fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
-    if airspace.pays() == Pays::Seen && airspace.radius() > 0 {
-        let nothing = CellValues::new(Grid::zeros(values.dim()), 0.0);
-        return nothing.within(airspace, Some(values));
+    match airspace.pays() {
+        Pays::Seen => CellValues::in_sight_of(airspace, values),
+        Pays::Visited => CellValues::new(values, 0.0).within(airspace, None),
     }
-    CellValues::new(values, 0.0).within(airspace, None)
 }
 
 /// Refuses what takes more memory than there may be.

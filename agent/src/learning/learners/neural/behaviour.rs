@@ -151,6 +151,7 @@ impl Behaviour {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use emberwatch_protocol::Model;
     use emberwatch_protocol::randomness::{Purpose, stream};
 
     fn shape() -> Shape {
@@ -209,5 +210,21 @@ mod tests {
         assert_eq!(best(Aim::Exploit { entropy: 0 }).1, 0.5);
         let with_entropy = best(Aim::Exploit { entropy: 3 }).1;
         assert!((with_entropy - 0.5 - 0.3 * 2_f32.ln()).abs() < 1e-6);
+        // With a wider sensor, covering and entropy are of what is seen.
+        let model = Model::wildfire().with_radius(1).expect("a radius");
+        let wide = model.airspace(shape()).expect("an airspace");
+        for (aim, in_sight) in [
+            (Aim::Cover, true),
+            (Aim::Far, false),
+            (Aim::Exploit { entropy: 0 }, false),
+            (Aim::Exploit { entropy: 3 }, true),
+        ] {
+            let mut rng = stream(1, Purpose::Exploration, 0);
+            let behaviour = Behaviour { aim, goal: 11 };
+            let values = behaviour.values(objective, &wide, 1, &belief, || seen.clone(), &mut rng);
+            let values = values.expect("values");
+            assert_eq!(values.in_sight().is_some(), in_sight, "{aim:?}");
+            assert_eq!(values.airspace(), &wide);
+        }
     }
 }
