@@ -2,7 +2,7 @@
 //! the same.
 
 use crate::learning::checkpoint::{Part, check, wrong};
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, n_zones};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::{Grid, Shape};
@@ -105,7 +105,8 @@ impl WorldForm<'_> {
     /// Refuses a filter about other observations, or learned on zones that are not the world's.
     pub fn check_filter(&self, dimensions: &Dimensions, zones: Option<&Grid<u8>>) -> Result<()> {
         self.check_observations(dimensions.n_observations, dimensions.n_matrices)?;
-        zones.map_or(Ok(()), |zones| check_zones(self.zones, Some(zones)))
+        let checked = zones.map_or(Ok(()), |zones| check_zones(self.zones, Some(zones)));
+        checked.context("checkpoint")
     }
 }
 
