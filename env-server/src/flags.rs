@@ -26,8 +26,9 @@ pub struct ServerFlags {
     /// no deadline [default: 0]
     #[arg(long, value_name = "MILLIS")]
     pub deadline_ms: Option<u64>,
-    /// Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes: `wildfire`,
-    /// `small`, `sparse`, `latent`, `burnout`, `terrain`, `road-ice`, `team`, `jacksboro` or the path of a task file
+    /// Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes:
+    /// `wildfire`, `small`, `sparse`, `latent`, `burnout`, `terrain`, `road-ice`, `team`, `jacksboro` or the path of a
+    /// task file
     #[arg(long, value_name = "NAME|FILE")]
     pub task: Option<String>,
     /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `wildfire-terrain`,

@@ -114,7 +114,7 @@ impl Contents {
     }
 
     /// The tensors whose names begin so.
-    pub fn part(&self, prefix: &'static str) -> Part<'_> {
+    pub fn part(&self, prefix: &str) -> Part<'_> {
         Part {
             contents: self,
             prefix: prefix.into(),

@@ -7,7 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
-use crate::learning::learners::filter::form::{Form, check_zones, zones_tensor};
+use crate::learning::learners::filter::form::{Form, check_zones, named_tensors, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use anyhow::Result;
@@ -162,14 +162,8 @@ impl FilterFit {
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         let adam = &self.optimiser.adam;
         let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
-        let named = |(suffix, part): (&str, &Parameters)| {
-            let shapes = part.dimensions.shapes();
-            [0, 1, 2].map(|at| {
-                let name = format!("{}{suffix}", Parameters::NAMES[at]);
-                (name, shapes[at].clone(), part.tensors[at].clone())
-            })
-        };
-        let parts = SUFFIXES.into_iter().zip(parts).flat_map(named);
+        let parts = SUFFIXES.into_iter().zip(parts);
+        let parts = parts.flat_map(|(suffix, part)| named_tensors(part, suffix));
         parts
             .chain(zones_tensor(self.optimiser.parameters()))
             .collect()

@@ -3,7 +3,7 @@
 
 use crate::learning::checkpoint::{Part, check, wrong};
 use anyhow::{Context, Result, ensure};
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, n_zones};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables, n_zones};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::{Grid, Shape};
 use std::sync::Arc;
@@ -11,7 +11,16 @@ use std::sync::Arc;
 /// The name of the tensor that holds the zone of each cell.
 const ZONES: &str = "zones";
 
-/// The zones that a filter was learned on, where it has kernels for each.
+/// The tensors of parameters, or of their moments, whose names end alike.
+pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] {
+    let shapes = parameters.dimensions.shapes();
+    [0, 1, 2].map(|at| {
+        let name = format!("{}{suffix}", Parameters::NAMES[at]);
+        (name, shapes[at].clone(), parameters.tensors[at].clone())
+    })
+}
+
+/// The zones that a filter was learned on, shape `[H, W]`, where it has kernels for each.
 pub fn zones_tensor(parameters: &Parameters) -> Option<NamedTensor> {
     let map = parameters.zones.as_ref()?;
     let (height, width) = map.dim();
@@ -28,6 +37,10 @@ pub struct Form {
 }
 
 impl Form {
+    /// That of a filter whose state says the other dimensions.
+    ///
+    /// # Errors
+    /// If zones or matrices are none that a filter can have.
     pub fn read(dimensions: Dimensions, part: &Part<'_>) -> Result<Self> {
         let shape = part.shape(ZONES);
         let zones = shape.map(|shape| read_zones(shape, part)).transpose()?;
@@ -80,9 +93,11 @@ fn read_zones(shape: &[usize], part: &Part<'_>) -> Result<Grid<u8>> {
 /// What a world must have in common with that of a belief that was learned.
 #[derive(Debug, Clone, Copy)]
 pub struct WorldForm<'a> {
+    /// Values that a cell may show, of all matrices together.
     pub n_observations: usize,
+    /// Observation matrices of the sensor, at least 1.
     pub n_matrices: usize,
-    /// The zone of each cell, as far as it is known.
+    /// The zone of each cell, shape `[H, W]`, if there are zones and they are known.
     pub zones: Option<&'a Grid<u8>>,
 }
 
@@ -103,10 +118,13 @@ impl WorldForm<'_> {
     }
 
     /// Refuses a filter about other observations, or learned on zones that are not the world's.
-    pub fn check_filter(&self, dimensions: &Dimensions, zones: Option<&Grid<u8>>) -> Result<()> {
+    pub fn check_filter(&self, filter: &Tables) -> Result<()> {
+        let dimensions = filter.dimensions;
         self.check_observations(dimensions.n_observations, dimensions.n_matrices)?;
-        let checked = zones.map_or(Ok(()), |zones| check_zones(self.zones, Some(zones)));
-        checked.context("checkpoint")
+        match &filter.zones {
+            None => Ok(()),
+            zones => check_zones(self.zones, zones.as_deref()).context("checkpoint"),
+        }
     }
 }
 

@@ -2,9 +2,9 @@
 
 use crate::learning::checkpoint::{Part, check};
 use crate::learning::learners::filter::fit::LearnedModel;
-use crate::learning::learners::filter::form::{Form, WorldForm, zones_tensor};
+use crate::learning::learners::filter::form::{Form, WorldForm, named_tensors, zones_tensor};
 use anyhow::Result;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_network::NamedTensor;
 use emberwatch_protocol::Shape;
@@ -36,17 +36,11 @@ impl LearnedModel {
 
     /// Refuses worlds of another form than those that it was learned in.
     pub fn check_world(&self, world: &WorldForm<'_>) -> Result<()> {
-        let Tables {
-            dimensions, zones, ..
-        } = &self.tables;
-        world.check_filter(dimensions, zones.as_deref())
+        world.check_filter(&self.tables)
     }
 
     pub fn tensors(&self) -> Vec<NamedTensor> {
-        let shapes = self.parameters.dimensions.shapes().into_iter();
-        let names = Parameters::NAMES.iter().map(|name| (*name).to_owned());
-        let tensors = names.zip(shapes).zip(self.parameters.tensors.clone());
-        let tensors = tensors.map(|((name, shape), numbers)| (name, shape, numbers));
+        let tensors = named_tensors(&self.parameters, "").into_iter();
         tensors.chain(zones_tensor(&self.parameters)).collect()
     }
 
