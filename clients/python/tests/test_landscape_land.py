@@ -220,7 +220,7 @@ def test_the_command_says_what_it_made(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines() == [
         f"{out}: 4 x 5 cells, zones: 1",
-        f"{dem}: cells of 30 x 30 metres, on the ground; steepest slope 10.0 degrees",
+        f"{dem}: cells of 30 x 30 metres on the ground; steepest slope 10.0 degrees",
         f"{dem}: heights taken as metres, as nothing says their unit; --height-unit ft changes "
         "that",
     ]

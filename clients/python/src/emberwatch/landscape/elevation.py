@@ -37,7 +37,7 @@ def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: 
     rise = gradient(values, width, height)
     steepest = np.degrees(np.arctan(np.hypot(*rise).max()))
     notes = [
-        f"cells of {width:.4g} x {height:.4g} metres, {why}; steepest slope {steepest:.1f} degrees"
+        f"cells of {width:.4g} x {height:.4g} metres{why}; steepest slope {steepest:.1f} degrees"
     ]
     return Slopes(rise, [*notes, *_turned(layer), heights])
 
@@ -53,14 +53,14 @@ def _sides(layer: Layer, cell: Side | None, *, oblong: bool) -> tuple[tuple[floa
         check_even(place, name)
     ground = place.ground()
     if ground is None and cell is not None:
-        return (cell.metres, cell.metres), "as --cell says"
+        return (cell.metres, cell.metres), ", as --cell says"
     if ground is None:
         check_unit(place, name, "say --cell METRES, or its projection (gdal_translate -a_srs)")
-        return place.cell, "as nothing says another unit (--cell does)"
+        return place.cell, ", as nothing says another unit (--cell does)"
     if cell is not None and abs(cell.metres / ground.height - 1) > _LIKE:
         side = f"{ground.height:.6g} metres, as {name} says, or no flag"
         raise invalid("--cell", side, f"{cell.metres:g}")
-    return (ground.width, ground.height), "on the ground"
+    return (ground.width, ground.height), " on the ground"
 
 
 def _is_in_feet(layer: Layer, cell: Side | None) -> bool:

@@ -165,7 +165,8 @@ def _check_flags(flags: argparse.Namespace) -> None:
     needs = dict.fromkeys(("cell", "height_unit", "oblong", "slope_step"), "elevation")
     needs |= dict.fromkeys(("unburnable", "missing_zone"), "zones")
     for flag, needed in needs.items():
-        if getattr(flags, flag) not in (None, False) and getattr(flags, needed) is None:
+        value = getattr(flags, flag)
+        if value is not None and value is not False and getattr(flags, needed) is None:
             word = "ELEVATION" if needed == "elevation" else "--zones"
             raise invalid(f"--{flag.replace('_', '-')}", f"{word} beside it", "none")
     flags.slope_step = 5.0 if flags.slope_step is None else flags.slope_step
