@@ -286,6 +286,9 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "wind: expected --wind-towards or --wind-from, got both": (dem, *WIND, "--wind-from=N"),
         "--wind-from: expected one of N, NNE, NE, ": (dem, "--wind-speed=3", "--wind-from=up"),
         "or -360 to 360 degrees, got '370'": (dem, "--wind-speed=3", "--wind-from=370"),
+        "--missing-zone: expected at most 1000000000000000, got 9": (
+            "--zones", fuel, f"--missing-zone={'9' * 400}",
+        ),
         "--missing-zone: expected --zones beside it": (dem, "--missing-zone=0"),
         "hole.npy: expected a number in each cell, got none in 1 cells, the first in row 1, col": (
             "--zones", array(f / "hole.npy", hole),

@@ -83,11 +83,11 @@ def _height_unit(layer: Layer, wanted: str | None, *, is_in_feet: bool) -> tuple
         return METRES[wanted], f"heights in {NAMES[wanted]}, as --height-unit says{instead}"
     if known is not None:
         return METRES[known], f"heights in {NAMES[known]}, as the raster says"
+    if vertical is not None:
+        return vertical[0], f"heights in units of {ascii(vertical[1])}, as the projection says"
     if words not in ("", "1"):
         expected = f"heights in one of {', '.join(METRES)}"
         raise invalid(layer.name, expected, f"'{words}'; say --height-unit")
-    if vertical is not None:
-        return vertical[0], f"heights in units of {ascii(vertical[1])}, as the projection says"
     if is_in_feet:
         expected = "a unit of heights, as cells are in feet"
         raise invalid(layer.name, expected, "none; say --height-unit ft, us-ft or m")

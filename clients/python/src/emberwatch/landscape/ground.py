@@ -80,7 +80,9 @@ def is_same(projection: str | None, other: str | None) -> bool:
     if projection is None or other is None or projection == other:
         return projection == other
     crs, second = _horizontal(projection), _horizontal(other)
-    return None not in (crs, second) and crs.equals(second, ignore_axis_order=True)
+    if crs is None or second is None:
+        return False
+    return crs.equals(second, ignore_axis_order=True)
 
 
 @lru_cache(maxsize=64)

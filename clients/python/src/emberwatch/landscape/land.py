@@ -38,6 +38,7 @@ examples:
 """
 #: Larger maps are in a `.npy` file beside the model file, which may have 16 MiB.
 _MOST_INLINE: Final = 1 << 16
+_MOST_NUMBER: Final = 10**15  # of a zone; doubles hold all whole numbers up to it
 _MOST_WIND: Final = 100.0  # m/s: more than any hurricane
 
 
@@ -73,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=tuple(METRES),
         help="what heights count [as the raster says, else m]",
     )
-    add("--oblong", action="store_true", help="take cells that are not square, or not alike")
+    add("--oblong", action="store_true", help="take cells that are not square or differ in size")
     add("--slope-step", type=float, metavar="DEGREES", help="of the classes of slope [5]")
     add("--wind-speed", type=float, default=0.0, metavar="M/S", help="[0: no wind]")
     add(
@@ -90,13 +91,18 @@ def _parser() -> argparse.ArgumentParser:
         "degrees clockwise from the north",
     )
     add("--zones", type=Path, metavar="RASTER", help="whole numbers: each is a zone of its own")
-    add("--missing-zone", type=int, metavar="N", help="the number of cells of --zones without one")
+    add(
+        "--missing-zone",
+        type=int,
+        metavar="N",
+        help="the number of cells of --zones without a value",
+    )
     add("--unburnable", type=_values, metavar="N,N", help="values of --zones that never burn")
     add(
         "--no-fly",
         type=Path,
         metavar="RASTER",
-        help="neither 0 nor without a value where robots may not be",
+        help="a number other than 0 where robots may not be",
     )
     add(
         "--model",
@@ -173,6 +179,8 @@ def _check_flags(flags: argparse.Namespace) -> None:
     if not 0.1 <= flags.slope_step <= 90.0:
         raise invalid("--slope-step", "0.1 to 90 degrees", flags.slope_step)
     flags.cell = None if flags.cell is None else side("--cell", flags.cell)
+    if flags.missing_zone is not None and abs(flags.missing_zone) > _MOST_NUMBER:
+        raise invalid("--missing-zone", f"at most {_MOST_NUMBER}", flags.missing_zone)
     _check_wind(flags)
 
 
@@ -282,7 +290,7 @@ def _whole(layer: Layer, missing_zone: int | None) -> NDArray[np.int64]:
         remedy = "--missing-zone N gives them the number N"
         raise invalid(layer.name, "a number in each cell", f"{got}; {remedy}")
     values = np.where(missing, missing_zone or 0, layer.values)
-    wrong = values[(values % 1 != 0) | (np.abs(values) > 1e15)]
+    wrong = values[(values % 1 != 0) | (np.abs(values) > _MOST_NUMBER)]
     if wrong.size:
         raise invalid(layer.name, "whole numbers, each a zone", wrong[0])
     return values.astype(np.int64)
