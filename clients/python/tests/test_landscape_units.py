@@ -313,7 +313,9 @@ def world(folder: Path, file: Path, cell: float) -> tuple[int, ...]:
         return sequences["states_000"].shape[1:]
 
 
-def test_cells_of_a_recorded_world_are_metres_on_the_ground(tmp_path: Path) -> None:
+def test_cells_of_a_recorded_world_are_metres_on_the_ground(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fire = ARRIVAL.repeat(4, axis=0).repeat(4, axis=1)
     for crs, side_, corner in (
         ("EPSG:3857", 60, MERCATOR_60), ("EPSG:4326", 30 / DEGREE, (10, 0)), (UTM, 30, (5e5, 4e6)),
@@ -321,6 +323,10 @@ def test_cells_of_a_recorded_world_are_metres_on_the_ground(tmp_path: Path) -> N
     ):  # fmt: skip
         file = geotiff(tmp_path / "fire.tif", fire, crs=crs, corner=corner, cell=(side_, side_))
         assert world(tmp_path, file, 60) == (6, 8), crs
+        assert "taken as metres" not in notes(capsys)
+    file = geotiff(tmp_path / "fire.tif", fire, crs=None, cell=(30, 30))
+    assert world(tmp_path, file, 60) == (6, 8)
+    assert "cells taken as metres, as nothing says their unit" in notes(capsys)
 
 
 def mapped(path: Path, unit: str, factor: float, corner: tuple[float, float], **mapping: Any):

@@ -153,6 +153,8 @@ def _import(flags: argparse.Namespace) -> None:
     write(contents)
     for states_of_fire in sequences:
         print(_told(states_of_fire))
+    if first is not None and flags.cell is not None and first.ground() is None:
+        print("cells taken as metres, as nothing says their unit; --height N does not need it")
     n_bytes = flags.out.stat().st_size
     told = f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}"
     print(shown(told))

@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         "--missing-zone",
         type=int,
         metavar="N",
-        help="the number of cells of --zones without a value",
+        help="the number of cells of --zones that have none",
     )
     add("--unburnable", type=_values, metavar="N,N", help="values of --zones that never burn")
     add(
