@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use clap::Parser;
 use emberwatch_dashboard::scene::{Scene, Stage};
-use emberwatch_dashboard::{player, server, watcher};
+use emberwatch_dashboard::{access, player, server, watcher};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::{WatchedProcess, start_logging, stop_on_signals};
 use std::io::Write;
@@ -35,8 +35,9 @@ struct Cli {
     /// Where browsers reach the page; port 0 takes a free one. Whoever reaches it sees everything
     #[arg(long, default_value = "127.0.0.1:8600", value_name = "ADDRESS:PORT")]
     listen: SocketAddr,
-    /// A host name that browsers may call this machine by, beside its addresses; may be given for each
-    #[arg(long, value_name = "HOST")]
+    /// A host name that browsers may call this machine by, in addition to its addresses, such as that of a proxy with
+    /// TLS; may be given for each
+    #[arg(long, value_name = "HOST", value_parser = access::host_name)]
     name: Vec<String>,
     /// Open the page in the default browser
     #[arg(long)]
