@@ -8,7 +8,7 @@ mod saved;
 pub use self::base::Base;
 pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
 
-use self::run::Run;
+use self::run::{Run, features};
 use self::saved::{Held, SavedRun, belief_tensors};
 use crate::config::AgentConfig;
 use crate::learning::belief::SavedBelief;
@@ -119,8 +119,8 @@ impl DecisionsLearner {
         let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
         let mut runs = std::mem::take(&mut self.runs);
         for (index, (run, mut proposals)) in runs.iter_mut().zip(proposals).enumerate() {
-            let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
-            if let Some(transition) = run.led_to(&features) {
+            let features = features(&proposals);
+            if let Some(transition) = run.led_to(&features, &self.dqn) {
                 self.dqn.remember(transition);
             }
             let option = self.choose(index, &features, &mut run.held);
@@ -195,8 +195,15 @@ impl Learner for DecisionsLearner {
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let run = self.begun(observation)?;
-        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
+        let begun = self.begun(observation)?;
+        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
+        let mut ended = std::mem::replace(run, begun);
+        if !self.is_frozen {
+            let start = Instant::now();
+            let transitions = ended.end(&self.dqn).into_iter();
+            transitions.for_each(|transition| self.dqn.remember(transition));
+            self.times[0].1 += start.elapsed();
+        }
         Ok(())
     }
 
