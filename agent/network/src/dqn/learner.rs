@@ -261,7 +261,11 @@ impl Dqn {
     /// Factor on the value of what follows one step: nothing follows the end of an episode that terminated. What
     /// follows a truncated episode counts, because the world goes on.
     pub fn discount(&self, is_terminated: bool) -> f32 {
-        if is_terminated { 0.0 } else { self.settings.gamma }
+        if is_terminated {
+            0.0
+        } else {
+            self.settings.gamma
+        }
     }
 
     /// Remembers a transition, and forgets the oldest if there are too many.

@@ -153,7 +153,10 @@ mod tests {
             };
             let whole = (0..n).filter_map(|_| track.add(step.clone())).last();
             let expected = f64::from(gamma).powi(n as i32) as f32;
-            assert_eq!(whole.expect("n steps").discount.to_bits(), expected.to_bits());
+            assert_eq!(
+                whole.expect("n steps").discount.to_bits(),
+                expected.to_bits()
+            );
         }
     }
 }

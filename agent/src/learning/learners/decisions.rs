@@ -13,7 +13,7 @@ use self::saved::{Held, SavedRun, belief_tensors};
 use crate::config::AgentConfig;
 use crate::learning::belief::SavedBelief;
 use crate::learning::checkpoint::{Contents, check};
-use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::base::{Learner, Worlds, lacks_steps, without_truth};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
@@ -275,6 +275,18 @@ impl Learner for DecisionsLearner {
 
     fn n_updates(&self) -> u64 {
         self.dqn.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        let (batch, n) = (self.dqn.settings().batch, self.dqn.n_remembered());
+        if n < batch {
+            return format!(
+                "an update learns from {batch} transitions, and the steps gave {n}; train for more --steps, or with a \
+                 smaller decisions.batch"
+            );
+        }
+        let rate = self.config.decisions.updates_per_step;
+        lacks_steps("decisions.updates_per_step", rate)
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

@@ -122,7 +122,11 @@ impl NetworkLearner {
         };
         let Progress { position, dqn, .. } = &mut self.progress;
         let full = position.track.add(step);
-        let short = if is_over { position.track.end() } else { Vec::new() };
+        let short = if is_over {
+            position.track.end()
+        } else {
+            Vec::new()
+        };
         let transitions = full.into_iter().chain(short);
         transitions.for_each(|transition| dqn.remember(transition));
     }
@@ -283,6 +287,15 @@ impl Learner for NetworkLearner {
 
     fn n_updates(&self) -> u64 {
         self.progress.autoencoder.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        format!(
+            "an update learns from a window of {} frames of one episode that see some cell twice, and there was none; \
+             train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
+             autoencoder.window",
+            self.config.autoencoder.window
+        )
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
