@@ -22,6 +22,9 @@ const TICK: Duration = Duration::from_millis(50);
 /// How much it gives way to others, of 19: on a busy machine a simulator that wakes up goes first.
 const NICENESS: i32 = 5;
 
+/// What `--listen` needs.
+const LISTEN: &str = "expected an address of this machine and a free port, which port 0 finds";
+
 /// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
 #[derive(Parser)]
 #[command(name = "emberwatch-dashboard", version)]
@@ -69,12 +72,7 @@ fn run(cli: &Cli) -> Result<()> {
         .build()
         .context("start the web server")?;
     let bound = runtime.block_on(TcpListener::bind(cli.listen));
-    let listener = bound.with_context(|| {
-        format!(
-            "--listen: expected a free port, got {}; 0 takes any",
-            cli.listen
-        )
-    })?;
+    let listener = bound.with_context(|| format!("--listen {}: {LISTEN}", cli.listen))?;
     let address = listener.local_addr().context("the page's address")?;
     let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;
