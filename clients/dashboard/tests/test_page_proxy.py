@@ -13,7 +13,7 @@ from typing import NamedTuple
 import pytest
 
 from running import PATIENCE, Dashboard, eventually
-from test_page_access import handshake
+from test_page_access import answer, handshake
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs/many-machines.md"
 
@@ -133,9 +133,7 @@ def test_the_page_works_with_tls_below_a_path(programs, proxy, open_page):
 
 def test_the_path_may_lack_its_slash(programs, proxy):
     behind = proxy(programs.dashboard("page-alone"))
-    connection = behind.connect()
-    connection.request("GET", "/fire", headers={"Host": f"localhost:{behind.port}"})
-    response = connection.getresponse()
+    response = answer(behind.connect(), "/fire", Host=f"localhost:{behind.port}")
     assert response.status == 301
     assert response.headers["Location"].endswith("/fire/")
 
