@@ -141,7 +141,7 @@ impl Status {
             }
             Self::Malformed => "malformed control message".into(),
             Self::NoSuchWorld => format!(
-                "no such world: the server has worlds 0 to {}",
+                "no such world: the server has worlds 0 to {}; start it with --worlds N for more",
                 detail.saturating_sub(1)
             ),
             Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
@@ -185,7 +185,8 @@ impl Status {
             ),
             Self::NoMemory => "shared memory is full: free some, and ask again".into(),
             Self::NoSuchRobot => format!(
-                "no such robot: the server has robots 0 to {}",
+                "no such robot: the server has robots 0 to {}; start it with --worlds N for more worlds, or --robots N \
+                 for more in each",
                 detail.saturating_sub(1)
             ),
         }

@@ -78,7 +78,10 @@ STATUSES: Final = (
     ),
     ("unknown_operation", "operation: expected 1 (step), 2 (observe) or 3 (recall), got {}"),
     ("malformed", "malformed control message"),
-    ("no_such_world", "no such world: the server has worlds 0 to {last}"),
+    (
+        "no_such_world",
+        "no such world: the server has worlds 0 to {last}; start it with --worlds N for more",
+    ),
     ("wrong_length", "wrong payload length: expected {} bytes"),
     ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
     ("bad_move", "byte {} of the payload: expected a move in 0..=3"),
@@ -107,7 +110,11 @@ STATUSES: Final = (
         "incomplete: robot {} is missing; a step names all robots that its client holds in a "
         "world, and a step of several worlds needs them all",
     ),
-    ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
+    (
+        "no_such_robot",
+        "no such robot: the server has robots 0 to {last}; start it with --worlds N for more "
+        "worlds, or --robots N for more in each",
+    ),
     ("no_memory", "shared memory is full: free some, and ask again"),
 )
 
