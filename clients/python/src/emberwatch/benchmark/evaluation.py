@@ -29,8 +29,7 @@ from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS, MeritTally
 from emberwatch.moves import fly
 from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
-from emberwatch.rows import Row, RowFile
-from emberwatch.rows import read as read
+from emberwatch.benchmark.rows import Row, RowFile
 from emberwatch.settings import WorldSpec
 from emberwatch.tasks import Task, built_in_tasks
 
