@@ -1,19 +1,14 @@
-"""A policy in Python on the benchmark's worlds, for the table of `emberwatch-agent compare`.
-
-    rows = evaluate(policy, name="ppo", seeds=range(32), csv="ppo.csv", model="wildfire-small", ...)
-
-and `emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, puts them beside its
-own policies, paired by world.
-"""
+"""Policies in Python on the benchmark's worlds."""
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+import warnings
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TextIO, cast
 
@@ -24,20 +19,21 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_integer, as_seed, told
-from emberwatch.client import Client
+from emberwatch.benchmark.digest import digest
+from emberwatch.benchmark.policies import Actor, Policy, statistics
+from emberwatch.benchmark.report import Progress
+from emberwatch.benchmark.row_file import Mark, RowFile
+from emberwatch.benchmark.rows import Row
+from emberwatch.benchmark.tally import Tally
+from emberwatch.client import Client, embed_flags
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.merit import RECENT_STEPS, MeritTally
-from emberwatch.moves import fly
-from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
-from emberwatch.benchmark.rows import Row, RowFile
-from emberwatch.settings import WorldSpec
+from emberwatch.merit import RECENT_STEPS
+from emberwatch.model import Model
+from emberwatch.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.release import VERSION
+from emberwatch.replies import ServerInfo
+from emberwatch.settings import Settings, WorldArguments
 from emberwatch.tasks import Task, built_in_tasks
-
-#: Takes the stacked observations of some worlds; returns an action for each.
-Policy = Callable[[Any], Any]
-
-#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
-FIRST_TRAINING_SEED: Final = 1000
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
@@ -54,63 +50,8 @@ _TIMEOUT: Final = 30.0
 _SET: Final = ("reward", "num_envs", "max_episode_steps", "autoreset_mode")
 
 
-class _Tally:
-    """Sums over the steps of some worlds."""
-
-    def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
-        self._spec: Final = spec
-        self.n_moves: Final = spec.n_moves
-        self.n_robots: Final = spec.n_robots
-        self.recent_steps: Final = recent_steps
-        self._shape = (n_worlds, spec.height, spec.width)
-        described = spec.described
-        self._knows_target = described is not None
-        target = 0 if described is None else described.target_state
-        self.merit: Final = MeritTally(
-            n_worlds, self._shape[1:], target=target, recent_steps=recent_steps
-        )
-        self.reward = np.zeros(n_worlds)
-        self.n_visited, self.n_visits, self.n_hits, self.n_fire = np.zeros((4, n_worlds), np.int64)
-        self.seconds = 0.0
-
-    def timed(self, act: Policy, seen: Any) -> Any:
-        begin = time.perf_counter()
-        actions = act(seen)
-        self.seconds += time.perf_counter() - begin
-        return actions
-
-    def add(
-        self,
-        results: NDArray[np.void],
-        paths: NDArray[np.integer],
-        truths: NDArray[np.uint8] | None,
-    ) -> None:
-        """One step of all robots, and the hidden states of their worlds, where these are known."""
-        worlds = results["world"][:: self.n_robots]
-        self.reward += worlds["reward"]
-        self.n_visited += worlds["n_visited"]
-        self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(1, np.int64)
-        self.n_hits += worlds["n_hits"]
-        self.n_fire += worlds["n_target_cells"]
-        self.merit.update(
-            self._visited(results["robot"], paths),
-            cells_of(results["robot"]).reshape(-1, self.n_robots, 2),
-            n_hits=worlds["n_hits"],
-            n_burning=worlds["n_target_cells"],
-            states=None if truths is None or not self._knows_target else truths[:: self.n_robots],
-        )
-
-    def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
-        visited = np.zeros(self._shape, np.bool_)
-        worlds = np.arange(len(robots))[:, np.newaxis] // self.n_robots
-        cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
-        visited[worlds, cells[..., 0], cells[..., 1]] = True
-        return visited
-
-
 def evaluate(
-    policy: Any,
+    policy: Policy | Any,
     *,
     name: str,
     seeds: Iterable[int] | None = None,
@@ -121,7 +62,8 @@ def evaluate(
     deterministic: bool = True,
     batch: int = 32,
     recent_steps: int = RECENT_STEPS,
-    csv: str | os.PathLike[str] | None = None,
+    wrap: Callable[[Any], Any] | None = None,
+    csv: str | os.PathLike[str] | RowFile | None = None,
     progress: TextIO | None = sys.stderr,
     **keywords: Any,
 ) -> list[Row]:
@@ -129,8 +71,12 @@ def evaluate(
 
     Args:
         policy: A function from the stacked observations of some worlds to their actions, or a model
-            of Stable-Baselines3. If it has a method `begin(n_worlds)`, that is called whenever
-            other worlds begin.
+            of Stable-Baselines3 or another object with its `predict`. Models with a memory get
+            their state back; `episode_start` is true in the first step of a world only. A function
+            or `predict` with a parameter `action_masks` gets the masks of the worlds,
+            `(n_worlds, 4)` booleans. Observations are normalized for a model that was trained
+            behind `VecNormalize` and still has it (`get_vec_normalize_env`). If the policy has a
+            method `begin(n_worlds)`, that is called whenever other worlds begin.
         name: What the table calls it.
         seeds: The worlds; None: those to test the task on, or 0 to 7. Those below 1000 are test
             worlds.
@@ -140,15 +86,22 @@ def evaluate(
         env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
         estimator: What the table says of its belief; None: `known_model` where `observation` has
             a belief, else `none`.
-        deterministic: Passed on to Stable-Baselines3.
+        deterministic: Passed on to `predict`.
         batch: Worlds at a time, in the order of the seeds.
         recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
             Those that need the hidden states are None with `truth=False`, and where a running
             server does not publish them, or hides its model or the description of recorded
             worlds.
-        csv: A file to write rows to. Rows of this policy that it has already are kept, and not
-            run again; those of other policies are kept. A changed policy needs another name.
-        progress: Where to write how far it is; None: nowhere.
+        wrap: Wraps the worlds, a `VecEnv` of Stable-Baselines3, as the training of the policy did:
+            `lambda worlds: VecFrameStack(worlds, 4)`, or for a saved model
+            `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`, of which the statistics
+            stay as they are.
+        csv: A file to write rows to; several processes may. Rows of this policy that it has
+            already are kept, and not run again, if the worlds, the settings and, as far as can be
+            seen, the policy are the same: the weights of a model, the code and the values that
+            functions refer to. Otherwise they are run again and replaced. Rows of other policies
+            are kept. A file with rows of other worlds is refused.
+        progress: Where to write how far it is, and which rows are kept; None: nowhere.
         keywords: Of the environment: `task`, `model`, `height`, `n_moves`, `observation`, ...
             With `robots` the policy acts for all robots of each world: rows are robots.
 
@@ -159,41 +112,50 @@ def evaluate(
     seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
     steps = (task.max_steps if task else _STEPS) if steps is None else steps
     chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
-    act = _acting(policy, deterministic)
+    actor = Actor(policy, deterministic=deterministic, is_wrapped=wrap is not None)
     if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
         burn_in = _BURN_IN
     keywords["burn_in"] = burn_in
     keywords.setdefault("timeout", _TIMEOUT)
-    if keywords.setdefault("truth", _publishes(keywords.get("instance"))):
+    served = _served(keywords.get("instance"))
+    # A private server publishes hidden states.
+    if keywords.setdefault("truth", served is None or served.publish_truth):
         batch = min(batch, wire.TRUTH_BUFFER)
+    parts = set(names_of(keywords.get("observation")))
     if estimator is None:
-        has_belief = OF_BELIEF & set(names_of(keywords.get("observation")))
-        estimator = "known_model" if has_belief else "none"
-    file = None if csv is None else RowFile(Path(csv))
+        estimator = "known_model" if OF_BELIEF & parts else "none"
     robots = task.robots if task else keywords.get("robots") or 1
-    shares = robots > 1 and bool(OF_TEAM & set(names_of(keywords.get("observation"))))
-    team = "shared" if shares else "alone"
-    kind = (name, estimator, robots, team)
-    done: dict[int, Row] = {}
-    if file is not None:
-        done = file.done(kind, steps, _n_moves(env, keywords, robots), recent_steps)
-    missing = [seed for seed in chosen if seed not in done]
-    report = _Progress(progress, name, chosen, len(missing) * steps)
-    for first in range(0, len(missing), batch):
-        part = missing[first : first + batch]
-        if hasattr(policy, "begin"):
-            policy.begin(len(part))
-        tally = _play(env, keywords, robots, act, part, steps, recent_steps, report)
-        rows = _rows(tally, part, steps, kind)
-        done |= {row.world_seed: row for row in rows}
-        if file is not None:
-            file.add(rows)
-    report.end()
+    setting = _Setting(env, keywords, robots, wrap)
+    acts_on: dict[str, Any] = {
+        "env": env,
+        "estimator": estimator,
+        "deterministic": deterministic,
+        "wrap": wrap,
+    }
+    acts_on["normalizers"] = _check_policy(setting, actor)
+    common: dict[str, Any] = {
+        "policy": name,
+        "estimator": estimator,
+        "robots": robots,
+        "team": "shared" if robots > 1 and OF_TEAM & parts else "alone",
+        "steps": steps,
+        "recent_steps": recent_steps,
+        "policy_fingerprint": _policy_fingerprint(policy, acts_on, keywords),
+    }
+    report = Progress(progress, name, chosen)
+    if csv is None:
+        return _score(setting, actor, chosen, batch, common, report)
+    with csv if isinstance(csv, RowFile) else RowFile(csv) as file:
+        setting = replace(setting, fingerprint=_worlds_fingerprint(keywords, served))
+        done = _kept(file, setting, common, chosen, report)
+        missing = [seed for seed in chosen if seed not in done]
+        made = _score(setting, actor, missing, batch, common, report, file)
+        done |= {row.world_seed: row for row in made}
     return [done[seed] for seed in chosen]
 
 
 def suite(
-    policy: Any,
+    policy: Policy | Any,
     *,
     name: str,
     folder: str | os.PathLike[str] = "suite",
@@ -206,7 +168,9 @@ def suite(
     Args:
         policy: As of `evaluate`, for all tasks; or a mapping from the name of each task to one.
         name: What tables call it.
-        folder: Where rows are kept, a CSV file a task. What is there already is not run again.
+        folder: Where rows are kept, a CSV file a task. Rows of this policy that are there are kept
+            and not run again, as by `evaluate`; rows of worlds that the task has no longer are run
+            again. Such rows of other policies stay there and do not count; a warning names them.
         tasks: Names of tasks or task files; None: all that have names, or those of the mapping.
         worlds: Worlds of each task, the first of its test seeds; None: all of them.
         keywords: As of `evaluate`, but for `task`, `seeds`, `steps` and `csv`.
@@ -220,21 +184,46 @@ def suite(
     if worlds is not None and (as_integer(worlds) or 0) < 1:
         raise invalid("worlds", "at least 1", told(worlds))
     by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
-    chosen = list(tasks or by_task or built_in_tasks())
-    rows: dict[str, list[Row]] = {}
-    for source in chosen:
-        task = Task.named(source)
-        if by_task is not None and task.name not in by_task:
-            raise invalid("policy", f"one for the task {task.name}", ", ".join(by_task))
-        rows[task.name] = evaluate(
+    sources = list(tasks or by_task or built_in_tasks())
+    chosen = [(source, Task.named(source)) for source in sources]
+    names = [task.name for _, task in chosen]
+    if len(set(names)) < len(names):
+        raise invalid("tasks", "tasks of different names", ", ".join(names))
+    for task_name in names:
+        if by_task is not None and task_name not in by_task:
+            raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
+    return {
+        task.name: evaluate(
             policy if by_task is None else by_task[task.name],
             name=name,
             task=source,
             seeds=task.test_seeds[:worlds],
-            csv=Path(folder) / f"{task.name}.csv",
+            csv=RowFile(Path(folder) / f"{task.name}.csv", is_cache=True),
             **keywords,
         )
-    return rows
+        for source, task in chosen
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class _Setting:
+    """The worlds that a policy acts in, and what is around them."""
+
+    env: str
+    keywords: dict[str, Any]
+    n_robots: int
+    wrap: Callable[[Any], Any] | None
+    #: Identifies the worlds; None: not known before they are there.
+    fingerprint: str | None = None
+
+    @contextmanager
+    def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
+        """The worlds as they are, and as the policy sees them."""
+        worlds = _make(self.env, self.keywords, self.n_robots, n_worlds)
+        try:
+            yield worlds.unwrapped, worlds if self.wrap is None else _wrapped(worlds, self.wrap)
+        finally:
+            worlds.close()
 
 
 def _make(env: str, keywords: dict[str, Any], n_robots: int, n_worlds: int) -> Any:
@@ -242,69 +231,163 @@ def _make(env: str, keywords: dict[str, Any], n_robots: int, n_worlds: int) -> A
     return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
 
 
-def _publishes(instance: str | None) -> bool:
-    """Whether there are hidden states to be had: a private server publishes them."""
+def _wrapped(worlds: Any, wrap: Callable[[Any], Any]) -> Any:
+    try:
+        from emberwatch.benchmark.wrapped import Wrapped
+    except ModuleNotFoundError as error:
+        needed = "expected Stable-Baselines3: pip install stable-baselines3"
+        raise ModuleNotFoundError(f"wrap: {needed}; got: {error}") from None
+    return Wrapped(worlds, wrap)
+
+
+def _served(instance: str | None) -> ServerInfo | None:
+    """What a running server says of itself."""
     if instance is None:
-        return True
+        return None
     with Client(instance) as client:
-        return client.info.publish_truth
+        return client.info
 
 
-def _n_moves(env: str, keywords: dict[str, Any], n_robots: int) -> int:
-    """Moves of a path; starts no server."""
-    worlds = _make(env, keywords, n_robots, 1)
-    worlds.close()
-    return worlds.unwrapped.n_moves
+def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
+    """Refuses worlds that a policy cannot act in; starts no server.
+
+    Returns:
+        The statistics with which observations are normalized.
+    """
+    with setting.made(1) as (worlds, shown):
+        actor.check(worlds, shown.single_observation_space)
+        normalizers = actor.normalizers if setting.wrap is None else shown.normalizers
+        if actor.normalizers and not normalizers:
+            raise InvalidArgumentError(
+                "wrap: expected VecNormalize in it, as the policy was trained behind one, got none"
+            )
+        return [statistics(normalizer) for normalizer in normalizers]
+
+
+def _policy_fingerprint(
+    policy: object, acts_on: dict[str, Any], keywords: Mapping[str, Any]
+) -> str:
+    """Identifies all that the actions depend on besides the worlds."""
+    others = {
+        name: value
+        for name, value in keywords.items()
+        if name not in WorldArguments.__annotations__
+    }
+    others["observation"] = names_of(others.get("observation")), type(others.get("observation"))
+    # The belief's, where a running server hides its own.
+    model = keywords.get("model") if keywords.get("instance") is not None else None
+    known = None if model is None else Model.named(model).toml
+    return digest((VERSION, acts_on, others, known, policy))
+
+
+def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:
+    """Identifies the worlds, whatever their seed; none is simulated for it."""
+    if served is None:
+        world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
+        with embed_flags(Settings(**world).server_flags(1)) as client:
+            served = client.info
+    if served.worlds_fingerprint is None:
+        raise invalid("instance", "a server of this release, for csv", f"one of {served.build}")
+    return served.worlds_fingerprint
+
+
+def _kept(
+    file: RowFile,
+    setting: _Setting,
+    common: Mapping[str, Any],
+    chosen: Sequence[int],
+    report: Progress,
+) -> dict[int, Row]:
+    """The rows of a file that need not be made again, by seed."""
+    mark = Mark(
+        setting.fingerprint or "",
+        common["policy_fingerprint"],
+        common["steps"],
+        common["recent_steps"],
+    )
+    found = file.find(common["policy"], mark)
+    if found.elsewhere:
+        warnings.warn(
+            f"{file.path} has rows of {', '.join(found.elsewhere)} on other worlds, or of an older "
+            "release, which does not say on which: they stay there, and do not count",
+            stacklevel=4,
+        )
+    kept = {seed: row for seed, row in found.kept.items() if seed in chosen}
+    n_again = sum(row.world_seed in chosen for row in found.stale)
+    n_dropped = len(found.stale) - n_again
+    report.found(file.path, n_kept=len(kept), n_again=n_again, n_dropped=n_dropped)
+    return kept
+
+
+def _score(
+    setting: _Setting,
+    actor: Actor,
+    seeds: Sequence[int],
+    batch: int,
+    common: Mapping[str, Any],
+    report: Progress,
+    file: RowFile | None = None,
+) -> list[Row]:
+    """Scores a policy on the worlds of these seeds, and writes their rows to a file."""
+    report.begin(len(seeds) * common["steps"])
+    rows: list[Row] = []
+    for first in range(0, len(seeds), batch):
+        part = seeds[first : first + batch]
+        made = _play(setting, actor, part, common, report)
+        rows += made
+        if file is not None:
+            file.add(made)
+    report.end()
+    return rows
 
 
 def _play(
-    env: str,
-    keywords: dict[str, Any],
-    n_robots: int,
-    act: Policy,
+    setting: _Setting,
+    actor: Actor,
     seeds: Sequence[int],
-    steps: int,
-    recent_steps: int,
-    report: _Progress,
-) -> _Tally:
-    """Flies so many paths in some worlds."""
-    worlds = _make(env, keywords, n_robots, len(seeds))
-    try:
-        if worlds.unwrapped.world_spec.n_robots != n_robots:
+    common: Mapping[str, Any],
+    report: Progress,
+) -> list[Row]:
+    """Flies the paths of all steps in the worlds of these seeds, at the same time."""
+    steps, n_robots = common["steps"], setting.n_robots
+    with setting.made(len(seeds)) as (worlds, shown):
+        if worlds.world_spec.n_robots != n_robots:
             raise InvalidArgumentError(
-                f"robots: expected {worlds.unwrapped.world_spec.n_robots}, as the server's worlds "
-                f"have, got {n_robots}"
+                f"robots: expected {worlds.world_spec.n_robots}, as the server's worlds have, got "
+                f"{n_robots}"
             )
-        tally = _Tally(worlds.unwrapped.world_spec, len(seeds), recent_steps)
-        seen, _ = worlds.reset(seed=np.repeat(seeds, n_robots).tolist())
-        n_actions = tally.n_moves if env == _MOVES else 1
+        tally = Tally(worlds.world_spec, len(seeds), common["recent_steps"])
+        actor.begin(len(seeds), worlds.num_envs)
+        seen, _ = shown.reset(seed=np.repeat(seeds, n_robots).tolist())
+        fingerprint = worlds.lease.client.info.worlds_fingerprint
+        if setting.fingerprint not in (None, fingerprint):
+            raise InvalidArgumentError(
+                "worlds: they have changed since the evaluation began: did the file of their task, "
+                "model or states change, or another server take the instance?"
+            )
+        n_actions = tally.n_moves if setting.env == _MOVES else 1
         truncated = np.zeros(worlds.num_envs, np.bool_)
         for step in range(1, steps + 1):
             flown: list[NDArray[np.integer]] = []
             for _ in range(n_actions):
-                # A copy: a policy may use its array again.
-                flown.append(np.array(tally.timed(act, seen)))
-                seen, _, _, truncated, _ = worlds.step(flown[-1])
+                begin = time.perf_counter()
+                flown.append(actor.act(seen, worlds))
+                tally.seconds += time.perf_counter() - begin
+                seen, _, _, truncated, _ = shown.step(flown[-1])
             if truncated.any() and step < steps:
                 raise invalid("steps", f"at most {step}, as episodes of these worlds have", steps)
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
-            tally.add(worlds.unwrapped.results, paths, worlds.unwrapped.truths)
+            tally.add(worlds.results, paths, worlds.truths)
             report.add(len(seeds))
-    finally:
-        worlds.close()
-    return tally
+    return _rows(tally, seeds, {**common, "worlds_fingerprint": fingerprint or ""})
 
 
-def _rows(
-    tally: _Tally, seeds: Sequence[int], steps: int, kind: tuple[str, str, int, str]
-) -> list[Row]:
-    name, estimator, robots, team = kind
+def _rows(tally: Tally, seeds: Sequence[int], common: Mapping[str, Any]) -> list[Row]:
+    steps = common["steps"]
     return [
         Row(
-            policy=name,
-            estimator=estimator,
+            **common,
             world_seed=seed,
-            steps=steps,
             mean_reward=float(tally.reward[index]) / steps,
             mean_distinct_cells=int(tally.n_visited[index]) / steps,
             hit_rate=int(tally.n_hits[index]) / max(int(tally.n_visited[index]), 1),
@@ -312,10 +395,7 @@ def _rows(
             mean_plan_millis=1e3 * tally.seconds / steps / len(seeds),
             brier="",
             moves=tally.n_moves,
-            robots=robots,
-            team=team,
             mean_repeated=1.0 - int(tally.n_visited[index]) / int(tally.n_visits[index]),
-            recent_steps=tally.recent_steps,
             **asdict(tally.merit.merit(index)),
         )
         for index, seed in enumerate(seeds)
@@ -349,51 +429,3 @@ def _check(
     if not chosen or len(set(chosen)) < len(chosen):
         raise invalid("seeds", "some, each once", chosen)
     return chosen
-
-
-def _acting(policy: Any, deterministic: bool) -> Policy:
-    predict = getattr(policy, "predict", None)
-    if predict is not None:
-        return lambda observations: predict(observations, deterministic=deterministic)[0]
-    if not callable(policy):
-        raise invalid(
-            "policy", "a function of observations, or a model of Stable-Baselines3", repr(policy)
-        )
-    return cast("Policy", policy)
-
-
-class _Progress:
-    """Says how far an evaluation is, a line a second on a terminal, else a line at its end."""
-
-    def __init__(self, out: TextIO | None, name: str, seeds: Sequence[int], n_steps: int) -> None:
-        n_test = sum(seed < FIRST_TRAINING_SEED for seed in seeds)
-        sort = {0: "", len(seeds): " test"}.get(n_test, f" ({n_test} of them test)")
-        self._out, self._title = out, f"{name}: {len(seeds)}{sort} worlds"
-        self._n_steps, self._n_done = n_steps, 0
-        self._begin = self._last = time.monotonic()
-
-    def add(self, n_steps: int) -> None:
-        self._n_done += n_steps
-        now = time.monotonic()
-        if self._out is not None and self._out.isatty() and now - self._last > 1.0:
-            self._last = now
-            left = (now - self._begin) * (self._n_steps / self._n_done - 1.0)
-            share = 100 * self._n_done // self._n_steps
-            print(f"\r{self._title}, {share} %, {left:.0f} s left ", end="", file=self._out)
-
-    def end(self) -> None:
-        if self._out is not None:
-            start = "\r" if self._out.isatty() else ""
-            seconds = time.monotonic() - self._begin
-            print(f"{start}{self._title}, {seconds:.0f} s{' ' * 20}".rstrip(), file=self._out)
-
-
-def summary(rows: Sequence[Row]) -> str:
-    """The mean reward of a step, and its standard error over worlds."""
-    rewards = np.array([row.mean_reward for row in rows])
-    n_test = sum(row.world_seed < FIRST_TRAINING_SEED for row in rows)
-    error = rewards.std(ddof=1) / math.sqrt(len(rows)) if len(rows) > 1 else math.nan
-    sort = "test " if n_test == len(rows) else "" if n_test == 0 else f"({n_test} test) "
-    return (
-        f"{rows[0].policy}: {rewards.mean():.2f} +- {error:.2f} a step on {len(rows)} {sort}worlds"
-    )

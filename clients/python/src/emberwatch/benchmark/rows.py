@@ -1,16 +1,15 @@
-"""Rows of the benchmark, and the CSV files that hold them."""
+"""Rows of the benchmark, and their form in CSV files."""
 
 from __future__ import annotations
 
 import csv
-import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,80 +54,46 @@ class Row:
     grid_seen_share: float | None = None
     #: Mean of ln P of a visited cell's observation; None: only the agent program scores beliefs.
     log_likelihood: float | None = None
+    #: Identifies the worlds, whatever their seed: equal for two rows if and only if model, grid,
+    #: moves, robots, sensor, start and burn-in are. Empty in rows of old files.
+    worlds_fingerprint: str = ""
+    #: Identifies the policy and all settings that its actions depend on. Empty in old files.
+    policy_fingerprint: str = ""
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: The same of older files: without likelihoods, figures of merit, or teams.
-_HEADERS: Final = [
-    _HEADER[: _HEADER.index(end)] for end in ("log_likelihood", "steps_to_detection", "robots")
-]
-
-
-class RowFile:
-    """Rows in a CSV file, which is replaced whole whenever some are added."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        if path.is_dir():
-            raise invalid("csv", "a file", f"the folder {path}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._rows = read(path) if path.exists() else []
-
-    def done(
-        self, kind: tuple[str, str, int, str], steps: int, n_moves: int, recent_steps: int
-    ) -> dict[int, Row]:
-        """What a policy has done already, by seed."""
-        own = [
-            row for row in self._rows if (row.policy, row.estimator, row.robots, row.team) == kind
-        ]
-        for row in own:
-            if (row.steps, row.moves) != (steps, n_moves):
-                raise InvalidArgumentError(
-                    f"csv: {self._path} has {row.steps} steps of {row.moves} moves of "
-                    f"{row.policy!r} on world {row.world_seed}, expected {steps} of "
-                    f"{n_moves}: choose another file or name"
-                )
-            if row.recent_steps not in (None, recent_steps):
-                raise InvalidArgumentError(
-                    f"csv: {self._path} has recent_steps {row.recent_steps} of {row.policy!r}, "
-                    f"expected {recent_steps}: choose another file or name"
-                )
-        return {row.world_seed: row for row in own}
-
-    def add(self, rows: Sequence[Row]) -> None:
-        for row, other in itertools.product(rows, self._rows):
-            same = (row.world_seed, row.steps) == (other.world_seed, other.steps)
-            if same and row.mean_fire_cells != other.mean_fire_cells:
-                raise InvalidArgumentError(
-                    f"csv: {self._path} has {other.mean_fire_cells} burning cells of world "
-                    f"{row.world_seed} ({other.policy!r}), got {row.mean_fire_cells} (another "
-                    "model, grid or burn-in): choose another file"
-                )
-        self._rows += rows
-        self._rows.sort(
-            key=lambda row: (row.policy, row.world_seed, row.estimator, row.robots, row.team)
-        )
-        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(_HEADER)
-            writer.writerows(astuple(row) for row in self._rows)
-        temporary.replace(self._path)
+#: First columns that older files lack: fingerprints, likelihoods, figures of merit, or teams.
+_LATER: Final = ("worlds_fingerprint", "log_likelihood", "steps_to_detection", "robots")
+_HEADERS: Final = [_HEADER, *(_HEADER[: _HEADER.index(column)] for column in _LATER)]
 
 
 def read(path: str | os.PathLike[str]) -> list[Row]:
-    """The rows of a CSV file of `evaluate` or `emberwatch-agent compare`."""
+    """Returns the rows of a CSV file of `evaluate` or `emberwatch-agent compare`.
+
+    An empty file has none. A byte order mark, as spreadsheets write it, is skipped.
+    """
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
             lines = csv.DictReader(file)
-            if lines.fieldnames not in (_HEADER, *_HEADERS):
-                raise ValueError(lines.fieldnames)
+            if lines.fieldnames is None:
+                return []
+            if lines.fieldnames not in _HEADERS:
+                raise ValueError(",".join(lines.fieldnames))
             return [_row(line) for line in lines]
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, csv.Error) as error:
         raise invalid("csv", f"{path} to have the columns {','.join(_HEADER)}", error) from None
 
 
-def _row(line: dict[str, Any]) -> Row:
+def write(file: TextIO, rows: Iterable[Row]) -> None:
+    """Writes a header and rows."""
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(_HEADER)
+    writer.writerows(astuple(row) for row in rows)
+
+
+def _row(line: dict[Any, Any]) -> Row:
+    if None in line or None in line.values():  # under None are values without a column
+        raise ValueError(f"a row with too many or too few values: {list(line.values())}")
     kinds: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
 
     def value(kind: str, text: str) -> Any:
