@@ -182,14 +182,15 @@ def _plain(part: Any) -> object:
 
 def _of_object(value: Any) -> object:
     """What makes one object different from another of its type."""
+    kind = cast("type[Any]", type(value))
     for method in _WEIGHTS:
-        if callable(getattr(type(value), method, None)):
+        if callable(getattr(kind, method, None)):
             return _weights(method, getattr(value, method)()), _settings(value)
     # Not what a method of its own returns: it may do anything.
     default: Callable[[Any], object] = object.__getstate__
-    is_plain = type(value).__getstate__ is default
+    is_plain = kind.__getstate__ is default
     state: object = default(value) if is_plain else getattr(value, "__dict__", None)
-    if not _is_installed(type(value).__module__):
+    if not _is_installed(kind.__module__):
         return state
     # Objects of libraries refer to much that is none of the policy's, such as loggers to others.
     return {name: part for name, part in _attributes(state) if _is_data(part)}

@@ -126,13 +126,8 @@ def evaluate(
         estimator = "known_model" if OF_BELIEF & parts else "none"
     robots = task.robots if task else keywords.get("robots") or 1
     setting = _Setting(env, keywords, robots, wrap)
-    acts_on: dict[str, Any] = {
-        "env": env,
-        "estimator": estimator,
-        "deterministic": deterministic,
-        "wrap": wrap,
-    }
-    acts_on["normalizers"] = _check_policy(setting, actor)
+    normalizers = _check_policy(setting, actor)
+    fingerprint = _policy_fingerprint(setting, policy, estimator, deterministic, normalizers)
     common: dict[str, Any] = {
         "policy": name,
         "estimator": estimator,
@@ -140,7 +135,7 @@ def evaluate(
         "team": "shared" if robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
         "recent_steps": recent_steps,
-        "policy_fingerprint": _policy_fingerprint(policy, acts_on, keywords),
+        "policy_fingerprint": fingerprint,
     }
     report = Progress(progress, name, chosen)
     if csv is None:
@@ -194,7 +189,7 @@ def suite(
             raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
     return {
         task.name: evaluate(
-            policy if by_task is None else by_task[task.name],
+            cast("Any", policy) if by_task is None else by_task[task.name],
             name=name,
             task=source,
             seeds=task.test_seeds[:worlds],
@@ -264,20 +259,14 @@ def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
         return [statistics(normalizer) for normalizer in normalizers]
 
 
-def _policy_fingerprint(
-    policy: object, acts_on: dict[str, Any], keywords: Mapping[str, Any]
-) -> str:
+def _policy_fingerprint(setting: _Setting, *acts_on: object) -> str:
     """Identifies all that the actions depend on besides the worlds."""
-    others = {
-        name: value
-        for name, value in keywords.items()
-        if name not in WorldArguments.__annotations__
-    }
-    others["observation"] = names_of(others.get("observation")), type(others.get("observation"))
-    # The belief's, where a running server hides its own.
+    keywords = setting.keywords
+    others = {it: keywords[it] for it in keywords if it not in WorldArguments.__annotations__}
+    # The model of the belief, where a running server hides its own.
     model = keywords.get("model") if keywords.get("instance") is not None else None
     known = None if model is None else Model.named(model).toml
-    return digest((VERSION, acts_on, others, known, policy))
+    return digest((VERSION, setting.env, others, known, setting.wrap, acts_on))
 
 
 def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:

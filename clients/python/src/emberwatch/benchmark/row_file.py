@@ -254,5 +254,8 @@ class RowFile:
         try:
             yield
         except OSError as error:
-            got = f"the folder {self.path}" if self.path.is_dir() else f"{self.path}: {error}"
-            raise invalid("csv", "a file that can be written", got) from None
+            got = f"the folder {self.path}" if self.path.is_dir() else f"{self.path}"
+            if error.filename not in (None, str(self.path), str(self._temporary)):
+                got += f", in {error.filename}"
+            expected = "a file that can be written"
+            raise invalid("csv", expected, f"{got}: {error.strerror or error}") from None
