@@ -111,7 +111,7 @@ def evaluate(
     task = None if keywords.get("task") is None else Task.named(keywords["task"])
     seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
     steps = (task.max_steps if task else _STEPS) if steps is None else steps
-    chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
+    chosen = _check(name, estimator, seeds, steps, batch, recent_steps, env, keywords)
     actor = Actor(policy, deterministic=deterministic, is_wrapped=wrap is not None)
     if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
         burn_in = _BURN_IN
@@ -125,6 +125,8 @@ def evaluate(
     if estimator is None:
         estimator = "known_model" if OF_BELIEF & parts else "none"
     robots = task.robots if task else keywords.get("robots") or 1
+    if served is not None and served.n_robots != robots:
+        raise invalid("robots", f"{served.n_robots}, as the server's worlds have", robots)
     setting = _Setting(env, keywords, robots, wrap)
     normalizers = _check_policy(setting, actor)
     fingerprint = _policy_fingerprint(setting, policy, estimator, deterministic, normalizers)
@@ -187,8 +189,9 @@ def suite(
     for task_name in names:
         if by_task is not None and task_name not in by_task:
             raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
-    return {
-        task.name: evaluate(
+    rows: dict[str, list[Row]] = {}
+    for source, task in chosen:
+        rows[task.name] = evaluate(
             cast("Any", policy) if by_task is None else by_task[task.name],
             name=name,
             task=source,
@@ -196,8 +199,7 @@ def suite(
             csv=RowFile(Path(folder) / f"{task.name}.csv", is_cache=True),
             **keywords,
         )
-        for source, task in chosen
-    }
+    return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,11 +342,6 @@ def _play(
     """Flies the paths of all steps in the worlds of these seeds, at the same time."""
     steps, n_robots = common["steps"], setting.n_robots
     with setting.made(len(seeds)) as (worlds, shown):
-        if worlds.world_spec.n_robots != n_robots:
-            raise InvalidArgumentError(
-                f"robots: expected {worlds.world_spec.n_robots}, as the server's worlds have, got "
-                f"{n_robots}"
-            )
         tally = Tally(worlds.world_spec, len(seeds), common["recent_steps"])
         actor.begin(len(seeds), worlds.num_envs)
         seen, _ = shown.reset(seed=np.repeat(seeds, n_robots).tolist())
@@ -393,6 +390,7 @@ def _rows(tally: Tally, seeds: Sequence[int], common: Mapping[str, Any]) -> list
 
 def _check(
     name: str,
+    estimator: str | None,
     seeds: Iterable[int],
     steps: int,
     batch: int,
@@ -403,6 +401,8 @@ def _check(
     """The seeds as a list; refuses what no worlds can be made of."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("name", "a name for the table", repr(name))
+    if estimator is not None and (not isinstance(estimator, str) or not estimator.isprintable()):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise invalid("estimator", "a word for the table, or None", repr(estimator))
     if env not in (_MOVES, _PATHS):
         raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr(env))
     numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}

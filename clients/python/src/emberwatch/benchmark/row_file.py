@@ -46,7 +46,7 @@ class Found:
     kept: dict[int, Row]
     #: Rows of the policy's name that are of another policy, other settings or worlds.
     stale: tuple[Row, ...]
-    #: Other policies with rows of other worlds.
+    #: In a cache: other policies with rows of other worlds, or of unknown ones.
     elsewhere: tuple[str, ...]
 
 
@@ -116,7 +116,7 @@ class RowFile:
         kept = {row.world_seed: row for row in own if Mark.of(row) == mark}
         stale = tuple(row for row in own if Mark.of(row) != mark)
         self._stale = {Mark.of(row) for row in stale}
-        others = [row for row in self._rows if row.policy != policy]
+        others = [row for row in self._rows if row.policy != policy and self._is_cache]
         elsewhere = {row.policy for row in others if not self._is_of_worlds(row)}
         return Found(kept, stale, tuple(sorted(elsewhere)))
 
