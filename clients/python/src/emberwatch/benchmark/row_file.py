@@ -81,11 +81,15 @@ class RowFile:
         with self._problems():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._is_new = not self.path.exists()
-            with self._locked():
-                self._rows = read(self.path)
-                # What the folder refuses is found now, not after the work.
-                self._temporary.touch()
-                self._temporary.unlink()
+            try:
+                with self._locked():
+                    self._rows = read(self.path)
+                    # What the folder refuses is found now, not after the work.
+                    self._temporary.touch()
+                    self._temporary.unlink()
+            except OSError:
+                self._remove_empty()
+                raise
         return self
 
     def __exit__(
@@ -95,11 +99,8 @@ class RowFile:
         traceback: TracebackType | None,
     ) -> None:
         """Removes the file if it was made here and has no rows."""
-        if not self._is_new:
-            return
-        with self._problems(), self._locked() as descriptor:
-            if os.fstat(descriptor).st_size == 0:
-                self.path.unlink()
+        with self._problems():
+            self._remove_empty()
 
     def find(self, policy: str, mark: Mark) -> Found:
         """Looks for rows of a policy, which `add` will add to.
@@ -147,6 +148,12 @@ class RowFile:
     def _temporary(self) -> Path:
         """A name that only the holder of the lock uses."""
         return self.path.with_name(f".{self.path.name}.tmp")
+
+    def _remove_empty(self) -> None:
+        if self._is_new and self.path.exists():
+            with self._locked() as descriptor:
+                if os.fstat(descriptor).st_size == 0:
+                    self.path.unlink()
 
     def _replace(self, rows: Sequence[Row], mode: int) -> None:
         try:
