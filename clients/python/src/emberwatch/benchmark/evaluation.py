@@ -252,12 +252,12 @@ def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
         The statistics with which observations are normalized.
     """
     with setting.made(1) as (worlds, shown):
-        actor.check(worlds, shown.single_observation_space)
         normalizers = actor.normalizers if setting.wrap is None else shown.normalizers
         if actor.normalizers and not normalizers:
             raise InvalidArgumentError(
                 "wrap: expected VecNormalize in it, as the policy was trained behind one, got none"
             )
+        actor.check(worlds, shown.single_observation_space)
         return [statistics(normalizer) for normalizer in normalizers]
 
 
