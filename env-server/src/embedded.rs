@@ -62,22 +62,23 @@ impl Embedded {
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
         let n_threads = n_threads(config).min(config.worlds as usize);
-        check_memory(&checked, n_threads)?;
         let publishes_truth = config.publish_truth;
         let mut n_leases = 0;
         let next_token = move || {
             n_leases += 1;
             n_leases
         };
-        let steps = threads(n_threads)?;
+        let (steps, reset_threads) = (threads(n_threads)?, threads(n_threads)?);
+        let file_thread = threads(1)?;
+        check_memory(&checked, n_threads)?;
         let (simulator, jobs) = Simulator::new(checked, steps, Box::new(next_token))?;
         let now = Instant::now();
         let embedded = Self {
             rules: Arc::new(simulator.spec().rules.clone()),
             simulator,
             resets: channel(),
-            reset_threads: threads(n_threads)?,
-            file_thread: threads(1)?,
+            reset_threads,
+            file_thread,
             n_files: Arc::default(),
             publishes_truth,
             client: ClientId {

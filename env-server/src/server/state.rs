@@ -19,7 +19,7 @@ use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::wait::Waiter;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
-use rayon::ThreadPoolBuilder;
+use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher;
@@ -68,14 +68,15 @@ impl Server {
     pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self> {
         let exit_with = exit_with.map(WatchedProcess::watch).transpose()?;
         let n_threads = n_threads(&checked.config);
+        let steps = start(ThreadPoolBuilder::new(), n_threads)?;
+        let reset_threads = start(ThreadPoolBuilder::new(), n_threads)?;
         check_memory(&checked, n_threads)?;
         let ports = Ports::open(&checked)?;
         announce(&checked);
         let autosave = Autosave::new(&checked)?;
-        let (simulator, resets_due) = simulator(checked, n_threads)?;
+        let (simulator, resets_due) = simulator(checked, steps)?;
         let spec = simulator.spec().clone();
-        let pool = start(ThreadPoolBuilder::new(), n_threads)?;
-        let resets = Resets::new(pool, spec.rules.clone())?;
+        let resets = Resets::new(reset_threads, spec.rules.clone())?;
         let files = Files::start(spec)?;
         resets.start(resets_due);
         let now = Instant::now();
@@ -214,10 +215,9 @@ pub fn announce_reach(reach: &Reach) {
 }
 
 /// The worlds, restored if there is a snapshot of them, and the resets that start the others.
-fn simulator(checked: Checked, n_threads: usize) -> Result<(Simulator, Vec<ResetJob>)> {
+fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
-    let pool = start(ThreadPoolBuilder::new(), n_threads)?;
-    let (mut simulator, mut resets) = Simulator::new(checked, pool, token_source())?;
+    let (mut simulator, mut resets) = Simulator::new(checked, steps, token_source())?;
     if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
         tracing::info!(file = %path.display(), "restored");
         let worlds = worlds.into_iter().enumerate();
