@@ -2,10 +2,12 @@
 //! states of n worlds.
 
 use crate::detached::detached;
+use crate::errors::no_threads;
 use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
@@ -13,6 +15,7 @@ use numpy::{
     IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
 };
 use pyo3::prelude::*;
+use rayon::ThreadPoolBuilder;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -189,11 +192,13 @@ pub fn simulated_prior<'py>(
 /// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
-    let pool = rayon::ThreadPoolBuilder::new().build();
-    let pool = pool.map_err(|error| failed(py, &format!("start threads: {error}"), "program"))?;
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {
         let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
-        let worker = scope.spawn(work);
+        let worker = std::thread::Builder::new().spawn_scoped(scope, work);
+        let worker = worker.map_err(|error| no_threads(py, &NoThreads::new(1, &error)))?;
         while !worker.is_finished() {
             py.detach(|| std::thread::sleep(LOOK));
             if let Err(interrupt) = py.check_signals() {

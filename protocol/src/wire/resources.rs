@@ -2,6 +2,7 @@
 //! all the same, the error names what is missing.
 
 use super::error::ChannelError;
+use crate::limits::memory::in_words;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::statvfs;
 use rustix::io::Errno;
@@ -81,14 +82,6 @@ pub(super) fn no_room<T>(problem: String) -> Result<T, ChannelError> {
     Err(ChannelError::NoRoom { problem })
 }
 
-/// A number of bytes, rounded to the next KiB or MiB.
-pub(super) fn in_words(n_bytes: u64) -> String {
-    match n_bytes >> 20 {
-        0..10 => format!("{} KiB", n_bytes.div_ceil(1 << 10)),
-        _ => format!("{} MiB", n_bytes.div_ceil(1 << 20)),
-    }
-}
-
 /// Adds context to an error of iceoryx2, whose cause is asked of the system where iceoryx2 does not tell it.
 pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
     limited_error(what, "64 processes")
@@ -114,6 +107,17 @@ pub fn limited_error<E: Debug>(
 /// Checks that descriptors are left for the ports of a connection.
 fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
     free_descriptors().map_err(|_| no_descriptors(what))
+}
+
+/// The error of a system call that does not depend on a file.
+pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
+    match errno {
+        Errno::MFILE | Errno::NFILE => no_descriptors(call),
+        errno => ChannelError::RefusedCall {
+            call,
+            problem: errno.to_string(),
+        },
+    }
 }
 
 /// The error of a process that may open no more files.

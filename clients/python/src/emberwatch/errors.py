@@ -14,7 +14,8 @@ class EmberwatchError(Exception):
             `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
             earlier step or reset did not finish: reset or resume), `"forked"` (neither shared
             memory nor embedded worlds survive `fork`), `"embedded"` (worlds in this process could
-            not be made), `"channel"` (iceoryx2 failed), `"bad_answer"` (client and server
+            not be made), `"threads"` (the system starts no more), `"channel"` (iceoryx2, or a
+            system call that it needs, failed), `"bad_answer"` (client and server
             are not of one release), `"program"` (could not be started, or failed),
             `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
@@ -56,6 +57,12 @@ class NoServerError(EmberwatchError):
     """Nobody serves the instance."""
 
     code = "no_server"
+
+
+class NotEnoughMemoryError(EmberwatchError, MemoryError):
+    """More memory was asked for than the machine, a cgroup or a `ulimit` has."""
+
+    code = "no_memory"
 
 
 class RequestTimeoutError(EmberwatchError, TimeoutError):
@@ -115,10 +122,14 @@ STATUSES: Final = (
         "no such robot: the server has robots 0 to {last}; start it with --worlds N for more "
         "worlds, or --robots N for more in each",
     ),
-    ("no_memory", "shared memory is full: free some, and ask again"),
+    ("no_memory", "memory: expected {} bytes for the answer, got less; ask for fewer robots"),
 )
 
-_CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}
+_CLASSES: Final = {
+    "agent_ends": ServerGoneError,
+    "lease_lost": LeaseLostError,
+    "no_memory": NotEnoughMemoryError,
+}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
@@ -129,6 +140,8 @@ def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchE
     code, sentence = STATUSES[status - 1]
     if code == "lease_lost" and detail == 0:
         sentence = "lease lost: it expired or was released; acquire the robots again"
+    if code == "no_memory" and detail == 0:
+        sentence = "shared memory is full: free some, and ask again"
     if message is None or code == "busy":  # the server's words name a flag, not a keyword
         message = sentence.format(detail, last=max(detail - 1, 0))
     return _CLASSES.get(code, EmberwatchError)(message, code, detail)
