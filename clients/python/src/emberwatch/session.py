@@ -6,12 +6,15 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 
 import inspect
 import logging
+import os
+import threading
 import warnings
+import weakref
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +57,17 @@ _OVER: Final = (
     "the episode of the world is over: a reset is for a client that holds all its robots",
 )
 
+#: A forked child waits for no thread of its parent's, which it does not have.
+_sessions: Final = weakref.WeakSet["Session"]()
+
+
+def _free_turns() -> None:
+    for session in _sessions:
+        session.turn = threading.RLock()
+
+
+os.register_at_fork(after_in_child=_free_turns)
+
 
 class Session:
     """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
@@ -61,6 +75,7 @@ class Session:
     It flies all robots of its worlds, or one robot of a world that others fly in. An environment
     calls `begin_step` or `begin_reset` first and `finish` last: anything between the two may be
     interrupted, by Ctrl-C or by a signal's handler, after which the worlds may have moved unseen.
+    All of it is within `with turn`, for programs whose threads share an environment.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -72,6 +87,9 @@ class Session:
         self._program: Program | None = None
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
+        #: Lets one thread at a time step or reset. A signal leaves it free again.
+        self.turn: AbstractContextManager[object] = threading.RLock()
+        _sessions.add(self)
         #: Why there is no next step, such as one that did not finish: worlds may have moved unseen.
         self._unfinished: tuple[str, str] | None = _CLOSED
         #: Whether the worlds may have moved since it began: a refusal alone changes nothing.
@@ -114,6 +132,14 @@ class Session:
     def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._lease is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which wait for no thread of this one."""
+        return {name: value for name, value in vars(self).items() if name != "turn"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, turn=threading.RLock())
+        _sessions.add(self)
 
     def begin_step(self) -> None:
         """Refuses a step before a reset, and after what did not finish."""
