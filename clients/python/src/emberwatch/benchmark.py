@@ -32,13 +32,10 @@ from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
-from emberwatch.tasks import Task, built_in_tasks
+from emberwatch.tasks import FIRST_TRAINING_SEED, Task, built_in_tasks
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
-
-#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
-FIRST_TRAINING_SEED: Final = 1000
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
@@ -270,6 +267,7 @@ def _play(
 ) -> _Tally:
     """Flies so many paths in some worlds."""
     worlds = _make(env, keywords, n_robots, len(seeds))
+    worlds.unwrapped.allow_test_worlds()
     try:
         if worlds.unwrapped.world_spec.n_robots != n_robots:
             raise InvalidArgumentError(

@@ -27,12 +27,14 @@ from emberwatch.errors import (
     LeaseLostError,
     RequestTimeoutError,
     ServerGoneError,
+    TrainingOnTestWorldsWarning,
     invalid,
 )
 from emberwatch.lease import Lease
 from emberwatch.observer import Newest, Present, Truth, TruthReader
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
+from emberwatch.tasks import FIRST_TRAINING_SEED
 from emberwatch.wire import StepAnswer, WorldResult
 
 _log: Final = logging.getLogger("emberwatch")
@@ -87,6 +89,8 @@ class Session:
         self._program: Program | None = None
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
+        #: Whether test worlds are meant, as in an evaluation.
+        self.allows_test_worlds = False
         #: Lets one thread at a time step or reset. A signal leaves it free again.
         self.turn: AbstractContextManager[object] = threading.RLock()
         _sessions.add(self)
@@ -340,6 +344,7 @@ class Session:
         return connect(instance, timeout=self.settings.timeout, wait=self.settings.timeout)
 
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        self._warn_of_test_worlds(seeds)
         self._open((seeds[0] - indices[0]) & (2**64 - 1))
         with self._told():
             self._settle()
@@ -363,6 +368,25 @@ class Session:
             f"no cell of world {barren[0]} (of {len(barren)} of {len(worlds)} worlds) is in the "
             "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
             "model='wildfire-small'"
+        )
+
+    def _warn_of_test_worlds(self, seeds: Sequence[int]) -> None:
+        task = self.spec.task
+        if (
+            task is None
+            or self.allows_test_worlds
+            or not any(it in task.test_seeds for it in seeds)
+        ):
+            return
+        tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
+        # Of this line, wherever the reset is: Python shows it once in a process.
+        warnings.warn(
+            f"task {task.name!r}: an episode begins on a test world, as seeds {tests.start} to "
+            f"{tests.stop - 1} do; train on seeds from {others} on, with reset(seed={others}) or a "
+            f"trainer's seed={others}; to test, use emberwatch.benchmark.evaluate, or ignore "
+            "emberwatch.TrainingOnTestWorldsWarning with warnings.filterwarnings",
+            TrainingOnTestWorldsWarning,
+            stacklevel=1,
         )
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
