@@ -77,6 +77,10 @@ class ServerGoneError(EmberwatchError, ConnectionError):
     code = "server_gone"
 
 
+class TrainingOnTestWorldsWarning(UserWarning):
+    """A reset has begun an episode on a test seed of the task, outside of an evaluation."""
+
+
 #: Name and sentence of each status code, from code 1; `step` sends the code alone.
 STATUSES: Final = (
     (
