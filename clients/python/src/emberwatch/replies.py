@@ -57,6 +57,9 @@ class ServerInfo:
     deadline_millis: int
     #: The task that its worlds are, by its name.
     task: str | None = None
+    #: Identifies the worlds: a hash of every setting that a reward depends on, besides seed and
+    #: policy. None from servers before release 0.3.
+    worlds_fingerprint: str | None = None
     #: None of simulated worlds.
     recorded_world: RecordedWorld | None = None
     #: That of the number `pid`.
@@ -212,7 +215,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     for name, types in _types(kind).items():
         if name in ("airspace", "zones"):
             continue
-        if name in ("pid_namespace", "task") and name not in given:
+        if name in ("pid_namespace", "task", "worlds_fingerprint") and name not in given:
             continue
         if name == "recorded_world":  # it may be missing, too
             nested = given.get(name)
