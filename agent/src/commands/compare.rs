@@ -10,8 +10,8 @@ use emberwatch_agent::benchmark::compare::{Comparison, Results, compare};
 use emberwatch_agent::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::benchmark::report::{
-    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
-    render_table, write_events,
+    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
+    figures::FIRE_CELLS_PER_STEP, render_table, write_events,
 };
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnDashboard;

@@ -97,7 +97,7 @@ pub fn make_folder(path: &Path) -> Result<()> {
 /// Locks the file of `--csv` until it is written, and makes its folder: better to fail before hours of work than after.
 pub fn lock_csv(path: Option<&Path>) -> Result<Option<RunsFile>> {
     let lock = |path: &Path| {
-        make_folder_of(path)?;
+        make_folder_of(path).with_context(|| path.display().to_string())?;
         RunsFile::lock(path, Duration::ZERO)
     };
     path.map(lock).transpose().context("--csv")

@@ -185,8 +185,7 @@ impl SuiteCommand {
         }
         if !missing.is_empty() {
             let n_worlds = comparison.seeds.end - comparison.seeds.start;
-            let (mut arena, _server) =
-                self.open(&plan.task, &comparison.seeds, n_worlds as u32)?;
+            let (mut arena, _server) = self.open(&plan.task, &comparison.seeds, n_worlds as u32)?;
             for policy in missing {
                 let comparison = Comparison {
                     policies: vec![policy],

@@ -58,7 +58,10 @@ pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds
             !policies.contains(&policy),
             "policy {policy:?}: expected a name that no policy compared has"
         );
-        let is_old = group.runs.iter().all(|run| run.worlds_fingerprint.is_empty());
+        let is_old = group
+            .runs
+            .iter()
+            .all(|run| run.worlds_fingerprint.is_empty());
         if is_old {
             tracing::warn!(
                 "policy {policy:?} has no worlds_fingerprint: sensor and start of its worlds cannot be checked"

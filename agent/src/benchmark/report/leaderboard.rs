@@ -258,7 +258,10 @@ fn is_plain(text: &str) -> bool {
     let address = ["https://", "http://"];
     let rest = address.iter().find_map(|scheme| text.strip_prefix(scheme));
     (1..=200).contains(&text.len())
-        && rest.unwrap_or(text).chars().all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
+        && rest
+            .unwrap_or(text)
+            .chars()
+            .all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
 }
 
 /// The page: a row an entry, the best first, then each task's scores.

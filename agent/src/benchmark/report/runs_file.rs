@@ -25,16 +25,17 @@ impl RunsFile {
     /// # Errors
     /// If the file cannot be replaced, now or because another process holds it.
     pub fn lock(path: &Path, patience: Duration) -> Result<Self> {
-        ensure!(
-            !path.exists() || path.is_file(),
-            "{}: expected a regular file, got a folder or device",
-            path.display()
-        );
-        let locked = lock(path, Instant::now() + patience);
-        let file = locked.with_context(|| format!("write {}", path.display()))?;
-        // The file behind a symbolic link is replaced, not the link.
-        let path = path.canonicalize()?;
-        let locked = Self { path, file };
+        let locked = || {
+            ensure!(
+                !path.exists() || path.is_file(),
+                "expected a regular file, got a folder or device"
+            );
+            let file = lock(path, Instant::now() + patience)?;
+            // The file behind a symbolic link is replaced, not the link.
+            let path = path.canonicalize()?;
+            anyhow::Ok(Self { path, file })
+        };
+        let locked = locked().with_context(|| format!("write {}", path.display()))?;
         check_replaceable(&locked.path)?;
         Ok(locked)
     }
