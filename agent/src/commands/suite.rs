@@ -43,8 +43,8 @@ pub struct SuiteCommand {
     /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// A folder for results, a CSV file a task; what it has already is not run again, unless its checkpoint
-    /// or the settings have changed
+    /// A folder for results, a CSV file a task; rows that it has are kept, unless the checkpoint, the settings or
+    /// the task's worlds have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Worlds of each task, the first of its test seeds [default: all]
