@@ -143,7 +143,7 @@ impl Contents {
     }
 
     /// Against damage, not malice.
-    fn digest(&self) -> String {
+    pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
             digest.update(format!("{name} {shape:?} ").as_bytes());
