@@ -121,7 +121,7 @@ class Actor:
         parts = cast("tuple[Any, ...]", outcome) if isinstance(outcome, tuple) else ()
         if len(parts) != 2 or _shape(parts[0]) != shape:
             self._state = None
-            return outcome
+            return cast("Any", outcome)
         actions, self._state = parts
         if self._state is not None and _STATE not in self._takes:
             raise InvalidArgumentError(
@@ -151,9 +151,8 @@ def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], 
         takes |= {_STATE, _STARTS, _DETERMINISTIC}
     if is_model and _OLD <= known.keys():
         takes.add(_OLD_STARTS)
-    return takes, {
-        name for name in takes & known.keys() if known[name].default is inspect.Parameter.empty
-    }
+    needed = {name for name, each in known.items() if each.default is each.empty}
+    return takes, takes & needed
 
 
 def _shape(actions: Any) -> tuple[int, ...] | None:
