@@ -1,6 +1,6 @@
 """What `evaluate` gives to a policy, and takes from it."""
 
-import contextlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,15 @@ def test_the_method_of_a_model_acts_as_the_model() -> None:
     model = Recurrent()
     go(model.predict, deterministic=False)
     assert model.counts[-1] == [3 * N_MOVES - 1] * 3 and model.deterministic == {False}
+
+
+def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
+    def act(state: Any, mask: Any = None) -> Any:
+        assert state.shape == (3, 7, 9, 1) and mask is None
+        return np.zeros(len(state), int)
+
+    go(act)
+    go(type("Named", (), {"predict": lambda self, state, mask=None: act(state, mask)})())
 
 
 def test_functions_may_have_a_memory() -> None:
@@ -304,8 +313,8 @@ def test_a_policy_hears_of_other_worlds() -> None:
 def test_wrapping_without_the_trainer_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
-    with contextlib.suppress(KeyError):
-        monkeypatch.delitem(__import__("sys").modules, "emberwatch.benchmark.wrapped")
+    for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "emberwatch.benchmark.wrapped", raising=False)
     with pytest.raises(ModuleNotFoundError, match="wrap: expected Stable-Baselines3: pip install"):
         go(Recurrent(), wrap=lambda worlds: worlds)

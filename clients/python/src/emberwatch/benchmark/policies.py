@@ -21,11 +21,16 @@ from emberwatch.errors import InvalidArgumentError, invalid
 #: Returns the actions of some worlds for their stacked observations, or is a model of SB3.
 Policy: TypeAlias = Callable[..., Any]
 
-#: Parameters that a policy is given if it has them; SB3 before 1.4 called the second one `mask`.
+#: Parameters that a policy is given if it has them.
 _STATE: Final = "state"
-_STARTS: Final = ("episode_start", "mask")
+_STARTS: Final = "episode_start"
 _DETERMINISTIC: Final = "deterministic"
 _MASKS: Final = "action_masks"
+
+#: What SB3 before 1.4 called `episode_start`, and what its `predict` has; elsewhere the word may
+#: mean anything.
+_OLD_STARTS: Final = "mask"
+_OLD: Final = frozenset((_STATE, _OLD_STARTS, _DETERMINISTIC))
 
 
 class Normalizer(Protocol):
@@ -103,7 +108,7 @@ class Actor:
         given: dict[str, Any] = {}
         if _STATE in self._takes:
             given[_STATE] = self._state
-        for name in self._takes.intersection(_STARTS):
+        for name in self._takes & {_STARTS, _OLD_STARTS}:
             given[name] = self._starts
         if _DETERMINISTIC in self._takes:
             given[_DETERMINISTIC] = self._deterministic
@@ -113,10 +118,11 @@ class Actor:
 
     def _actions(self, outcome: Any, shape: tuple[int, ...]) -> Any:
         """The actions of what a policy returned: these, or as `predict` a pair with a state."""
-        if type(outcome) is not tuple or len(outcome) != 2 or _shape(outcome[0]) != shape:  # pyright: ignore[reportUnknownArgumentType]
+        parts = cast("tuple[Any, ...]", outcome) if isinstance(outcome, tuple) else ()
+        if len(parts) != 2 or _shape(parts[0]) != shape:
             self._state = None
             return cast("Any", outcome)
-        actions, self._state = cast("tuple[Any, Any]", outcome)
+        actions, self._state = parts
         if self._state is not None and _STATE not in self._takes:
             raise InvalidArgumentError(
                 "policy: it returns a state with its actions, but has no parameter `state` to get "
@@ -134,18 +140,19 @@ def statistics(normalizer: Normalizer) -> dict[str, Any]:
 def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
     """Returns the known parameters that a policy has, and those without a default."""
     try:
-        parameters = inspect.signature(call).parameters
+        parameters = list(inspect.signature(call).parameters.values())
     except (TypeError, ValueError):  # written in C
         return set(), set()
-    known = (_STATE, *_STARTS, _DETERMINISTIC, _MASKS)
+    # The first one is the observation, whatever its name.
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    named = {it: each for it, each in parameters.items() if it in known and each.kind in kinds}
-    takes = set(named)
-    if is_model and any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-        takes |= {_STATE, _STARTS[0], _DETERMINISTIC}
-    if _STARTS[0] in takes:
-        takes.discard(_STARTS[1])
-    return takes, {name for name, each in named.items() if each.default is each.empty}
+    known = {each.name: each for each in parameters[1:] if each.kind in kinds}
+    takes = known.keys() & {_STATE, _STARTS, _DETERMINISTIC, _MASKS}
+    if is_model and any(each.kind is each.VAR_KEYWORD for each in parameters):
+        takes |= {_STATE, _STARTS, _DETERMINISTIC}
+    if is_model and _OLD <= known.keys():
+        takes.add(_OLD_STARTS)
+    needed = {name for name, each in known.items() if each.default is each.empty}
+    return takes, takes & needed
 
 
 def _shape(actions: Any) -> tuple[int, ...] | None:
