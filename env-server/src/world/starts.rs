@@ -132,3 +132,60 @@ fn corner_or_side(shape: Shape, robot: usize) -> Cell {
     let (row, col) = places[robot % places.len()];
     Cell { row, col }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::Rules;
+    use emberwatch_protocol::model::{CellMap, Pays};
+    use emberwatch_protocol::randomness::{Purpose, stream};
+    use emberwatch_protocol::{Grid, Model};
+    use rand::RngExt;
+    use std::sync::Arc;
+
+    fn airspace(rows: &[&str]) -> Airspace {
+        let shape = Shape::new(rows.len(), rows[0].len()).expect("a shape");
+        let closed = |(row, col): (usize, usize)| rows[row].as_bytes()[col] == b'#';
+        let map = Grid::from_shape_fn(shape.dim(), closed);
+        Airspace::new(shape, Some(Arc::new(map)), 0, 1, Pays::Visited)
+    }
+
+    #[test]
+    fn fixed_starts_in_a_pocket_are_named_with_what_they_reach() {
+        let pocket = airspace(&["..#...", "###...", "......"]);
+        let reach = |start| Reach::of(start, &pocket, 2).expect("a start that can be left");
+        let corner = reach(Start::Corner);
+        assert_eq!((corner.n_free, corner.n_cut_off), (14, 2));
+        let words = corner.closed_in[0].to_string();
+        assert!(
+            words.contains("(0, 0)") && words.contains("reach 2 of 14 free cells"),
+            "{words}"
+        );
+        assert_eq!(corner.closed_in.len(), 1, "the other corner is outside");
+        let words = corner.cut_off().expect("a share");
+        assert!(words.contains("2 of 14 free cells (14.29 %)"), "{words}");
+        assert!(reach(Start::Centre).closed_in.is_empty());
+        assert!(reach(Start::Random).closed_in.is_empty());
+        let open = Reach::of(Start::Corner, &Airspace::open(pocket.shape()), 2);
+        assert_eq!(open.map(|it| it.cut_off()), Ok(None));
+    }
+
+    #[test]
+    fn a_connected_map_has_the_random_starts_of_all_free_cells() {
+        let rows = [".#....", ".####.", "......"];
+        let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
+        let mut file = Model::wildfire().file().clone();
+        file.no_fly = Some(CellMap::Rows(rows.map(of_row).to_vec()));
+        let model = Model::new(file).expect("a model");
+        let shape = Shape::new(3, 6).expect("a shape");
+        let rules = Rules::new(&model, shape, 0, 0, Start::Random).expect("rules");
+        let free: Vec<usize> = (0..18)
+            .filter(|&at| rows[at / 6].as_bytes()[at % 6] == b'.')
+            .collect();
+        for (seed, robot) in (0..200).zip([0, 1].into_iter().cycle()) {
+            let mut stream = stream(seed, Purpose::Start, robot as u64);
+            let expected = shape.cell(free[stream.random_range(0..free.len())]);
+            assert_eq!(rules.start_cell(seed, robot), expected);
+        }
+    }
+}

@@ -150,3 +150,33 @@ pub fn in_words(n_bytes: u64) -> String {
         _ => format!("{} MiB", n_bytes.div_ceil(1 << 20)),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_does_not_fit_is_refused_with_numbers() {
+        let refused = check("worlds", 1 << 50).expect_err("too much").to_string();
+        let expected = "memory: expected 1073741824 MiB for worlds, got ";
+        assert!(refused.starts_with(expected), "{refused}");
+        check("worlds", 1 << 20).expect("enough");
+        let refused = with_capacity::<u64>("numbers", 1 << 47).expect_err("too many");
+        assert!(
+            refused
+                .to_string()
+                .starts_with(expected.split_once(" for").expect("a word").0)
+        );
+        assert_eq!(
+            with_capacity::<u8>("bytes", 7).map(|it| it.capacity()),
+            Ok(7)
+        );
+    }
+
+    #[test]
+    fn kib_are_read_by_their_names() {
+        let text = "MemTotal:       16 kB\nMemAvailable:   4 kB\n";
+        assert_eq!(kib(text, "MemAvailable:"), Some(4096));
+        assert_eq!(kib(text, "MemFree:"), None);
+    }
+}

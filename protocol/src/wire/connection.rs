@@ -10,6 +10,7 @@ use super::exchange::{check_answer, copied, garbled};
 use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
 use super::node::Opened;
 use super::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
+use super::resources::{CLIENT_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::texts::TextPort;
 use super::turn::Turn;
@@ -85,6 +86,7 @@ impl Connection {
     /// All ports but that for steps, whose size the server tells.
     fn open_ports(instance: &Instance, limit: Duration) -> Result<Opened<Ports>, ConnectionError> {
         let _turn = Turn::take_within(limit)?; // declared first: what fails below is dropped within it
+        check_descriptors("connect", CLIENT_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
             node: &node,
