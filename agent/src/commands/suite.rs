@@ -132,20 +132,7 @@ impl SuiteCommand {
         } else {
             Team::Alone
         };
-        let names = [FLOOR, CEILING].into_iter();
-        let names = names.chain(self.policies.iter().map(|name| &**name));
-        let mut policies: Vec<Policy> = Vec::new();
-        for name in names {
-            let policy = Policy::named(name, arena.model())?;
-            let can_run =
-                learned.suits(&policy) && !(task.is_recorded() && policy.estimator.knows_model());
-            if !can_run {
-                let task = &task.name;
-                tracing::warn!("task {task}: {name} is not run: it needs a model or --checkpoints");
-            } else if !policies.contains(&policy) {
-                policies.push(policy);
-            }
-        }
+        let policies = self.policies(&task, arena.model(), &learned)?;
         Ok(Plan {
             comparison: Comparison {
                 policies,
@@ -161,6 +148,24 @@ impl SuiteCommand {
             task,
             worlds,
         })
+    }
+
+    /// The policies that can run on a task; warns of the others.
+    fn policies(&self, task: &Task, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
+        let names = [FLOOR, CEILING].into_iter();
+        let mut policies: Vec<Policy> = Vec::new();
+        for name in names.chain(self.policies.iter().map(|name| &**name)) {
+            let policy = Policy::named(name, model)?;
+            let can_run =
+                learned.suits(&policy) && !(task.is_recorded() && policy.estimator.knows_model());
+            if !can_run {
+                let task = &task.name;
+                tracing::warn!("task {task}: {name} is not run: it needs a model or --checkpoints");
+            } else if !policies.contains(&policy) {
+                policies.push(policy);
+            }
+        }
+        Ok(policies)
     }
 
     /// Runs the policies whose runs are missing or outdated, one by one; returns all runs that count.
@@ -195,18 +200,9 @@ impl SuiteCommand {
                 plan.replace(runs)?;
             }
         }
-        let mut runs = plan.read()?;
-        let policies: BTreeSet<String> = runs.iter().map(|run| run.policy.clone()).collect();
-        for policy in policies {
-            if let Err(reason) = plan.check(&policy, &runs) {
-                tracing::warn!("task {task}: {policy} is left out: {reason:#}");
-                runs.retain(|run| run.policy != policy);
-            }
-        }
-        runs.retain(|run| comparison.seeds.contains(&run.world_seed));
         Ok(TaskRuns {
             task: task.clone(),
-            runs,
+            runs: plan.valid_runs()?,
         })
     }
 
@@ -267,6 +263,21 @@ impl Plan {
 
     fn read(&self) -> Result<Vec<PolicyRun>> {
         self.lock()?.read()
+    }
+
+    /// Reads all runs that count; warns of the policies whose runs do not.
+    fn valid_runs(&self) -> Result<Vec<PolicyRun>> {
+        let mut runs = self.read()?;
+        let policies: BTreeSet<String> = runs.iter().map(|run| run.policy.clone()).collect();
+        for policy in policies {
+            if let Err(reason) = self.check(&policy, &runs) {
+                let task = &self.task.name;
+                tracing::warn!("task {task}: {policy} is left out: {reason:#}");
+                runs.retain(|run| run.policy != policy);
+            }
+        }
+        runs.retain(|run| self.comparison.seeds.contains(&run.world_seed));
+        Ok(runs)
     }
 
     /// Checks that a policy's runs are of the task's worlds, and those of a built-in policy of what it is now.

@@ -54,11 +54,11 @@ fn runs_of_other_worlds_are_refused_with_what_differs() {
         ),
         (
             |runs| runs.truncate(2),
-            "expected worlds [0, 1, 2], got [0, 1]",
+            "one row for each world, 3 from seed 0 to 2, got 2 from seed 0 to 1",
         ),
         (
             |runs| runs[1].world_seed = 2,
-            "expected worlds [0, 1, 2], got [0, 2, 2]",
+            "one row for each world, 3 from seed 0 to 2, got 3 from seed 0 to 2",
         ),
     ];
     for (change, words) in changes {

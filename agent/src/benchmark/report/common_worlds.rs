@@ -43,8 +43,9 @@ impl CommonWorlds {
         found.sort_unstable();
         ensure!(
             found == self.seeds,
-            "policy {policy:?}: expected worlds {:?}, got {found:?}",
-            self.seeds
+            "policy {policy:?}: expected one row for each world, {}, got {}",
+            counted(&self.seeds),
+            counted(&found)
         );
         Ok(())
     }
@@ -87,6 +88,15 @@ pub fn check_fire(added: &[PolicyRun], runs: &[PolicyRun]) -> Result<()> {
         same(run, what, expected, run.mean_fire_cells).context("--add")?;
     }
     Ok(())
+}
+
+/// How many worlds there are, with the first and the last seed.
+fn counted(seeds: &[u64]) -> String {
+    match seeds {
+        [] => "none".into(),
+        [first, .., last] => format!("{} from seed {first} to {last}", seeds.len()),
+        [only] => format!("1 of seed {only}"),
+    }
 }
 
 fn same<T: PartialEq + Display>(run: &PolicyRun, what: &str, expected: T, got: T) -> Result<()> {
