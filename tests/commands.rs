@@ -17,8 +17,8 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --worlds 1025 => worlds: expected 1 to 1024, got 1025
 --worlds many => 'many' | --worlds
 --worlds 99999999999 => --worlds
---height 0 => height and width in 1..=4096, got 0 x 64
---width 4097 => height and width in 1..=4096, got 64 x 4097
+--height 0 => height: expected 1 to 4096, got 0
+--width 4097 => width: expected 1 to 4096, got 4097
 --moves 0 => moves: expected 1 to 4096, got 0
 --robots 0 => robots: expected 1 to 64, got 0
 --robots 65 => robots: expected 1 to 64, got 65

@@ -351,7 +351,7 @@ fn settings_that_a_states_file_decides_are_refused_as_flags() {
         ("--burn-in 0", "burn_in"),
         ("--model wildfire", "model"),
     ] {
-        let words = format!("{setting}: expected no flag beside a states file");
+        let words = format!("{setting}: expected to be left out, as the states file decides it");
         check(SERVER, &format!("{states} {flag}"), &words);
     }
     let table = "--states-offset 3 => expected none without a states file

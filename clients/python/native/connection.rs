@@ -15,7 +15,6 @@ use emberwatch_server::world::Episode;
 use numpy::PyArray1;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
-use std::ffi::OsString;
 use std::time::Duration;
 
 /// How long the server worked on a step, and what it answered: results of the worlds, of the robots, frames.
@@ -51,11 +50,11 @@ impl Server {
         Ok(Self::of(instance, Backend::Server(Box::new(wire))))
     }
 
-    /// Worlds in this process, with the flags of `emberwatch-server`.
+    /// Worlds in this process, of these settings of `config/server.toml`, as JSON.
     #[staticmethod]
     #[pyo3(name = "embedded")]
-    fn new_embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Self> {
-        let worlds = Backend::Embedded(Box::new(embedded(py, flags)?));
+    fn new_embedded(py: Python<'_>, settings: &str) -> PyResult<Self> {
+        let worlds = Backend::Embedded(Box::new(embedded(py, settings)?));
         Ok(Self::of(INSTANCE, worlds))
     }
 

@@ -164,7 +164,7 @@ def test_a_task_ends_episodes_in_any_environment() -> None:
     ],
 )
 def test_what_a_task_decides_is_refused_by_name(keyword: str, value: Any, setting: str) -> None:
-    with refuses(f"{setting}: expected no flag beside a task, which decides it, got"):
+    with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
         gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
 
 

@@ -4,7 +4,6 @@ Waits leave the interpreter to other threads; Ctrl-C ends them. What is open bel
 that made it: in a forked child, using it is an error with code `"forked"`.
 """
 
-from collections.abc import Sequence
 from os import PathLike
 from typing import Any, Literal, Protocol, final
 
@@ -23,8 +22,8 @@ class _Airspace(Protocol):
     @property
     def no_fly(self) -> NDArray[np.bool_] | None: ...
 
-def check_settings(flags: Sequence[str]) -> str:
-    """What a server would run with, given these flags, as TOML."""
+def check_settings(settings: str) -> str:
+    """All settings that a server with these would have; JSON from JSON."""
 
 class Server:
     """A connection to a server, or worlds in this process. Threads may share it, in turns."""
@@ -33,8 +32,8 @@ class Server:
         """Opens it; `client` names this program in the server's log."""
 
     @staticmethod
-    def embedded(flags: Sequence[str]) -> Server:
-        """Worlds in this process, with the flags of `emberwatch-server`."""
+    def embedded(settings: str) -> Server:
+        """Worlds in this process, of these settings of `config/server.toml`, as JSON."""
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
         """The hidden states of embedded worlds, as the fields of `Truth`; refused of a server's."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.client import Client, connect, embed_flags
+from emberwatch.client import Client, connect, embed
 from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
@@ -251,11 +251,12 @@ class Session:
 
     def launch(self, seed: int) -> Client:
         """Begins worlds of its own, with this seed for world 0; `close` ends them."""
-        flags = [f"--seed={seed}", *self.settings.server_flags(self.n_worlds)]
         if self.settings.is_embedded:
-            return embed_flags(flags)
+            return embed(seed=seed, **self.settings.of_server(self.n_worlds))
         instance = unused_instance()
-        self._program = Program("emberwatch-server", [f"--instance={instance}", *flags])
+        flags = [f"--instance={instance}", f"--seed={seed}"]
+        flags += self.settings.server_flags(self.n_worlds)
+        self._program = Program("emberwatch-server", flags)
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
-from os import fspath
 from pathlib import Path
 from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
 from emberwatch.airspace import Airspace, Zones
-from emberwatch.arguments import check_settings
+from emberwatch.arguments import as_setting, check_settings
 from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
@@ -27,6 +26,14 @@ SEEDS: Final = 2**53
 #: Where the worlds are: at a server, or in this process.
 SERVER: Final = "server"
 EMBEDDED: Final = "embedded"
+
+#: Keywords whose settings of a server have other names.
+_KEYWORDS: Final = {
+    "moves": "n_moves",
+    "worlds": "num_envs",
+    "worlds times robots": "num_envs",
+    "cells times robots": "height times width times robots",
+}
 
 _Init = TypeVar("_Init")
 
@@ -132,9 +139,9 @@ class Settings:
         asked = cls(**world)
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
-    def server_flags(self, n_worlds: int) -> list[str]:
-        """The flags of a private server with these worlds, or of embedded ones."""
-        flags = {
+    def of_server(self, n_worlds: int) -> dict[str, Any]:
+        """The settings of these worlds, by their names in `config/server.toml`."""
+        given = {
             "worlds": n_worlds,
             "robots": self.robots,
             "task": self.task,
@@ -143,15 +150,32 @@ class Settings:
             "height": self.height,
             "width": self.width,
             "moves": self.n_moves,
-            "burn-in": self.burn_in,
-            "sensor-radius": self.sensor_radius,
+            "burn_in": self.burn_in,
+            "sensor_radius": self.sensor_radius,
             "start": self.start,
-            "publish-truth": str(self.truth).lower(),
+            "publish_truth": self.truth,
             # Refused where there is no states file.
-            "states-symmetries": "true" if self.states_symmetries else None,
-            "states-offset": self.states_offset or None,
+            "states_symmetries": self.states_symmetries or None,
+            "states_offset": self.states_offset or None,
         }
-        return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
+        return {name: as_setting(name, it) for name, it in given.items() if it is not None}
+
+    def server_flags(self, n_worlds: int) -> list[str]:
+        """The same as flags of `emberwatch-server`."""
+        settings = self.of_server(n_worlds).items()
+        return [
+            f"--{name.replace('_', '-')}={str(it).lower() if isinstance(it, bool) else it}"
+            for name, it in settings
+        ]
+
+    def check(self, n_worlds: int) -> dict[str, Any]:
+        """All settings of a server with these worlds. A refusal names the keyword."""
+        try:
+            return check_settings(self.of_server(n_worlds))
+        except InvalidArgumentError as error:
+            setting, colon, words = str(error).partition(":")
+            words = f"{_KEYWORDS.get(setting, setting)}{colon}{words}"
+            raise InvalidArgumentError(words) from None
 
 
 def shows_keywords(init: _Init) -> _Init:
@@ -224,7 +248,7 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     task = None if settings.task is None else Task.named(settings.task)
     n_robots = settings.robots or (1 if task is None else task.robots)
     robots = _robots(settings, n_rows, n_robots)
-    checked = check_settings(settings.server_flags(len(robots) // n_robots))
+    checked = settings.check(len(robots) // n_robots)
     described = _described(checked)
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
@@ -301,7 +325,7 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     task = Task.named(asked)
     if task.name != info.task:
         raise invalid("task", f"{info.task!r}, as the server has, or None", repr(task.name))
-    own = check_settings([f"--task={fspath(asked)}"])
+    own = check_settings({"task": utf8("task", asked)})
     has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
     has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
     for name, got in has.items():
