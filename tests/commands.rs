@@ -123,7 +123,10 @@ compare --instance nobody --policies coverage,ash => policy: expected one of ran
 compare --instance nobody --baseline ash => --baseline | expected one of | got "ash"
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
-compare TINY --csv / => --csv: expected a file, got the folder /
+compare TINY --csv / => --csv: write /: expected a regular file, got a folder
+compare TINY --csv /dev/null => --csv: write /dev/null: expected a regular file
+compare TINY --csv /proc/rows.csv => --csv: /proc/rows.csv: create /proc: expected a folder that can be written to
+compare TINY --figures /proc => create /proc: expected a folder that can be written to
 compare TINY --figures /proc/no => create /proc/no
 "#;
 

@@ -5,6 +5,8 @@ mod commands;
 
 use clap::{Parser, Subcommand};
 use emberwatch_network::{Allocator, set_up_process};
+use emberwatch_protocol::limits::threads::NoThreads;
+use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;
 
 #[global_allocator]
@@ -44,7 +46,12 @@ enum Command {
 fn main() -> ExitCode {
     set_up_process();
     emberwatch_protocol::program::start_logging();
-    let result = match &Cli::parse().command {
+    let command = Cli::parse().command;
+    if let Err(error) = start_threads() {
+        tracing::error!("{error}");
+        return ExitCode::FAILURE;
+    }
+    let result = match &command {
         Command::Run(command) => command.run(),
         Command::ServeDecisions(command) => command.run(),
         Command::Prior(command) => command.run(),
@@ -61,4 +68,11 @@ fn main() -> ExitCode {
             commands::exit_code(&error)
         }
     }
+}
+
+/// Starts the threads that all commands share: they would start at their first work, where a failure is a panic.
+fn start_threads() -> Result<(), NoThreads> {
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let started = ThreadPoolBuilder::new().build_global();
+    started.map_err(|error| NoThreads::new(n_threads, &error))
 }

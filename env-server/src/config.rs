@@ -1,7 +1,7 @@
 //! The server's settings and their checks.
 
 use crate::states_file::{StatesError, StatesFile};
-use crate::world::{Recorded, check_start};
+use crate::world::{Reach, Recorded};
 use emberwatch_protocol::channels::{
     ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
 };
@@ -67,6 +67,8 @@ pub struct Checked {
     /// That of recorded worlds has no changes.
     pub model: Model,
     pub shape: Shape,
+    /// What no-fly cells leave to the robots.
+    pub reach: Reach,
     pub recorded: Option<CheckedStates>,
 }
 
@@ -179,13 +181,14 @@ impl ServerConfig {
             expected,
             got,
         };
-        check_start(self.start, &airspace, self.robots as usize).map_err(wrong)?;
+        let reach = Reach::of(self.start, &airspace, self.robots as usize).map_err(wrong)?;
         Ok(Checked {
             config: self,
             instance,
             task,
             model,
             shape,
+            reach,
             recorded,
         })
     }

@@ -9,6 +9,7 @@
 pub mod config;
 pub mod embedded;
 pub mod flags;
+pub mod limits;
 pub mod recording;
 pub mod server;
 pub mod simulator;

@@ -37,6 +37,8 @@ pub struct Learned {
     pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `learned_policy` and others on the belief that they were learned on.
     pub decisions: Option<LearnedDecisions>,
+    /// Of each checkpoint, in the order read.
+    pub digests: Vec<String>,
 }
 
 impl Learned {
@@ -74,6 +76,7 @@ impl Learned {
             }
         };
         ensure!(!twice, "expected one checkpoint of {kind}, got two");
+        self.digests.push(contents.digest());
         Ok(())
     }
 

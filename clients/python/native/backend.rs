@@ -1,10 +1,11 @@
 //! What answers requests: a server, or worlds in this process.
 
-use crate::errors::raise;
+use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
 use clap::{Args, Command, FromArgMatches};
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::message::{StepReply, StepRequest};
 use emberwatch_server::config::{Checked, ServerConfig};
 use emberwatch_server::embedded::{Embedded, wait_for};
@@ -59,7 +60,13 @@ pub fn embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Embedded> {
     let checked = checked(py, flags)?;
     check_embeddable(py, &checked.config)?;
     let worlds = py.detach(|| Embedded::new(checked));
-    worlds.map_err(|error| failed(py, &format!("{error:#}"), "embedded"))
+    worlds.map_err(|error| match error.downcast_ref() {
+        Some(short) => no_memory(py, short),
+        None => match error.downcast_ref() {
+            Some(short) => no_threads(py, short),
+            None => failed(py, &format!("{error:#}"), "embedded"),
+        },
+    })
 }
 
 /// The settings that a server with these flags would have, as TOML.
@@ -78,11 +85,17 @@ fn checked(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Checked> {
         let settings = ServerFlags::from_arg_matches(&matches)?.effective();
         Ok::<_, clap::Error>(settings.and_then(ServerConfig::check))
     };
-    std::thread::spawn(move || drop(sender.send(read())));
+    let reader = spawn("settings", move || drop(sender.send(read())));
+    reader.map_err(|short| no_threads(py, &short))?;
     let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
     let checked = py.detach(wait);
     match checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))? {
-        Ok(Ok(checked)) => Ok(checked),
+        Ok(Ok(checked)) => {
+            for closed_in in &checked.reach.closed_in {
+                warn(py, closed_in)?;
+            }
+            Ok(checked)
+        }
         Ok(Err(problem)) => Err(refused(py, &problem.to_string())),
         Err(problem) => Err(refused(py, &problem.to_string())),
     }

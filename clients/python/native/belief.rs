@@ -2,10 +2,12 @@
 //! states of n worlds.
 
 use crate::detached::detached;
+use crate::errors::no_threads;
 use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
@@ -13,18 +15,25 @@ use numpy::{
     IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
 };
 use pyo3::prelude::*;
+use rayon::ThreadPoolBuilder;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, TryLockError};
 use std::time::Duration;
 
 /// How often a long computation looks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// The operator `Phi` of one model on one grid, with its work space.
-#[pyclass(module = "emberwatch._native")]
+/// The operator `Phi` of one model on one grid. Threads cannot share it.
+#[pyclass(frozen, module = "emberwatch._native")]
 pub struct Transition {
     /// The model file's text.
     model: String,
     shape: Shape,
+    work: Mutex<Work>,
+}
+
+/// What one application at a time needs.
+struct Work {
     /// Or the error that `apply` raises: that eq. 3 could divide by zero.
     operator: Result<transition::Transition<f64>, ModelError>,
     belief: Array3<f64>,
@@ -37,30 +46,43 @@ impl Transition {
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
         let none = Array3::zeros((parameters.n_states(), height, width));
-        Ok(Self {
+        let work = Work {
             operator: transition::Transition::new(&parameters, shape),
             belief: none.clone(),
             predictor: none,
+        };
+        Ok(Self {
             model,
             shape,
+            work: Mutex::new(work),
         })
     }
 
     /// `Phi` of beliefs, a new array of their shape.
     fn apply<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         beliefs: &Bound<'py, PyArray4<f64>>,
     ) -> PyResult<Bound<'py, PyArray4<f64>>> {
-        let operator = self
-            .operator
-            .as_mut()
-            .map_err(|error| vanishing(py, error))?;
+        let mut work = match self.work.try_lock() {
+            Ok(work) => work,
+            Err(TryLockError::Poisoned(left)) => left.into_inner(),
+            Err(TryLockError::WouldBlock) => {
+                let expected = "a transition or filter for each thread";
+                return Err(invalid(py, "transition", expected, "one in use by another"));
+            }
+        };
+        let Work {
+            operator,
+            belief,
+            predictor,
+        } = &mut *work;
+        let operator = operator.as_mut().map_err(|error| vanishing(py, error))?;
         let beliefs = beliefs.try_readonly();
         let expected = "an array that no other thread corrects";
         let beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, "one in use"))?;
         let beliefs = beliefs.as_array();
-        let (n_states, height, width) = self.belief.dim();
+        let (n_states, height, width) = belief.dim();
         let (_, n_worlds, _, _) = beliefs.dim();
         if beliefs.dim() != (n_states, n_worlds, height, width) {
             let expected = format!("shape ({n_states}, n, {height}, {width})");
@@ -72,7 +94,6 @@ impl Transition {
             ));
         }
         let mut out = Array4::zeros(beliefs.dim());
-        let (belief, predictor) = (&mut self.belief, &mut self.predictor);
         detached(py, beliefs.len(), || {
             let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
             for (world, mut next) in worlds {
@@ -189,11 +210,13 @@ pub fn simulated_prior<'py>(
 /// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
-    let pool = rayon::ThreadPoolBuilder::new().build();
-    let pool = pool.map_err(|error| failed(py, &format!("start threads: {error}"), "program"))?;
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {
         let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
-        let worker = scope.spawn(work);
+        let worker = std::thread::Builder::new().spawn_scoped(scope, work);
+        let worker = worker.map_err(|error| no_threads(py, &NoThreads::new(1, &error)))?;
         while !worker.is_finished() {
             py.detach(|| std::thread::sleep(LOOK));
             if let Err(interrupt) = py.check_signals() {

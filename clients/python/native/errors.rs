@@ -2,11 +2,15 @@
 
 use emberwatch_protocol::channels::ChannelError;
 use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::limits::memory::NoMemory;
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_server::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
-use pyo3::exceptions::PyKeyboardInterrupt;
+use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
 use pyo3::prelude::*;
 use std::cell::RefCell;
+use std::ffi::CString;
+use std::fmt::Display;
 
 thread_local! {
     /// What a signal's handler raised during a wait of this thread.
@@ -34,10 +38,27 @@ pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) 
     made.map_or_else(|error| error, PyErr::from_value)
 }
 
+/// The error of memory that there is not.
+pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
+    error(py, "NotEnoughMemoryError", (short.to_string(),))
+}
+
+/// The error of threads that the system does not start.
+pub fn no_threads(py: Python<'_>, short: &NoThreads) -> PyErr {
+    error(py, "EmberwatchError", (short.to_string(), "threads"))
+}
+
+/// Warns the caller of this package's function.
+pub fn warn(py: Python<'_>, words: impl Display) -> PyResult<()> {
+    let words = CString::new(words.to_string())?;
+    PyErr::warn(py, &py.get_type::<PyUserWarning>(), &words, 1)
+}
+
 /// The error of a request, `what`, that was waited for so many seconds.
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
+        ConnectionError::Memory(short) => no_memory(py, &short),
         ConnectionError::ServerGone { instance, .. } if instance == INSTANCE => {
             let text = "these worlds were ended by shutdown: make others";
             error(py, "ServerGoneError", (text,))

@@ -21,7 +21,7 @@ pub use super::channel_files::lives_elsewhere;
 pub use super::directory::{Entries, SHARED_MEMORY, channel_directory, node_config};
 pub use super::error::{ChannelError, Ipc};
 pub use super::node::create_node;
-pub use super::resources::{check_room, ipc_error, limited_error};
+pub use super::resources::{call_error, check_room, ipc_error, limited_error};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;

@@ -1,5 +1,6 @@
 //! The numbers of the binary messages: version, operations, flags, status codes.
 
+use crate::limits::memory::in_words;
 use thiserror::Error;
 
 /// Version of the protocol.
@@ -90,7 +91,7 @@ pub enum Status {
     Incomplete = 21,
     /// A robot outside the server's; detail: number of robots of all worlds.
     NoSuchRobot = 22,
-    /// There is too little shared memory for the answer; detail: 0.
+    /// There is too little memory for the answer; detail: bytes of a step's answer, or 0 if it is shared memory.
     NoMemory = 23,
 }
 
@@ -141,7 +142,7 @@ impl Status {
             }
             Self::Malformed => "malformed control message".into(),
             Self::NoSuchWorld => format!(
-                "no such world: the server has worlds 0 to {}",
+                "no such world: the server has worlds 0 to {}; start it with --worlds N for more",
                 detail.saturating_sub(1)
             ),
             Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
@@ -183,9 +184,16 @@ impl Status {
                 "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
                  a step of several worlds needs them all"
             ),
-            Self::NoMemory => "shared memory is full: free some, and ask again".into(),
+            Self::NoMemory if detail == 0 => {
+                "shared memory is full: free some, and ask again".into()
+            }
+            Self::NoMemory => format!(
+                "memory: expected {} for the answer, got less; ask for fewer robots at a time",
+                in_words(detail)
+            ),
             Self::NoSuchRobot => format!(
-                "no such robot: the server has robots 0 to {}",
+                "no such robot: the server has robots 0 to {}; start it with --worlds N for more worlds, or --robots N \
+                 for more in each",
                 detail.saturating_sub(1)
             ),
         }

@@ -5,6 +5,7 @@ use super::connection::{ConnectionError, unexpected};
 use super::decisions::{AgentInfo, Reply};
 use super::exchange::garbled;
 use super::node::Opened;
+use super::resources::{CLIENT_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::texts::TextPort;
 use super::turn::Turn;
@@ -43,6 +44,7 @@ impl Decider {
         limit: Duration,
     ) -> Result<Opened<TextPort>, ConnectionError> {
         let _turn = Turn::take_within(limit)?; // declared first: what fails below is dropped within it
+        check_descriptors("connect", CLIENT_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
             node: &node,

@@ -100,6 +100,17 @@ pub enum ChannelError {
         /// How many the process may have.
         limit: String,
     },
+    /// The system refuses a call that channels need, as a container's seccomp profile does.
+    #[error(
+        "{call}: expected the system to allow this call, got: {problem}; allow it in the seccomp profile of the container \
+         (docker: --security-opt seccomp=PROFILE), or use a newer kernel if it lacks the call"
+    )]
+    RefusedCall {
+        /// The system call.
+        call: &'static str,
+        /// The system's words.
+        problem: String,
+    },
     /// The check of [`super::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]
     Interrupted,

@@ -8,6 +8,7 @@ use super::interrupt::check_interrupt;
 use super::message::{Header, Status, VERSION};
 use super::process::WatchedProcess;
 use super::wait::{Waiter, descriptor, drain, sleep_until_readable};
+use crate::limits::memory::{NoMemory, with_capacity};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
@@ -29,6 +30,9 @@ pub enum ConnectionError {
     /// The channel could not be used.
     #[error(transparent)]
     Channel(#[from] ChannelError),
+    /// There is too little memory for the answer, which has come.
+    #[error(transparent)]
+    Memory(#[from] NoMemory),
     /// The server, or the agent asked for decisions, ended while, or before, it was asked.
     #[error("the {who} on instance {instance:?} is gone")]
     ServerGone {
@@ -223,6 +227,13 @@ pub(super) fn check_answer(
         return Ok(());
     };
     Err(garbled(what, problem))
+}
+
+/// A copy of an answer's payload.
+pub(super) fn copied(what: &str, payload: &[u8]) -> Result<Vec<u8>, NoMemory> {
+    let mut copy = with_capacity(format_args!("the answer to {what}"), payload.len())?;
+    copy.extend_from_slice(payload);
+    Ok(copy)
 }
 
 /// The error of an answer that makes no sense.

@@ -19,7 +19,7 @@ from emberwatch import recording
 from emberwatch.client import Client, connect, embed
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv, WildfireVectorEnv
-from emberwatch.errors import EmberwatchError
+from emberwatch.errors import EmberwatchError, TrainingOnTestWorldsWarning
 from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv, WildfireMovesVectorEnv
 from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVectorEnv
@@ -53,6 +53,7 @@ __all__ = [
     "StepAnswer",
     "StepResult",
     "Task",
+    "TrainingOnTestWorldsWarning",
     "Truth",
     "TruthReader",
     "WildfireEnv",

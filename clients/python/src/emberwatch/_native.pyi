@@ -113,8 +113,11 @@ class Flights:
         """What the moves have been paid."""
 
     @property
-    def masks(self) -> NDArray[np.bool_]:
-        """Whether each move takes a robot to another cell, `(n_rows, 4)`; all, where none does."""
+    def masks(self) -> NDArray[np.int8]:
+        """1 for each move that takes a robot to another cell, else 0, `(n_rows, 4)`.
+
+        All 1 where no move does.
+        """
 
     def begin(
         self,

@@ -106,8 +106,9 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begins an episode; see `WildfireEnv`. An agent that does not start says why."""
-        seen = self._seen(self._begin(seed, options))
-        self._session.finish()
+        with self._session.turn:
+            seen = self._seen(self._begin(seed, options))
+            self._session.finish()
         return seen
 
     def step(
@@ -119,13 +120,14 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
             EmberwatchError: As `WildfireEnv.step`, in the agent's words if it has ended.
         """
         objective = as_choice(action, int(self._agent.action_space.n))
-        self._session.begin_step()
-        answer = self._agent.decide(np.array([objective], np.uint8), ONE_ROW)
-        if self.render_mode is not None:
-            self._path = self._agent.paths[0]
-        observation, info = self._seen(answer)
-        world = answer.result().world
-        self._session.finish()
+        with self._session.turn:
+            self._session.begin_step()
+            answer = self._agent.decide(np.array([objective], np.uint8), ONE_ROW)
+            if self.render_mode is not None:
+                self._path = self._agent.paths[0]
+            observation, info = self._seen(answer)
+            world = answer.result().world
+            self._session.finish()
         return observation, world.reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:

@@ -4,11 +4,14 @@ import tomllib
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 from emberwatch.arguments import check_settings
 from emberwatch.model import built_in
 from emberwatch.paths import utf8
+
+#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+FIRST_TRAINING_SEED: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -217,6 +217,7 @@ class _Setting:
     def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
         """The worlds as they are, and as the policy sees them."""
         worlds = _make(self.env, self.keywords, self.n_robots, n_worlds)
+        worlds.unwrapped.allow_test_worlds()
         try:
             yield worlds.unwrapped, worlds if self.wrap is None else _wrapped(worlds, self.wrap)
         finally:

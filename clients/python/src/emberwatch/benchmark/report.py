@@ -6,15 +6,13 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, TextIO
+from typing import TextIO
 
 import numpy as np
 
 from emberwatch.benchmark.rows import Row
 from emberwatch.errors import invalid
-
-#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
-FIRST_TRAINING_SEED: Final = 1000
+from emberwatch.tasks import FIRST_TRAINING_SEED
 
 
 class Progress:
