@@ -56,7 +56,7 @@ class Actor:
         if not callable(self._call):
             expected = "a function of observations, or a model of Stable-Baselines3"
             raise invalid("policy", expected, told(policy))
-        #: The model, also where the policy is a method of it.
+        # The model, also where the policy is a method of it.
         self._model: Any = getattr(policy, "__self__", policy)
         self._begin: Any = getattr(policy, "begin", None)
         self._deterministic: Final = deterministic
@@ -98,10 +98,8 @@ class Actor:
         """Returns the actions for the observations of some worlds, a new array."""
         if self._normalizer is not None:
             seen = self._normalizer.normalize_obs(seen)
-        outcome = self._call(seen, **self._given(worlds))
-        # Not the same array, which a policy may have kept.
-        self._starts = np.zeros_like(self._starts)
-        actions = self._actions(outcome, worlds.action_space.shape)
+        outcome = self._call(seen, **self._given(worlds)) if self._takes else self._call(seen)
+        actions = self._actions(outcome, worlds)
         return np.array(as_array(actions, "policy", "actions"))  # a policy may use its array again
 
     def _given(self, worlds: Any) -> dict[str, Any]:
@@ -109,17 +107,17 @@ class Actor:
         if _STATE in self._takes:
             given[_STATE] = self._state
         for name in self._takes & {_STARTS, _OLD_STARTS}:
-            given[name] = self._starts
+            given[name], self._starts = self._starts, np.zeros_like(self._starts)
         if _DETERMINISTIC in self._takes:
             given[_DETERMINISTIC] = self._deterministic
         if _MASKS in self._takes and hasattr(worlds, _MASKS):
             given[_MASKS] = np.asarray(worlds.action_masks(), np.bool_)
         return given
 
-    def _actions(self, outcome: Any, shape: tuple[int, ...]) -> Any:
+    def _actions(self, outcome: Any, worlds: Any) -> Any:
         """The actions of what a policy returned: these, or as `predict` a pair with a state."""
         parts = cast("tuple[Any, ...]", outcome) if isinstance(outcome, tuple) else ()
-        if len(parts) != 2 or _shape(parts[0]) != shape:
+        if len(parts) != 2 or _shape(parts[0]) != worlds.action_space.shape:
             self._state = None
             return cast("Any", outcome)
         actions, self._state = parts
@@ -149,7 +147,7 @@ def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], 
     takes = known.keys() & {_STATE, _STARTS, _DETERMINISTIC, _MASKS}
     if is_model and any(each.kind is each.VAR_KEYWORD for each in parameters):
         takes |= {_STATE, _STARTS, _DETERMINISTIC}
-    if is_model and _OLD <= known.keys():
+    if is_model and _OLD <= known.keys() and _STARTS not in takes:
         takes.add(_OLD_STARTS)
     needed = {name for name, each in known.items() if each.default is each.empty}
     return takes, takes & needed
