@@ -29,11 +29,9 @@ pub enum ConnectionError {
     /// The channel could not be used.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The server, or the agent asked for decisions, ended while, or before, it was asked.
-    #[error("the {who} on instance {instance:?} is gone")]
+    /// The server ended while, or before, it was asked.
+    #[error("the server on instance {instance:?} is gone")]
     ServerGone {
-        /// "server" or "agent".
-        who: &'static str,
         /// Name of the instance.
         instance: String,
     },
@@ -69,7 +67,6 @@ pub enum ConnectionError {
 
 /// What a request and its answer need: both ends of waking, and the server's process.
 pub(super) struct Exchange {
-    pub(super) who: &'static str,
     pub(super) instance: Instance,
     pub(super) server: Notifier<Ipc>,
     pub(super) listener: Listener<Ipc>,
@@ -147,7 +144,6 @@ impl Exchange {
     pub(super) fn server_gone(&self) -> ConnectionError {
         let _ = remove_leftovers(); // Else the next program removes them.
         ConnectionError::ServerGone {
-            who: self.who,
             instance: self.instance.name().into(),
         }
     }

@@ -65,13 +65,13 @@ class RequestTimeoutError(EmberwatchError, TimeoutError):
 
 
 class ServerGoneError(EmberwatchError, ConnectionError):
-    """The server, or the agent asked for decisions, ended while or before it was asked."""
+    """The server ended while or before it was asked."""
 
     code = "server_gone"
 
 
-#: Name and sentence of each status code, from code 1; `step` sends the code alone.
-STATUSES: Final = (
+#: Name and sentence of each status code, from code 1; `step` sends the code alone. None: not used.
+STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
     (
         "version_mismatch",
         "protocol version mismatch: the server speaks {}; use a client and a server of one release",
@@ -93,8 +93,8 @@ STATUSES: Final = (
         "takes no steps",
     ),
     ("unknown_flags", "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {}"),
-    ("bad_objective", "objective: expected one below {}"),
-    ("agent_ends", "the agent ends"),
+    None,
+    None,
     ("bad_file", "the file cannot be used"),
     ("not_kept", "not kept: the nearest step that is kept is {}"),
     (
@@ -111,17 +111,18 @@ STATUSES: Final = (
     ("no_memory", "shared memory is full: free some, and ask again"),
 )
 
-_CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
     """The error of a status code other than 0, in the server's words if they fit Python."""
-    if not 1 <= status <= len(STATUSES):
+    known = STATUSES[status - 1] if 1 <= status <= len(STATUSES) else None
+    if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"
         return EmberwatchError(message, detail=detail)
-    code, sentence = STATUSES[status - 1]
+    code, sentence = known
     if code == "lease_lost" and detail == 0:
         sentence = "lease lost: it expired or was released; acquire the robots again"
     if message is None or code == "busy":  # the server's words name a flag, not a keyword
         message = sentence.format(detail, last=max(detail - 1, 0))
-    return _CLASSES.get(code, EmberwatchError)(message, code, detail)
+    kind = LeaseLostError if code == "lease_lost" else EmberwatchError
+    return kind(message, code, detail)
