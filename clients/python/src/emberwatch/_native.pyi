@@ -11,8 +11,6 @@ from typing import Any, Literal, Protocol, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.settings import WorldSpec
-
 _Doubles = NDArray[np.float64]
 
 class _Airspace(Protocol):
@@ -26,6 +24,32 @@ class _Airspace(Protocol):
     def pays(self) -> str: ...
     @property
     def no_fly(self) -> NDArray[np.bool_] | None: ...
+
+class _Text(Protocol):
+    """A model or a description."""
+
+    @property
+    def toml(self) -> str: ...
+
+class _Spec(Protocol):
+    """What counts of a `WorldSpec`."""
+
+    @property
+    def height(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def n_moves(self) -> int: ...
+    @property
+    def n_observations(self) -> int: ...
+    @property
+    def burn_in(self) -> int: ...
+    @property
+    def airspace(self) -> _Airspace: ...
+    @property
+    def model(self) -> _Text | None: ...
+    @property
+    def description(self) -> _Text | None: ...
 
 def check_settings(flags: Sequence[str]) -> str:
     """What a server would run with, given these flags, as TOML."""
@@ -75,7 +99,7 @@ class Options:
 
     def __init__(
         self,
-        spec: WorldSpec,
+        spec: _Spec,
         n_worlds: int,
         estimator: str | None,
         checkpoint: str | None,

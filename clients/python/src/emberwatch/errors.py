@@ -112,7 +112,6 @@ STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
 )
 
 
-
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
     """The error of a status code other than 0, in the server's words if they fit Python."""
     known = STATUSES[status - 1] if 1 <= status <= len(STATUSES) else None
