@@ -8,7 +8,6 @@ use emberwatch_protocol::channels::{
     MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, TRUTH_BUFFER,
 };
 use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
-use emberwatch_protocol::decisions;
 use emberwatch_protocol::grid::MAX_SIDE;
 use emberwatch_protocol::message::{
     AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, FrameHeader,

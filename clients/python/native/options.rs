@@ -38,6 +38,9 @@ use std::sync::OnceLock;
 /// Bytes of a world's result and its robot's.
 const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
+/// What plans promise, and their paths.
+type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
+
 /// The names of the options, and those of the numbers that describe the plan of each.
 #[pyfunction]
 pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
@@ -234,7 +237,7 @@ impl Options {
         results: PyReadonlyArray1<'py, u8>,
         frames: Option<PyReadonlyArray3<'py, u8>>,
         flown: Option<Vec<usize>>,
-    ) -> PyResult<(Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>)> {
+    ) -> PyResult<Plans<'py>> {
         let results = results.as_slice()?;
         let frames = frames.as_ref().map(|frames| frames.as_slice());
         let frames = frames.transpose()?;

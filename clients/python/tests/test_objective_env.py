@@ -206,6 +206,14 @@ def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Pat
         make(checkpoint=checkpoints / "damaged")
 
 
+def test_a_sensor_of_several_matrices_is_learned_for_without_its_model(tmp_path: Path) -> None:
+    world = {"model": ringed(tmp_path), "height": 7, "width": 5, "moves": 4, "burn_in": 50}
+    checkpoint = trained(tmp_path, **world)
+    shown = [server(reveal_model=reveals, **world) for reveals in (True, False)]
+    seen = [rollout(make(instance=it.instance, checkpoint=checkpoint), 3, seed=5) for it in shown]
+    assert_same(*seen)
+
+
 def test_an_estimator_that_knows_the_model_ignores_what_was_learned(checkpoints: Path) -> None:
     known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
@@ -290,6 +298,29 @@ def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
     assert_same(receiver.recv(), [step[0] for step in expected])
     assert receiver.recv() == "forked"
     process.join()
+
+
+@pytest.mark.parametrize(
+    ("policy", "estimator"),
+    [("known_exploit", "known_model"), ("spatial_exploit", "spatial_filter")],
+)
+def test_exploiting_makes_the_steps_of_a_policy_that_does(policy: str, estimator: str) -> None:
+    found = []
+    for flies in (False, True):
+        started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
+        client = started.connect()
+        if flies:
+            env = make(instance=started.instance, estimator=estimator)
+            env.reset(options={"resume": True})
+            for _ in range(5):
+                env.step(0)
+        else:
+            flags = ["--instance", started.instance, "--policy", policy, "--steps", "5"]
+            command = [find("emberwatch-agent"), "run", "--prior", "initial", *flags]
+            subprocess.run(command, check=True, capture_output=True, timeout=60)
+        answers = [client.recall(step) for step in range(6)]
+        found.append([(answer.results.tolist(), answer.frames.tolist()) for answer in answers])
+    assert_same(*found)
 
 
 def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:

@@ -7,7 +7,7 @@ use super::target::{Kind, Seed, Target};
 use super::worlds;
 
 /// All of them.
-pub const TARGETS: [Target; 12] = [
+pub const TARGETS: [Target; 11] = [
     message("step_request", requests::step, requests::step_seeds),
     message("control_request", requests::control, Vec::new),
     message(

@@ -27,10 +27,13 @@ Estimator: TypeAlias = Literal[
 ]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
-#: The names of the options, and those of the numbers that describe the plan of each.
-OBJECTIVES: Final[tuple[str, ...]]
-FEATURES: Final[tuple[str, ...]]
-OBJECTIVES, FEATURES = map(tuple, _native.option_names())
+_NAMES: Final = _native.option_names()
+
+#: The names of the options.
+OBJECTIVES: Final = tuple(_NAMES[0])
+
+#: The names of the numbers that describe the plan of each.
+FEATURES: Final = tuple(_NAMES[1])
 
 
 class Plans:
