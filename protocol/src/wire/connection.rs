@@ -2,9 +2,7 @@
 //!
 //! Nothing returned points into shared memory.
 
-use super::channels::{
-    Entries, Instance, Ipc, Services, StepService, create_node, limited_error,
-};
+use super::channels::{Entries, Instance, Ipc, Services, StepService, create_node, limited_error};
 use super::control::{Reply, Request, ServerInfo};
 use super::exchange::{check_answer, garbled};
 use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};

@@ -50,7 +50,10 @@ impl TextPort {
             instance,
         };
         let server_process = server_process(service, instance)?;
-        let notifier = services.wake(Channel::WakeServer)?.notifier_builder().create();
+        let notifier = services
+            .wake(Channel::WakeServer)?
+            .notifier_builder()
+            .create();
         let server = notifier.map_err(ipc_error("create a notifier"))?;
         let listener = services.listener(Channel::WakeClient)?;
         let client = service.client_builder().initial_max_slice_len(SLICE);

@@ -63,8 +63,8 @@ pub fn decode(name: &str, bytes: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::control::{Reply, Request, parse};
     use emberwatch_protocol::Model;
+    use emberwatch_protocol::control::{Reply, Request, parse};
     use std::path::Path;
 
     #[test]
