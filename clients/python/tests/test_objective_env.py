@@ -274,6 +274,14 @@ def test_a_copy_plans_by_itself() -> None:
     assert_same(rollout(closed_later(copied), 3, seed=1000), expected)
 
 
+def test_no_thread_starts_before_the_first_reset(checkpoints: Path) -> None:
+    keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
+    before = set(os.listdir("/proc/self/task"))
+    envs = make_vec(2, **keywords)
+    assert set(os.listdir("/proc/self/task")) <= before
+    envs.reset(seed=1000)
+
+
 def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
     keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
     envs = make_vec(2, **keywords)
@@ -382,6 +390,7 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
         ({"estimator": 3}, "estimator: expected the name of one, got 3"),
         ({"prior": None}, "prior: expected the name of one, got None"),
+        ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
         ({"estimator": "neural_belief"}, "checkpoint: expected one of a neural_belief, got none"),
     ],

@@ -3,8 +3,8 @@
 `WildfireObjectiveEnv` makes an environment of it.
 """
 
-from os import PathLike, fspath
-from typing import Final, Literal, TypeAlias, cast
+from os import PathLike
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from emberwatch import _native
 from emberwatch.arguments import told
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.paths import utf8
 from emberwatch.session import Session
 from emberwatch.wire import RobotResult, StepResult, WorldResult
 
@@ -51,12 +52,19 @@ class Plans:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one"
             )
-        for name, given in {"estimator": estimator, "prior": prior}.items():
-            value = cast("object", given)
-            if not isinstance(value, str) and (name == "prior" or value is not None):
-                raise invalid(name, "the name of one", told(value))
+        given: dict[str, object] = {
+            "estimator": estimator,
+            "prior": prior,
+            "checkpoint": checkpoint,
+        }
+        for name, value in given.items():
+            kinds = (str, PathLike) if name == "checkpoint" else str
+            if not isinstance(value, kinds) and (name == "prior" or value is not None):
+                expected = "a path" if name == "checkpoint" else "the name of one"
+                raise invalid(name, expected, told(value))
         self._session = session
-        self._arguments = estimator, None if checkpoint is None else fspath(checkpoint), prior
+        path = None if checkpoint is None else utf8("checkpoint", checkpoint)
+        self._arguments = estimator, path, prior
         #: Of one world.
         self.action_space: Final = spaces.Discrete(len(OBJECTIVES))
         shape = len(OBJECTIVES), len(FEATURES)
