@@ -122,6 +122,20 @@ impl Learned {
         filter.map(LearnedBelief::Filter)
     }
 
+    /// What options are planned on unless it is said: what decisions were learned on, or else the belief that was learned;
+    /// without one the known model's.
+    pub fn estimator(&self) -> EstimatorKind {
+        let decided = self.decisions.as_ref().map(|decisions| decisions.estimator);
+        let learned = [
+            EstimatorKind::LEARNED,
+            EstimatorKind::learned(true),
+            EstimatorKind::Neural,
+        ];
+        let mut learned = learned.into_iter();
+        let found = learned.find(|&kind| self.belief(kind).is_some());
+        decided.or(found).unwrap_or(EstimatorKind::KNOWN)
+    }
+
     /// The policies that act on it: those of beliefs, of the autoencoder, and of decisions.
     pub fn policies(&self, model: &Model) -> Vec<Policy> {
         let mut policies = Policy::all(model);

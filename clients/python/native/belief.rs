@@ -194,17 +194,22 @@ pub fn simulated_prior<'py>(
     let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
     let n_worlds = Prior::N_WORLDS;
     let prior = Prior::Simulated { n_worlds, burn_in };
-    let kept = KeptBelief::new(prior, &model, shape, 0);
-    let belief = match kept.as_ref().and_then(KeptBelief::read) {
-        Some(belief) => belief,
-        None => {
-            let belief = simulated(py, prior, &model, shape)?;
-            // Else it is simulated again.
-            let _ = kept.map(|kept| kept.write(&belief));
-            belief
-        }
-    };
+    let belief = first_belief(py, prior, &model, shape)?;
     Ok(belief.probabilities().to_pyarray(py))
+}
+
+/// The belief before the first frame; one that was simulated is kept for later.
+pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let is_simulated = matches!(prior, Prior::Simulated { .. });
+    let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
+    let kept = kept.flatten();
+    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
+        return Ok(belief);
+    }
+    let belief = simulated(py, prior, model, shape)?;
+    // Else it is simulated again.
+    let _ = kept.map(|kept| kept.write(&belief));
+    Ok(belief)
 }
 
 /// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
