@@ -8,6 +8,7 @@ use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::message::{StepReply, StepRequest};
 use emberwatch_server::config::{Checked, ServerConfig};
 use emberwatch_server::embedded::{Embedded, wait_for};
+use emberwatch_server::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::sync::mpsc::channel;
@@ -72,6 +73,12 @@ pub fn embedded(py: Python<'_>, settings: &str) -> PyResult<Embedded> {
 pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
     let settings = checked(py, settings)?.config;
     Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
+}
+
+/// Identifies the worlds of these settings, which are not simulated.
+#[pyfunction]
+pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
+    Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
 /// Reads files on a thread of its own: one may be a pipe.

@@ -59,6 +59,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<options::Options>()?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
+    module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;

@@ -8,7 +8,6 @@ use crate::model::{model_of, shape_of};
 use crate::owned::Owned;
 use crate::refusal::{failed, invalid};
 use anyhow::{Context, Result, ensure};
-use clap::ValueEnum;
 use emberwatch_agent::acting::options::{Crew, Planned, Shown};
 use emberwatch_agent::client::feed::{Feed, View};
 use emberwatch_agent::config::{AgentConfig, PriorKind};
@@ -135,7 +134,7 @@ impl Options {
         let estimator = estimator.map(str::parse).transpose();
         let estimator: Option<EstimatorKind> =
             estimator.map_err(|problem: String| refused(py, format!("estimator: {problem}")))?;
-        let kind = PriorKind::from_str(prior, false).map_err(|_| {
+        let kind: PriorKind = serde_json::from_value(prior.into()).map_err(|_| {
             let got = format!("'{prior}'");
             invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
         })?;

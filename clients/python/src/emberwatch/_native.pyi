@@ -53,6 +53,9 @@ class _Spec(Protocol):
 def check_settings(settings: str) -> str:
     """All settings that a server with these would have; JSON from JSON."""
 
+def worlds_fingerprint(settings: str) -> str:
+    """The `worlds_fingerprint` of a server with these settings, as JSON; simulates nothing."""
+
 class Server:
     """A connection to a server, or worlds in this process. Threads may share it, in turns."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -17,7 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch import wire
+from emberwatch import _native, wire
 from emberwatch.arguments import as_integer, as_seed, told
 from emberwatch.benchmark.digest import digest
 from emberwatch.benchmark.policies import Actor, Policy, statistics
@@ -25,7 +26,7 @@ from emberwatch.benchmark.report import Progress
 from emberwatch.benchmark.row_file import Mark, RowFile
 from emberwatch.benchmark.rows import Row
 from emberwatch.benchmark.tally import Tally
-from emberwatch.client import Client, embed_flags
+from emberwatch.client import Client
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS
 from emberwatch.model import Model
@@ -276,8 +277,7 @@ def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) 
     """Identifies the worlds, whatever their seed; none is simulated for it."""
     if served is None:
         world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
-        with embed_flags(Settings(**world).server_flags(1)) as client:
-            served = client.info
+        return _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
     if served.worlds_fingerprint is None:
         raise invalid("instance", "a server of this release, for csv", f"one of {served.build}")
     return served.worlds_fingerprint
