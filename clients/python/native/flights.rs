@@ -2,6 +2,7 @@
 
 use crate::airspace::Given;
 use crate::detached::detached;
+use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_protocol::model::{Pays, SeenCell};
@@ -69,6 +70,8 @@ impl Flights {
             let expected = format!("an integer within 1 to {MAX_MOVES}");
             return Err(invalid(py, "n_moves", expected, n_moves));
         }
+        let n_bytes = n_rows.saturating_mul(3 * shape.n_cells() + n_moves);
+        check_memory(py, format_args!("the flights of {n_rows} robots"), n_bytes)?;
         Ok(Self {
             shape,
             airspace: within,

@@ -192,7 +192,8 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
 
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
-        EmberwatchError: With code `"embedded"` if there is too little memory.
+        NotEnoughMemoryError: If they would take more than the machine, a cgroup or a `ulimit` has.
+        EmberwatchError: With code `"threads"` if the system starts none.
     """
     flags = list[str]()
     for name, given in settings.items():
