@@ -237,7 +237,7 @@ fn a_server_refuses_a_land_that_cannot_be() {
     check("--sensor-radius 9", "--sensor-radius");
     check(
         "--task small --sensor-radius 1",
-        "sensor_radius: expected no flag beside a task",
+        "sensor_radius: expected to be left out, as the task decides it",
     );
     let text = std::fs::read_to_string(&model).expect("the model");
     let (head, rest) = text.split_once("no_fly = ").expect("a map");

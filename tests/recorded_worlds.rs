@@ -337,8 +337,6 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     refuse(ladder, no_model);
     let words = "--steps: expected at most 23, as the shortest episode has, got 24";
     refuse("compare --seeds 0..1 --steps 24", words);
-    let words = "has recorded worlds, without a model: expected --model FILE";
-    refuse("serve-decisions", words);
 }
 
 #[test]
@@ -351,7 +349,7 @@ fn settings_that_a_states_file_decides_are_refused_as_flags() {
         ("--burn-in 0", "burn_in"),
         ("--model wildfire", "model"),
     ] {
-        let words = format!("{setting}: expected no flag beside a states file");
+        let words = format!("{setting}: expected to be left out, as the states file decides it");
         check(SERVER, &format!("{states} {flag}"), &words);
     }
     let table = "--states-offset 3 => expected none without a states file

@@ -116,6 +116,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        worlds_fingerprint: None,
         airspace: None,
         zones: None,
         recorded_world: None,

@@ -166,12 +166,12 @@ fn flags_that_a_task_decides_are_refused_by_name() {
     let small = small.expect("the task").replace("moves = 16", "moves = 15");
     std::fs::write(&other, small).expect("write");
     let table =
-        "--task small --height 3 => height: expected no flag beside a task, which decides it, got 3
---task small --model wildfire => model: expected no flag beside a task
---task small --robots 1 => robots: expected no flag beside a task
---task small --max-steps 3 => max_steps: expected no flag beside a task
---task small --start corner => start: expected no flag beside a task
---task jacksboro --states-offset 3 => states_offset: expected no flag beside a task
+        "--task small --height 3 => height: expected to be left out, as the task decides it, got 3
+--task small --model wildfire => model: expected to be left out, as the task decides it
+--task small --robots 1 => robots: expected to be left out, as the task decides it
+--task small --max-steps 3 => max_steps: expected to be left out, as the task decides it
+--task small --start corner => start: expected to be left out, as the task decides it
+--task jacksboro --states-offset 3 => states_offset: expected to be left out, as the task decides it
 --task ash => task ash: No such file | expected one, or wildfire, small
 --task= => task : expected a name or a file, got \"\"
 --task FILE => missing field `moves`

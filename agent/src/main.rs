@@ -1,5 +1,4 @@
-//! `emberwatch-agent`: acts on a server's world, for itself or for a learner outside, or
-//! compares ways to act.
+//! `emberwatch-agent`: acts on a server's world, or compares ways to act.
 
 mod commands;
 
@@ -25,8 +24,6 @@ enum Command {
     /// Act on one world of a running server
     #[command(after_long_help = commands::policies())]
     Run(commands::RunCommand),
-    /// Take decisions for one world from a learner outside, and do the rest
-    ServeDecisions(commands::ServeDecisionsCommand),
     /// Write a filter's first belief to a file
     Prior(commands::PriorCommand),
     /// Compare policies on the same worlds: table, CSV and figures
@@ -53,7 +50,6 @@ fn main() -> ExitCode {
     }
     let result = match &command {
         Command::Run(command) => command.run(),
-        Command::ServeDecisions(command) => command.run(),
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
         Command::Suite(command) => command.run(),

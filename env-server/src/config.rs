@@ -1,25 +1,21 @@
 //! The server's settings and their checks.
 
+use crate::bounds::BOUNDS;
 use crate::states_file::{StatesError, StatesFile};
 use crate::world::{Reach, Recorded};
-use emberwatch_protocol::channels::{
-    ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
-};
+use emberwatch_protocol::channels::{ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_TEAM_CELLS};
 use emberwatch_protocol::control::CoverageRule;
 use emberwatch_protocol::grid::ShapeError;
-use emberwatch_protocol::model::{MAX_RADIUS, ModelError};
-use emberwatch_protocol::path::MAX_MOVES;
+use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::program::read_text;
 use emberwatch_protocol::task::{Start, Task, TaskError};
 use emberwatch_protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Number, Value};
 use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 use thiserror::Error;
-
-/// Most worlds of one server.
-const MAX_WORLDS: u32 = 1024;
 
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";
@@ -97,6 +93,13 @@ pub enum ConfigError {
     #[error("{setting}: expected {expected}, got {got}")]
     Range {
         setting: &'static str,
+        expected: String,
+        got: String,
+    },
+    /// A setting given by name that is impossible.
+    #[error("{setting}: expected {expected}, got {got}")]
+    Given {
+        setting: String,
         expected: String,
         got: String,
     },
@@ -209,20 +212,16 @@ impl ServerConfig {
     }
 
     fn check_ranges(&self) -> Result<(), ConfigError> {
-        in_range("worlds", u64::from(self.worlds), 1, u64::from(MAX_WORLDS))?;
-        in_range("moves", self.moves as u64, 1, MAX_MOVES as u64)?;
-        if !(-1..=MAX_RADIUS as i64).contains(&self.sensor_radius) {
-            return Err(ConfigError::Range {
-                setting: "sensor_radius",
-                expected: format!("-1 to {MAX_RADIUS}"),
-                got: self.sensor_radius.to_string(),
-            });
+        let settings = self.values();
+        // Recorded states decide height and width later; `Shape` checks both.
+        let bounds = BOUNDS
+            .iter()
+            .filter(|(it, ..)| !["height", "width"].contains(it));
+        for &(setting, least, most) in bounds {
+            let number = settings[setting].as_number().and_then(Number::as_i128);
+            let number = number.expect("invariant: bounds are those of integers");
+            in_range(setting, number, least, most)?;
         }
-        in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
-        in_range("threads", self.threads as u64, 0, 256)?;
-        in_range("burn_in", self.burn_in, 0, 1 << 40)?;
-        in_range("history", self.history.into(), 1, 1_000_000)?;
-        in_range("snapshot_keep", self.snapshot_keep.into(), 1, 1_000_000)?;
         let needs = |setting, expected: &str, got| {
             let expected = expected.into();
             Err(ConfigError::Range {
@@ -244,13 +243,19 @@ impl ServerConfig {
     }
 
     fn check_robots(&self, shape: Shape) -> Result<(), ConfigError> {
-        in_range("robots", self.robots.into(), 1, MAX_ROBOTS as u64)?;
-        in_range("deadline_millis", self.deadline_millis, 0, 86_400_000)?;
-        let (n_robots, n_cells) = (self.robots as u64, shape.n_cells() as u64);
-        let n_all = u64::from(self.worlds) * n_robots;
-        in_range("worlds times robots", n_all, 1, MAX_ROBOT_NUMBERS as u64)?;
-        let most = MAX_TEAM_CELLS as u64;
+        let (n_robots, n_cells) = (i128::from(self.robots), shape.n_cells() as i128);
+        let n_all = i128::from(self.worlds) * n_robots;
+        in_range("worlds times robots", n_all, 1, MAX_ROBOT_NUMBERS as i128)?;
+        let most = MAX_TEAM_CELLS as i128;
         in_range("cells times robots", n_cells * n_robots, 1, most)
+    }
+
+    /// The settings by name.
+    pub fn values(&self) -> Map<String, Value> {
+        match serde_json::to_value(self) {
+            Ok(Value::Object(values)) => values,
+            _ => unreachable!("invariant: settings serialise"),
+        }
     }
 
     /// The settings of a TOML file.
@@ -289,7 +294,7 @@ impl ServerConfig {
         let path = Path::new(&self.model);
         Model::read(path).map_err(|error| match error {
             // The name may be mistyped.
-            ModelError::File { path: of, problem } if Path::new(&of) == path => {
+            ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
                 let names: Vec<&str> = Model::built_in_names().collect();
                 let problem = format!("{problem}: expected one, or {}", names.join(", "));
                 file_error("model file", path, problem)
@@ -307,7 +312,7 @@ fn file_error(what: &'static str, path: &Path, problem: impl Display) -> ConfigE
     }
 }
 
-fn in_range(setting: &'static str, got: u64, least: u64, most: u64) -> Result<(), ConfigError> {
+fn in_range(setting: &'static str, got: i128, least: i128, most: i128) -> Result<(), ConfigError> {
     if (least..=most).contains(&got) {
         return Ok(());
     }

@@ -191,7 +191,6 @@ impl Embedded {
     fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
-                who: "server",
                 instance: INSTANCE.into(),
             });
         }

@@ -1,17 +1,19 @@
 //! The server's settings as flags.
 
 use crate::config::{ConfigError, ServerConfig};
+use crate::given::start_of;
 use clap::{Args, ValueEnum};
-use emberwatch_protocol::Cell;
-use emberwatch_protocol::control::CoverageRule;
-use emberwatch_protocol::task::{Start, Task};
+use emberwatch_protocol::task::Start;
+use serde::Serialize;
+use serde_json::Value;
 use std::path::PathBuf;
 
 /// The settings of [`ServerConfig`] as flags; each overrides the file.
-#[derive(Debug, Default, Args)]
+#[derive(Debug, Default, Args, Serialize)]
 pub struct ServerFlags {
     /// Read settings from this TOML file
     #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
     pub config: Option<PathBuf>,
     /// Name under which clients find this server [default: default]
     #[arg(long)]
@@ -25,6 +27,7 @@ pub struct ServerFlags {
     /// How long a world waits for the paths of its other held robots from the first path on, in milliseconds, 0 for
     /// no deadline [default: 0]
     #[arg(long, value_name = "MILLIS")]
+    #[serde(rename = "deadline_millis")]
     pub deadline_ms: Option<u64>,
     /// Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes:
     /// `wildfire`, `small`, `sparse`, `latent`, `burnout`, `terrain`, `road-ice`, `team`, `jacksboro` or the path of a
@@ -70,7 +73,7 @@ pub struct ServerFlags {
     #[arg(long)]
     pub coverage: Option<CoverageFlag>,
     /// The robots' first cells: corner (each in another), centre, random or ROW,COL [default: corner]
-    #[arg(long, value_parser = parse_start)]
+    #[arg(long, value_parser = start_of)]
     pub start: Option<Start>,
     /// Publish the hidden states, for evaluation and pictures
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
@@ -101,8 +104,9 @@ pub struct ServerFlags {
     pub snapshot_keep: Option<u32>,
 }
 
-/// [`CoverageRule`] as a flag.
-#[derive(Debug, Clone, Copy, ValueEnum)]
+/// [`CoverageRule`](emberwatch_protocol::control::CoverageRule) as a flag.
+#[derive(Debug, Clone, Copy, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum CoverageFlag {
     /// The cells on the path
     Path,
@@ -115,131 +119,23 @@ pub enum CoverageFlag {
 impl ServerFlags {
     /// The effective settings.
     pub fn effective(&self) -> Result<ServerConfig, ConfigError> {
-        let mut config = match &self.config {
+        let config = match &self.config {
             None => ServerConfig::default(),
             Some(path) => ServerConfig::read(path)?,
         };
-        fn set<T: Clone>(setting: &mut T, flag: &Option<T>) {
-            if let Some(value) = flag {
-                *setting = value.clone();
-            }
-        }
-        set(&mut config.instance, &self.instance);
-        set(&mut config.worlds, &self.worlds);
-        set(&mut config.robots, &self.robots);
-        set(&mut config.deadline_millis, &self.deadline_ms);
-        set(&mut config.task, &self.task);
-        set(&mut config.model, &self.model);
-        set(
-            &mut config.sensor_radius,
-            &self.sensor_radius.map(i64::from),
-        );
-        set(&mut config.states, &self.states);
-        set(&mut config.states_symmetries, &self.states_symmetries);
-        set(&mut config.states_offset, &self.states_offset);
-        if self.task.as_deref() == Some("") {
-            Task::named("")?;
-        }
-        if !config.task.is_empty() {
-            self.check_beside("a task", &[])?;
-        } else if !config.states.is_empty() {
-            let left = [
-                "states",
-                "sensor_radius",
-                "states_symmetries",
-                "states_offset",
-                "moves",
-                "robots",
-                "max_steps",
-                "start",
-            ];
-            self.check_beside("a states file", &left)?;
-        }
-        set(&mut config.height, &self.height);
-        set(&mut config.width, &self.width);
-        set(&mut config.moves, &self.moves);
-        set(&mut config.seed, &self.seed);
-        set(&mut config.burn_in, &self.burn_in);
-        set(&mut config.max_steps, &self.max_steps);
-        set(&mut config.coverage, &self.coverage.map(CoverageRule::from));
-        set(&mut config.start, &self.start);
-        set(&mut config.publish_truth, &self.publish_truth);
-        set(&mut config.reveal_model, &self.reveal_model);
-        set(&mut config.lease_millis, &self.lease_millis);
-        set(&mut config.threads, &self.threads);
-        set(&mut config.history, &self.history);
-        set(&mut config.restore, &self.restore);
-        set(&mut config.snapshot_every, &self.snapshot_every);
-        set(&mut config.snapshot_dir, &self.snapshot_dir);
-        set(&mut config.snapshot_keep, &self.snapshot_keep);
-        Ok(config)
-    }
-
-    /// Refuses flags for what a task or recorded states decide; the settings in `left` are left to flags.
-    fn check_beside(&self, what: &str, left: &[&str]) -> Result<(), ConfigError> {
-        let text = |value: Option<u64>| value.map(|it| it.to_string());
-        let of_worlds = [
-            ("model", self.model.clone()),
-            ("sensor_radius", text(self.sensor_radius.map(u64::from))),
-            ("states", self.states.clone()),
-            (
-                "states_symmetries",
-                self.states_symmetries.map(|it| it.to_string()),
-            ),
-            ("states_offset", text(self.states_offset)),
-            ("height", text(self.height.map(|it| it as u64))),
-            ("width", text(self.width.map(|it| it as u64))),
-            ("moves", text(self.moves.map(|it| it as u64))),
-            ("robots", text(self.robots.map(u64::from))),
-            ("burn_in", text(self.burn_in)),
-            ("max_steps", text(self.max_steps)),
-            (
-                "start",
-                self.start.map(|it| format!("{it:?}").to_lowercase()),
-            ),
-        ];
-        for (setting, got) in of_worlds {
-            if let Some(got) = got.filter(|_| !left.contains(&setting)) {
-                let expected = format!("no flag beside {what}, which decides it");
-                return Err(ConfigError::Range {
-                    setting,
-                    expected,
-                    got,
-                });
-            }
-        }
-        Ok(())
-    }
-}
-
-fn parse_start(text: &str) -> Result<Start, String> {
-    match text {
-        "corner" => Ok(Start::Corner),
-        "centre" => Ok(Start::Centre),
-        "random" => Ok(Start::Random),
-        cell => {
-            let parsed = cell
-                .split_once(',')
-                .and_then(|(row, col)| Some((row.trim().parse().ok()?, col.trim().parse().ok()?)));
-            let (row, col) = parsed.ok_or("expected corner, centre, random or ROW,COL")?;
-            Ok(Start::At(Cell { row, col }))
-        }
-    }
-}
-
-impl From<CoverageFlag> for CoverageRule {
-    fn from(flag: CoverageFlag) -> Self {
-        match flag {
-            CoverageFlag::Path => Self::Path,
-            CoverageFlag::Full => Self::Full,
-            CoverageFlag::Client => Self::Client,
-        }
+        let mut given = match serde_json::to_value(self) {
+            Ok(Value::Object(given)) => given,
+            _ => unreachable!("invariant: flags serialise"),
+        };
+        given.retain(|_, value| !value.is_null());
+        config.with(&given)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use emberwatch_protocol::Cell;
 
     #[test]
     fn flags_override_the_file_and_the_file_the_defaults() {

@@ -6,9 +6,11 @@
 
 #![allow(missing_docs, reason = "a program, which tests use as a library")]
 
+pub mod bounds;
 pub mod config;
 pub mod embedded;
 pub mod flags;
+pub mod given;
 pub mod limits;
 pub mod recording;
 pub mod server;

@@ -137,6 +137,9 @@ impl Task {
     fn read(path: &Path) -> Result<Self, String> {
         check_kind(path)?;
         let text = read_text(path).map_err(|error| {
+            if path.exists() {
+                return error.to_string();
+            }
             let names: Vec<&str> = Self::built_in_names().collect();
             format!("{error}: expected one, or {}", names.join(", "))
         })?;

@@ -28,6 +28,7 @@ fn server(height: usize, width: usize, n_moves: usize) -> Event {
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        worlds_fingerprint: None,
         airspace: None,
         zones: None,
         recorded_world: None,

@@ -1,8 +1,9 @@
 //! What a learner keeps between runs, in one safetensors file: weights and the optimiser's moments as tensors by
 //! name, everything else as one value that bincode encodes, the tensor of bytes `state`.
 //!
-//! Written beside the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
-//! which learner and which format it is of, and a digest tells damage that keeps its form.
+//! Written next to the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
+//! which learner and which format it is of, and a digest tells damage that keeps its form. Equal contents are equal bytes,
+//! so trainings can be compared by a hash of their checkpoints.
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
@@ -29,7 +30,7 @@ const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 
 /// Changes with what any state holds.
-const VERSION: &str = "4";
+const VERSION: &str = "5";
 
 /// The tensor of bytes.
 const STATE: &str = "state";
@@ -142,7 +143,7 @@ impl Contents {
     }
 
     /// Against damage, not malice.
-    fn digest(&self) -> String {
+    pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
             digest.update(format!("{name} {shape:?} ").as_bytes());
@@ -233,9 +234,21 @@ pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>> {
         (SETTINGS, &contents.settings),
     ];
     let texts = texts.map(|(name, text)| (name.into(), text.into()));
-    let bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    let mut bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    sort_header(&mut bytes);
     check_size(bytes.len() as u64)?;
     Ok(bytes)
+}
+
+/// Sorts the header by name: safetensors writes its texts in the random order of a hash map. The length stays the same.
+fn sort_header(file: &mut [u8]) {
+    type Header = BTreeMap<String, BTreeMap<String, serde_json::Value>>;
+    const WRITTEN: &str = "invariant: safetensors wrote a header of its length";
+    let (length, rest) = file.split_first_chunk_mut().expect(WRITTEN);
+    let header = &mut rest[..u64::from_le_bytes(*length) as usize];
+    let sorted: Header = serde_json::from_slice(header).expect(WRITTEN);
+    let sorted = serde_json::to_vec(&sorted).expect(WRITTEN);
+    header[..sorted.len()].copy_from_slice(&sorted);
 }
 
 /// The checkpoint of one of some kinds that bytes are, and which.
@@ -357,7 +370,26 @@ mod tests {
         let mode = path.metadata().expect("the file").permissions().mode();
         assert_eq!(mode & 0o777, 0o600);
         let files = std::fs::read_dir(folder.path()).expect("the folder");
-        assert_eq!(files.count(), 1, "nothing left beside it");
+        assert_eq!(files.count(), 1, "nothing left next to it");
+    }
+
+    #[test]
+    fn equal_contents_are_equal_bytes() {
+        let mut other = contents();
+        let kernel = other.tensors.remove("kernel").expect("a tensor");
+        other
+            .tensors
+            .insert("bias \"\u{e9}\n".into(), kernel.clone());
+        other.tensors.insert("kernel".into(), kernel);
+        for contents in [contents(), other] {
+            let first = encode("tests", &contents).expect("small");
+            let (_, read) = decode(&["tests"], &first).expect("whole");
+            assert_eq!(read, contents);
+            // Each map has its own order: of 24, ten in a row would hardly be the same.
+            for _ in 0..10 {
+                assert!(encode("tests", &contents).expect("small") == first);
+            }
+        }
     }
 
     #[test]
@@ -399,9 +431,9 @@ mod tests {
         };
         let words = "expected a checkpoint of others, got one of tests";
         assert_eq!(refused("others", "kernel", "kernel"), words);
-        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"4""#, "none")] {
-            let words = format!("emberwatch.format: expected 4, got {got}");
-            assert_eq!(refused("tests", r#"format":"4""#, to), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"5""#, "none")] {
+            let words = format!("emberwatch.format: expected 5, got {got}");
+            assert_eq!(refused("tests", r#"format":"5""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();

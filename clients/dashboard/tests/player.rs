@@ -26,6 +26,7 @@ fn damaged() -> Vec<u8> {
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
         task: None,
+        worlds_fingerprint: None,
         airspace: None,
         zones: None,
         recorded_world: None,

@@ -2,16 +2,15 @@
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
-use clap::{Args, Command, FromArgMatches};
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::message::{StepReply, StepRequest};
 use emberwatch_server::config::{Checked, ServerConfig};
 use emberwatch_server::embedded::{Embedded, wait_for};
-use emberwatch_server::flags::ServerFlags;
+use emberwatch_server::snapshot::Settings;
 use pyo3::prelude::*;
-use std::ffi::OsString;
+use serde_json::{Map, Value};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
@@ -55,9 +54,9 @@ impl Backend {
     }
 }
 
-/// Worlds in this process, with the flags of `emberwatch-server`.
-pub fn embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Embedded> {
-    let checked = checked(py, flags)?;
+/// Worlds in this process, of these settings of `config/server.toml`, as JSON.
+pub fn embedded(py: Python<'_>, settings: &str) -> PyResult<Embedded> {
+    let checked = checked(py, settings)?;
     check_embeddable(py, &checked.config)?;
     let worlds = py.detach(|| Embedded::new(checked));
     worlds.map_err(|error| match error.downcast_ref() {
@@ -69,36 +68,39 @@ pub fn embedded(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Embedded> {
     })
 }
 
-/// The settings that a server with these flags would have, as TOML.
+/// All settings that a server with these would have; JSON from JSON.
 #[pyfunction]
-pub fn check_settings(py: Python<'_>, flags: Vec<OsString>) -> PyResult<String> {
-    let settings = checked(py, flags)?.config;
-    Ok(toml::to_string(&settings).expect("invariant: settings serialise"))
+pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
+    let settings = checked(py, settings)?.config;
+    Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
+}
+
+/// Identifies the worlds of these settings, which are not simulated.
+#[pyfunction]
+pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
+    Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
 /// Reads files on a thread of its own: one may be a pipe.
-fn checked(py: Python<'_>, flags: Vec<OsString>) -> PyResult<Checked> {
+fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
+    let given: Map<String, Value> =
+        serde_json::from_str(settings).map_err(|error| refused(py, &error.to_string()))?;
     let (sender, receiver) = channel();
     let read = move || {
-        let command = Command::new("emberwatch-server").no_binary_name(true);
-        let matches = ServerFlags::augment_args(command).try_get_matches_from(flags)?;
-        let settings = ServerFlags::from_arg_matches(&matches)?.effective();
-        Ok::<_, clap::Error>(settings.and_then(ServerConfig::check))
+        let settings = ServerConfig::default().with(&given);
+        settings.and_then(ServerConfig::check)
     };
     let reader = spawn("settings", move || drop(sender.send(read())));
     reader.map_err(|short| no_threads(py, &short))?;
     let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
     let checked = py.detach(wait);
-    match checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))? {
-        Ok(Ok(checked)) => {
-            for closed_in in &checked.reach.closed_in {
-                warn(py, closed_in)?;
-            }
-            Ok(checked)
-        }
-        Ok(Err(problem)) => Err(refused(py, &problem.to_string())),
-        Err(problem) => Err(refused(py, &problem.to_string())),
+    let checked =
+        checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?;
+    let checked = checked.map_err(|problem| refused(py, &problem.to_string()))?;
+    for closed_in in &checked.reach.closed_in {
+        warn(py, closed_in)?;
     }
+    Ok(checked)
 }
 
 /// Refuses settings that only a server can have.
@@ -119,14 +121,11 @@ fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
         .zip(usual)
         .find(|(one, other)| one != other);
     wrong.map_or(Ok(()), |((setting, got), _)| {
-        let expected = "expected none, as embedded worlds have no server";
+        let expected = "expected to be left out, as worlds in this process have no server";
         Err(refused(py, &format!("{setting}: {expected}, got {got}")))
     })
 }
 
 fn refused(py: Python<'_>, problem: &str) -> PyErr {
-    // Without the hint at flags of commands.
-    let problem = problem.split("\n\nFor more information").next();
-    let problem = problem.unwrap_or_default().trim_start_matches("error: ");
     crate::errors::error(py, "InvalidArgumentError", (problem.trim(),))
 }

@@ -18,17 +18,23 @@ use numpy::{
 use pyo3::prelude::*;
 use rayon::ThreadPoolBuilder;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, TryLockError};
 use std::time::Duration;
 
 /// How often a long computation looks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// The operator `Phi` of one model on one grid, with its work space.
-#[pyclass(module = "emberwatch._native")]
+/// The operator `Phi` of one model on one grid. Threads cannot share it.
+#[pyclass(frozen, module = "emberwatch._native")]
 pub struct Transition {
     /// The model file's text.
     model: String,
     shape: Shape,
+    work: Mutex<Work>,
+}
+
+/// What one application at a time needs.
+struct Work {
     /// Or the error that `apply` raises: that eq. 3 could divide by zero.
     operator: Result<transition::Transition<f64>, ModelError>,
     belief: Array3<f64>,
@@ -44,30 +50,43 @@ impl Transition {
         let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
         check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
-        Ok(Self {
+        let work = Work {
             operator: transition::Transition::new(&parameters, shape),
             belief: none.clone(),
             predictor: none,
+        };
+        Ok(Self {
             model,
             shape,
+            work: Mutex::new(work),
         })
     }
 
     /// `Phi` of beliefs, a new array of their shape.
     fn apply<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         beliefs: &Bound<'py, PyArray4<f64>>,
     ) -> PyResult<Bound<'py, PyArray4<f64>>> {
-        let operator = self
-            .operator
-            .as_mut()
-            .map_err(|error| vanishing(py, error))?;
+        let mut work = match self.work.try_lock() {
+            Ok(work) => work,
+            Err(TryLockError::Poisoned(left)) => left.into_inner(),
+            Err(TryLockError::WouldBlock) => {
+                let expected = "a transition or filter for each thread";
+                return Err(invalid(py, "transition", expected, "one in use by another"));
+            }
+        };
+        let Work {
+            operator,
+            belief,
+            predictor,
+        } = &mut *work;
+        let operator = operator.as_mut().map_err(|error| vanishing(py, error))?;
         let beliefs = beliefs.try_readonly();
         let expected = "an array that no other thread corrects";
         let beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, "one in use"))?;
         let beliefs = beliefs.as_array();
-        let (n_states, height, width) = self.belief.dim();
+        let (n_states, height, width) = belief.dim();
         let (_, n_worlds, _, _) = beliefs.dim();
         if beliefs.dim() != (n_states, n_worlds, height, width) {
             let expected = format!("shape ({n_states}, n, {height}, {width})");
@@ -81,7 +100,6 @@ impl Transition {
         let probe = with_capacity::<f64>("predicted beliefs", beliefs.len());
         probe.map_err(|short| no_memory(py, &short))?;
         let mut out = Array4::zeros(beliefs.dim());
-        let (belief, predictor) = (&mut self.belief, &mut self.predictor);
         detached(py, beliefs.len(), || {
             let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
             for (world, mut next) in worlds {
@@ -182,17 +200,22 @@ pub fn simulated_prior<'py>(
     let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
     let n_worlds = Prior::N_WORLDS;
     let prior = Prior::Simulated { n_worlds, burn_in };
-    let kept = KeptBelief::new(prior, &model, shape, 0);
-    let belief = match kept.as_ref().and_then(KeptBelief::read) {
-        Some(belief) => belief,
-        None => {
-            let belief = simulated(py, prior, &model, shape)?;
-            // Else it is simulated again.
-            let _ = kept.map(|kept| kept.write(&belief));
-            belief
-        }
-    };
+    let belief = first_belief(py, prior, &model, shape)?;
     Ok(belief.probabilities().to_pyarray(py))
+}
+
+/// The belief before the first frame; one that was simulated is kept for later.
+pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let is_simulated = matches!(prior, Prior::Simulated { .. });
+    let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
+    let kept = kept.flatten();
+    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
+        return Ok(belief);
+    }
+    let belief = simulated(py, prior, model, shape)?;
+    // Else it is simulated again.
+    let _ = kept.map(|kept| kept.write(&belief));
+    Ok(belief)
 }
 
 /// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.

@@ -76,8 +76,8 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
             let text = format!("{what} did not end within {seconds:?} s");
             error(py, "RequestTimeoutError", (text,))
         }
-        ConnectionError::ServerGone { who, instance } => {
-            let text = format!("the {who} on instance '{instance}' is gone");
+        ConnectionError::ServerGone { instance } => {
+            let text = format!("the server on instance '{instance}' is gone");
             error(py, "ServerGoneError", (text,))
         }
         ConnectionError::Timeout { instance, .. } => {
@@ -110,7 +110,6 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
             let text = format!("no server on instance '{instance}': {remedy}");
             error(py, "NoServerError", (text,))
         }
-        ChannelError::NoAgent { .. } => error(py, "NoServerError", (text,)),
         ChannelError::OtherVersion { version } => {
             error(py, "EmberwatchError", (text, "version_mismatch", version))
         }

@@ -1,7 +1,6 @@
 //! Paths flown move by move by many robots, in rows: where they are, what they have visited.
 
 use crate::airspace::Given;
-use crate::detached::detached;
 use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
@@ -27,6 +26,8 @@ type Arguments = (
 );
 
 /// The present path of each robot, as far as it is flown.
+///
+/// No method leaves the interpreter to other threads: one that reads meanwhile would find it borrowed.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
@@ -117,8 +118,7 @@ impl Flights {
     #[getter]
     fn visited<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let (height, width) = self.shape.dim();
-        let visited = detached(py, self.visited.len(), || self.visited.clone());
-        PyArray1::from_vec(py, visited).reshape([self.cells.len(), height, width])
+        PyArray1::from_slice(py, &self.visited).reshape([self.cells.len(), height, width])
     }
 
     /// What the moves have been paid.
@@ -127,14 +127,16 @@ impl Flights {
         PyArray1::from_slice(py, &self.paid)
     }
 
-    /// Whether each move takes a robot to another cell, `[n_rows, 4]`; all of them, where none does.
+    /// 1 for each move that takes a robot to another cell, else 0, `[n_rows, 4]`; all 1 where no move does.
     #[getter]
-    fn masks<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<bool>>> {
-        let of_robot = |&cell: &Cell| {
-            let is_stuck = !self.airspace.has_way_out(cell);
-            Move::ALL.map(|step| is_stuck || self.airspace.after(step, cell) != cell)
-        };
-        PyArray1::from_iter(py, self.cells.iter().flat_map(of_robot)).reshape([self.cells.len(), 4])
+    fn masks<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i8>>> {
+        let mut masks = Vec::with_capacity(self.cells.len() * Move::ALL.len());
+        for &cell in &self.cells {
+            let leads_on = Move::ALL.map(|step| self.airspace.after(step, cell) != cell);
+            let is_stuck = leads_on == [false; Move::ALL.len()];
+            masks.extend(leads_on.map(|leads| i8::from(leads || is_stuck)));
+        }
+        PyArray1::from_vec(py, masks).reshape([self.cells.len(), Move::ALL.len()])
     }
 
     /// Begins some paths; `robots` and hidden `states` are those of all rows.
@@ -166,7 +168,7 @@ impl Flights {
             self.n_made[row] = 0;
             self.paid[row] = 0.0;
         }
-        detached(py, self.visited.len(), || self.enter(begun, states));
+        self.enter(begun, states);
         Ok(())
     }
 

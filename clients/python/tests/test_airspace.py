@@ -16,7 +16,6 @@ from environments import (
     LIVELY,
     MOVES,
     RECORDED,
-    SMALL,
     WILDFIRE,
     actions,
     assert_same,
@@ -26,7 +25,7 @@ from environments import (
     rollout,
     serving,
 )
-from failures import fails, refuses
+from failures import refuses
 from gymnasium.utils.env_checker import check_env
 from processes import server
 
@@ -41,7 +40,10 @@ from emberwatch.prior import simulated_prior
 
 SHAPE = (7, 5)
 BACKENDS = ("server", "embedded")
-ALL_MOVES = ("frame", "robot", "age", "belief", "local", "recent", "visited", "move")
+ALL_MOVES = (
+    *("frame", "robot", "age", "belief", "local", "recent", "visited", "move"),
+    "action_mask",
+)
 
 
 @pytest.fixture
@@ -179,55 +181,11 @@ def test_action_masks_are_those_of_a_loop(no_fly: Any) -> None:
     flights.begin(np.ones(len(cells), bool), np.array(cells), None)
     nowhere = np.zeros(SHAPE, bool) if no_fly is None else no_fly
     expected = [land.legal_moves((at[0], at[1]), nowhere) for at in cells]
-    assert flights.masks.tolist() == expected and flights.masks.dtype == np.bool_
+    assert flights.masks.tolist() == expected and flights.masks.dtype == np.int8
     assert not all(map(any, expected)) or no_fly is None or [True] * 4 in expected
     again = pickle.loads(pickle.dumps(flights))
     again.begin(np.ones(len(cells), bool), np.array(cells), None)
     assert again.masks.tolist() == expected
-
-
-def test_every_environment_of_moves_has_action_masks(seeing: Any) -> None:
-    keywords = {**seeing(), "start": "0,2", "backend": "embedded"}
-    expected = land.legal_moves((0, 2), land.NO_FLY)
-    assert expected == [False, True, True, False]
-    env = make(MOVES, **keywords)
-    with fails("closed"):
-        env.unwrapped.action_masks()
-    env.reset(seed=1)
-    masks = env.get_wrapper_attr("action_masks")()
-    assert masks.dtype == np.bool_ and masks.shape == (4,) and masks.tolist() == expected
-    assert env.action_space.sample(mask=masks.astype(np.int8)) not in (0, 3)
-    vector = make_vec(3, MOVES, **keywords)
-    vector.reset(seed=1)
-    assert vector.unwrapped.action_masks().tolist() == [expected] * 3
-    vector.step(np.array([0, 1, 2]))
-    robots = [(0, 2), (1, 2), (0, 1)]
-    assert vector.unwrapped.action_masks().tolist() == [
-        land.legal_moves(robot, land.NO_FLY) for robot in robots
-    ]
-    team = closed_later(emberwatch.parallel_env(**{**SMALL, **keywords}))
-    team.reset(seed=1)
-    assert {agent: mask.tolist() for agent, mask in team.action_masks().items()} == {
-        "robot_0": expected,
-        "robot_1": expected,
-    }
-    team = closed_later(emberwatch.parallel_env(action="path", **{**SMALL, **keywords}))
-    with refuses("action_masks: expected an environment of action='move'"):
-        team.action_masks()
-    assert not hasattr(make(**keywords).unwrapped, "action_masks")
-
-
-def test_masked_learners_take_it(seeing: Any) -> None:
-    contrib = pytest.importorskip("sb3_contrib")
-    from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
-
-    from emberwatch.sb3 import make_vec_env
-
-    env = make_vec_env(MOVES, 2, **{**SMALL, **seeing(), "observation": "robot"})
-    assert is_masking_supported(env)
-    env.reset()
-    assert get_action_masks(env).shape == (2, 4)
-    contrib.MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=4).learn(32)
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])

@@ -430,11 +430,20 @@ def test_it_says_what_came_out(
     assert words in capsys.readouterr().out
 
 
-def test_the_page_has_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "begin", "end"),
+    [
+        ([], "## Options", "## Time and grid"),
+        (["land"], "## Model files with zones", "## What policies find"),
+    ],
+)
+def test_the_page_has_the_flags_of_the_help(
+    words: list[str], begin: str, end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        main(["--help"])
+        main([*words, "--help"])
     page = (ROOT / "docs" / "landscapes.md").read_text("utf-8")
-    options = page[page.index("## Options") : page.index("## Time and grid")]
+    options = page[page.index(begin) : page.index(end)]
     in_help = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
     in_page = {
         flag

@@ -23,6 +23,7 @@ BURNOUT = tomllib.loads((CONFIG / "models/wildfire-burnout.toml").read_text("utf
 SIDE, CORNER = (0.04 + 0.10 + 0.02 + 0.04) / 4, (0.06 + 0.02 + 0.06 + 0.02) / 4
 #: Metres: on cells of 30 m, 10 degrees up to the east.
 EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
+SLOPE = "10 degrees up to the east, aspect W"
 WIND = ("--wind-speed", 5, "--wind-towards", 20)
 
 
@@ -82,9 +83,11 @@ def test_fire_climbs_and_follows_the_wind() -> None:
 
 def test_the_gradient_points_up_in_metres_per_metre() -> None:
     north = np.arange(4)[::-1, np.newaxis] * 3.0
-    east, up = gradient(north + np.arange(5) * 6.0, 30)
+    east, up = gradient(north + np.arange(5) * 6.0, 30, 30)
     np.testing.assert_allclose(east, 0.2)
     np.testing.assert_allclose(up, 0.1)
+    east, up = gradient(north + np.arange(5) * 6.0, 15, 30)
+    np.testing.assert_allclose((east, up), (np.full((4, 5), 0.4), np.full((4, 5), 0.1)))
 
 
 def test_each_cell_is_in_the_zone_of_its_slope_and_aspect() -> None:
@@ -92,11 +95,13 @@ def test_each_cell_is_in_the_zone_of_its_slope_and_aspect() -> None:
     rise = rng.normal(0, 0.2, (2, 9, 11))
     cells, found = zones(rise, None, shape=(9, 11), step=5)
     names = "east north-east north north-west west south-west south south-east".split()
+    aspects = "W SW S SE E NE N NW".split()  # downhill
     for row, col in np.ndindex(9, 11):
         east, north = rise[:, row, col]
         degrees = 5 * round(math.degrees(math.atan(math.hypot(east, north))) / 5)
         angle = math.degrees(math.atan2(north, east))
-        name = f"{degrees} degrees up to the {names[round(angle / 45) % 8]}"
+        eighths = round(angle / 45) % 8
+        name = f"{degrees} degrees up to the {names[eighths]}, aspect {aspects[eighths]}"
         assert found[cells[row, col]].name == (name if degrees else "flat")
     assert cells.dtype == np.uint8 and set(cells.flat) == set(range(len(found)))
     assert len({zone.name for zone in found}) == len(found)
@@ -106,7 +111,7 @@ def test_each_cell_is_in_the_zone_of_its_slope_and_aspect() -> None:
 
 def test_a_slope_is_one_zone_with_the_factors_on_burning_neighbours(tmp_path: Path) -> None:
     model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), *WIND)
-    assert [zone["name"] for zone in model["zones"]] == ["10 degrees up to the east"]
+    assert [zone["name"] for zone in model["zones"]] == [SLOPE]
     assert model["name"] == "land" and model["zone_map"] == np.zeros((4, 5)).tolist()
     name, rise = model["zones"][0]["name"], math.tan(math.radians(10))
     got = spread(model, name)
@@ -139,7 +144,6 @@ def test_elevation_is_the_same_from_each_format(tmp_path: Path) -> None:
         (netcdf(tmp_path / "a.nc", z=EASTWARD, unit="m"),),
         (netcdf(tmp_path / "b.nc", z=EASTWARD, y2=EASTWARD, unit="m"), "--variable", "z"),
         (array(tmp_path / "a.npy", EASTWARD), "--cell", 30),
-        (geotiff(tmp_path / "km.tif", EASTWARD, crs="EPSG:2263", cell=(98.425, 98.425)),),
     ]
     first, *others = (made(tmp_path, *flags) for flags in files)
     for other in others:
@@ -169,12 +173,13 @@ def test_zones_of_a_raster_have_the_base_s_kernels(tmp_path: Path) -> None:
 
 
 def test_slopes_divide_zones_but_of_what_never_burns(tmp_path: Path) -> None:
+    steep = "zone 1, 60 degrees up to the east, aspect W"
     step = np.where(np.arange(6) < 3, 0.0, 100.0) * np.ones((2, 1))
     values = array(tmp_path / "z.npy", [[1] * 6, [2] * 6])
     dem = geotiff(tmp_path / "dem.tif", step)
     model = made(tmp_path, dem, "--zones", values, "--unburnable", 2, "--slope-step", 30)
     names = [zone["name"] for zone in model["zones"]]
-    assert names == ["zone 1, flat", "zone 1, 60 degrees up to the east", "zone 2, never burns"]
+    assert names == ["zone 1, flat", steep, "zone 2, never burns"]
     assert model["zone_map"] == [[0, 0, 1, 1, 0, 0], [2] * 6]
 
 
@@ -213,7 +218,12 @@ def test_the_command_says_what_it_made(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "emberwatch.landscape", "land", dem, "--out", out]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"{out}: 4 x 5 cells, zones: 1\n"
+    assert done.stdout.splitlines() == [
+        f"{out}: 4 x 5 cells, zones: 1",
+        f"{dem}: cells of 30 x 30 metres on the ground; steepest slope 10.0 degrees",
+        f"{dem}: heights taken as metres, as nothing says their unit; --height-unit ft changes "
+        "that",
+    ]
     assert out.read_text().startswith("# python -m emberwatch.landscape land: 'dem.tif'; model ")
 
 
@@ -254,12 +264,10 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "rasters: expected ELEVATION, --zones or --no-fly, got none": (),
         f"{f}/none.tif: expected a file or folder, got none": (f / "none.tif",),
         f"{f}/a.png: expected one of .tif, ": (array(f / "a.npy", FUEL).rename(f / "a.png"),),
-        f"{npy}: expected cells in metres, got no place on the ground; say --cell METRES": (npy,),
-        "degrees.tif: expected cells in metres, got cells in degrees; say --cell METRES": (
-            geotiff(f / "degrees.tif", EASTWARD, crs="EPSG:4326", corner=(10, 1), cell=(0.1, 0.1)),
-        ),
-        "--cell: expected none, as ": (dem, "--cell=30"),
-        "--cell: expected at least 0.001 metres, got 0.0": (npy, "--cell=0"),
+        "got no place on the ground; say --cell METRES, or its projection": (npy,),
+        "--cell: expected 30 metres, as ": (dem, "--cell=90"),
+        "--cell: expected at least 0.001 metres, such as 30 or '98.4 ft' (m, ": (npy, "--cell=0"),
+        "got '30 furlongs'": (npy, "--cell=30 furlongs"),
         "--cell: expected ELEVATION beside it, got none": ("--zones", fuel, "--cell=30"),
         "--oblong: expected ELEVATION beside it": ("--zones", fuel, "--oblong"),
         "--unburnable: expected --zones beside it": (dem, "--unburnable=3"),
@@ -268,26 +276,40 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         ),
         "--slope-step: expected 0.1 to 90 degrees, got 0.0": (dem, "--slope-step=0"),
         "--wind-speed: expected 0 to 100 m/s, got nan": (dem, "--wind-speed=nan"),
-        "wind: expected a --wind-speed above 0 and --wind-towards, or neither": (
+        "wind: expected a --wind-speed above 0 and --wind-from (or --wind-towards), or neit": (
             dem, "--wind-speed=3",
         ),
         "or neither, got one of them": (dem, "--wind-towards=3"),
         "--wind-towards: expected -360 to 360 degrees, got inf": (
             dem, "--wind-speed=3", "--wind-towards=inf",
         ),
-        "hole.tif: expected a number in each cell, got nan in row 1, column 2": (
+        "wind: expected --wind-towards or --wind-from, got both": (dem, *WIND, "--wind-from=N"),
+        "--wind-from: expected one of N, NNE, NE, ": (dem, "--wind-speed=3", "--wind-from=up"),
+        "or -360 to 360 degrees, got '370'": (dem, "--wind-speed=3", "--wind-from=370"),
+        "--missing-zone: expected at most 1000000000000000, got 9": (
+            "--zones", fuel, f"--missing-zone={'9' * 400}",
+        ),
+        "--missing-zone: expected --zones beside it": (dem, "--missing-zone=0"),
+        "hole.npy: expected a number in each cell, got none in 1 cells, the first in row 1, col": (
+            "--zones", array(f / "hole.npy", hole),
+        ),
+        "column 2; --missing-zone N gives them the number N": ("--zones", f / "hole.npy"),
+        "column 2; fill them (gdal_fillnodata), or take a part": (f / "hole.npy", "--cell=30"),
+        "hole.tif: expected a height in each cell, got none in 1 cells, the first in row 1, col": (
             geotiff(f / "hole.tif", hole),
         ),
-        "expected elevations of -1000 to 10000 metres, got -9999; if it means no value": (
+        "expected heights of -1000 to 10000 metres, got -9999; say --nodata if it means no": (
             array(f / "low.npy", low), "--cell=30",
         ),
         "expected at least 2 x 2 cells, as slopes are between cells, got 1 x 1": (
             array(f / "one.npy", [[1.0]]), "--cell=30",
         ),
-        "expected elevation in metres, got it in 'ft'": (
-            netcdf(f / "ft.nc", z=EASTWARD, unit="ft"),
+        "expected heights in one of m, km, dm, cm, mm, ft, us-ft, got 'm2 s-2'; say --height-u": (
+            netcdf(f / "geopotential.nc", z=EASTWARD, unit="m2 s-2"),
         ),
-        "expected square cells, got 30 x 60": (geotiff(f / "ob.tif", EASTWARD, cell=(30, 60)),),
+        "expected square cells, got 30 x 60 metres on the ground; ": (
+            geotiff(f / "ob.tif", EASTWARD, cell=(30, 60)),
+        ),
         "two.tif: expected one layer, got several; choose with --band": (
             geotiff(f / "two.tif", EASTWARD, EASTWARD),
         ),

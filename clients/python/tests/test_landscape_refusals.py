@@ -222,7 +222,7 @@ CASES: dict[str, tuple[Case, str]] = {
     ),
     "degrees": (
         arrivals(crs="EPSG:4326", corner=(0, 60), cell=(1, 1)),
-        "degrees of latitude; reproject it",
+        "expected square cells, got 58306.3 x 111386 metres on the ground; reproject it",
     ),
     "rotated grid": (
         lambda f: (rotated(f / "a.tif", 30, 5, 0, 5, -30, 0), *ARRIVALS),
@@ -370,7 +370,7 @@ CASES: dict[str, tuple[Case, str]] = {
     ),
     "metres of no place": (
         lambda f: (array(f, masks()), *MASKS, "--cell", 60),
-        "--cell: expected a grid in metres, got no place on the ground",
+        "projection that says their size, got no place on the ground; use --height",
     ),
     "cell and height": (
         arrivals("--cell", 60, "--height", 3),
@@ -442,7 +442,8 @@ CASES: dict[str, tuple[Case, str]] = {
     ),
     "cells of nothing": (
         arrivals("--cell", "1e-320"),
-        "--cell: expected at least 0.001 metres, got 1e-320",
+        "--cell: expected at least 0.001 metres, such as 30 or '98.4 ft' (m, km, dm, cm, mm, ft, "
+        "us-ft), got '1e-320'",
     ),
     "link to itself": (lambda f: (linked(f), *ARRIVALS), "a.tif: expected a GeoTIFF, got"),
     "unknown kind": (lambda f: (geotiff(f / "a.tif"), "--kind", "fire"), "invalid choice: 'fire'"),

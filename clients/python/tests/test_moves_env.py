@@ -23,11 +23,13 @@ def test_a_path_of_moves_is_a_step_of_the_other_environment() -> None:
     moves, paths = make(MOVES, observation=PARTS, truth=True), make(observation=parts, truth=True)
     begun, expected = moves.reset(seed=6), paths.reset(seed=6)
     assert_same({part: begun[0][part] for part in parts}, expected[0])
+    assert begun[1].pop("action_mask").tolist() == [0, 1, 0, 1]
     assert_same(begun[1], expected[1])
     for path in actions(paths, 30):
         got = [moves.step(move) for move in path]
         expected = paths.step(path)
         assert_same({part: got[-1][0][part] for part in parts}, expected[0])
+        del got[-1][4]["action_mask"]
         assert_same(got[-1][1:], expected[1:])
         assert [transition[1] for transition in got[:-1]] == [0.0, 0.0, 0.0]
 
@@ -201,6 +203,8 @@ def test_resume_begins_a_new_path_where_the_world_stands() -> None:
         first.close()
         env = make(MOVES, instance=instance, observation=PARTS)
         observation, info = env.reset(options={"resume": True})
+        mask = info.pop("action_mask")
+        assert mask.tolist() == env.unwrapped.action_masks().tolist()
         assert_same(info, left[4])
         for part in ("frame", "robot"):
             assert_same(observation[part], left[0][part])

@@ -140,7 +140,7 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
 
 def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"height": 4}, "height: expected no flag beside a states file"),
+        ({"height": 4}, "height: expected to be left out, as the states file decides it"),
         ({"states_offset": 4}, "states_offset: expected 0 to 3"),
         ({"observation": "belief"}, "expected simulated worlds, as recorded ones have no model"),
         ({"states": tmp_path / "none.npz"}, "none.npz: No such file"),

@@ -1,6 +1,7 @@
 """Tasks: their names, ids and worlds, which are those of the same settings by hand."""
 
 import subprocess
+import sys
 import tomllib
 import warnings
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from environments import assert_same, no_warnings, rollout, serving
+from environments import assert_same, closed_later, no_warnings, rollout, serving
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
 
@@ -37,6 +38,13 @@ PREFIXES = {
 
 #: Those that one robot flies in.
 ALONE = [name for name in PREFIXES if name != "team"]
+
+
+def warns_of_tests(name: str) -> Any:
+    """A context in which an episode begins on a test world."""
+    return pytest.warns(
+        emberwatch.TrainingOnTestWorldsWarning, match=f"task '{name}': .* test world"
+    )
 
 
 def by_hand(name: str) -> dict[str, Any]:
@@ -80,7 +88,7 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
             gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}"),
             gymnasium.make(f"emberwatch/Wildfire{kind}", **other),
         ]
-        first, second = [rollout(env, steps, seed=5) for env in worlds]
+        first, second = [rollout(env, steps, seed=1005) for env in worlds]
         assert_same(first, second)
         for env in worlds:
             env.close()
@@ -95,7 +103,7 @@ def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
             gymnasium.make_vec(f"emberwatch/{PREFIXES[name]}{kind}", num_envs=n_rows),
             gymnasium.make_vec(f"emberwatch/Wildfire{kind}", num_envs=n_rows, **by_hand(name)),
         ]
-        first, second = [rollout(envs, steps, seed=5) for envs in worlds]
+        first, second = [rollout(envs, steps, seed=1005) for envs in worlds]
         assert_same(first, second)
         for envs in worlds:
             envs.close()
@@ -116,6 +124,8 @@ def test_pettingzoo_finds_no_fault_in_the_team() -> None:
     with no_warnings():
         env = emberwatch.parallel_env(task="team")
         assert len(env.possible_agents) == 4
+        # It resets with seed 0, and learns nothing.
+        warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
         parallel_api_test(env, num_cycles=50)
         env.close()
 
@@ -133,7 +143,7 @@ def test_one_robot_flies_the_team_s_world_only_beside_others() -> None:
 
 def test_a_task_ends_episodes_in_any_environment() -> None:
     env = gymnasium.make("emberwatch/Wildfire-v0", task="small")
-    *_, last = rollout(env, built_in_tasks()["small"].max_steps, seed=1)
+    *_, last = rollout(env, built_in_tasks()["small"].max_steps, seed=1001)
     assert last[3]
     env.close()
 
@@ -154,7 +164,7 @@ def test_a_task_ends_episodes_in_any_environment() -> None:
     ],
 )
 def test_what_a_task_decides_is_refused_by_name(keyword: str, value: Any, setting: str) -> None:
-    with refuses(f"{setting}: expected no flag beside a task, which decides it, got"):
+    with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
         gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
 
 
@@ -165,6 +175,11 @@ def test_a_running_server_must_have_the_task() -> None:
         env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
         env.reset()
         env.close()
+        for name in ("emberwatch/WildfireSmall-v0", "emberwatch/Wildfire-v0"):
+            env = gymnasium.make(name, instance=lab)
+            with warns_of_tests("small"):
+                env.reset(seed=0)
+            env.close()
         with refuses("task: expected 'small', as the server has, or None, got 'sparse'"):
             gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
         with refuses("task ash: No such file"):
@@ -247,3 +262,116 @@ def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
             suite(down, **(chosen | keywords))
     with refuses("policy: expected one for the task tiny, got small"):
         suite({"small": down}, tasks=[file], **chosen)
+
+
+#: What makes environments of a task, and resets them on its test world of that seed.
+ON_TEST_WORLDS: dict[str, Any] = {
+    "path": lambda task: gymnasium.make("emberwatch/Wildfire-v0", task=task),
+    "move": lambda task: gymnasium.make("emberwatch/WildfireMoves-v0", task=task),
+    "moves": lambda task: gymnasium.make_vec("emberwatch/WildfireMoves-v0", 2, task=task),
+    "team": lambda task: emberwatch.parallel_env(task=task),
+    "objective": lambda task: gymnasium.make(
+        "emberwatch/WildfireObjective-v1", task=task, prior="initial"
+    ),
+}
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A task with the test seeds 5 and 6."""
+    file = tmp_path / "own.toml"
+    text = (CONFIG / "tasks/small.toml").read_text("utf-8").replace('"small"', '"own"')
+    for old, new in {"3000": "3", "start = 0": "start = 5", "end = 32": "end = 7"}.items():
+        assert old in text
+        text = text.replace(old, new)
+    file.write_text(text, "utf-8")
+    return file
+
+
+@pytest.mark.parametrize("kind", ON_TEST_WORLDS)
+def test_an_episode_on_a_test_world_warns(own: Path, kind: str) -> None:
+    env = closed_later(ON_TEST_WORLDS[kind](own))
+    with warns_of_tests("own"):
+        env.reset(seed=6)
+    with warns_of_tests("own"):
+        env.reset(seed=5)
+    with no_warnings():
+        for seed in (7, 1000, None):
+            env.reset(seed=seed)
+
+
+def test_seeds_of_a_vector_are_those_of_its_worlds(own: Path) -> None:
+    envs = closed_later(gymnasium.make_vec("emberwatch/Wildfire-v0", 4, task=own))
+    with no_warnings():
+        envs.reset(seed=1)
+        envs.reset(seed=[None, 7, 8, None])
+    for seed in (2, [None, None, None, 5]):
+        with warns_of_tests("own"):
+            envs.reset(seed=seed)
+
+
+def test_only_tasks_have_test_worlds() -> None:
+    with no_warnings():
+        env = closed_later(gymnasium.make("emberwatch/Wildfire-v0", burn_in=0))
+        env.reset(seed=0)
+
+
+def test_evaluations_are_on_test_worlds_without_a_warning(own: Path, tmp_path: Path) -> None:
+    def up(seen: Any) -> Any:
+        return np.zeros(len(seen), np.int64)
+
+    common: dict[str, Any] = {"name": "up", "observation": "frame", "progress": None}
+    with no_warnings():
+        evaluate(up, task=own, steps=1, **common)
+        evaluate(up, task="team", steps=1, seeds=[0], **common)
+        suite(up, tasks=[own], worlds=1, folder=tmp_path / "suite", **common)
+
+
+#: Resets at two places, of several environments, and one with the warning switched off before.
+RESETS = """
+import warnings, gymnasium, emberwatch
+from gymnasium.vector import SyncVectorEnv
+
+def make():
+    return gymnasium.make("emberwatch/WildfireSmallMoves-v0", observation="frame")
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
+    env = make()
+    env.reset(seed=3)
+    print("by hand", flush=True)
+envs = SyncVectorEnv([make] * 3)
+envs.reset(seed=0)
+env.reset(seed=1)
+for _ in range(3):
+    envs.reset(seed=0)
+envs.close()
+env.close()
+"""
+
+
+def test_a_process_is_warned_once_and_not_where_it_is_switched_off() -> None:
+    command = [sys.executable, "-c", RESETS]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "by hand\n"), done.stderr
+    assert done.stderr.count("TrainingOnTestWorldsWarning: task 'small'") == 1
+    command[1:1] = ["-W", "ignore::UserWarning"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_trainers_own_seeds_warn(own: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.env_util import make_vec_env as dummies
+
+    from emberwatch.sb3 import make_vec_env
+
+    keywords = {"task": own, "observation": "local"}
+    for envs in (
+        make_vec_env("emberwatch/WildfireMoves-v0", 8, **keywords),
+        dummies("emberwatch/WildfireMoves-v0", 8, env_kwargs=keywords),
+    ):
+        closed_later(envs)
+        agent = sb3.PPO("MlpPolicy", envs, n_steps=8, batch_size=64, seed=0, device="cpu")
+        with warns_of_tests("own"):
+            agent.learn(64)

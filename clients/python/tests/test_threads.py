@@ -1,11 +1,21 @@
-"""Threads beside a client: forks meanwhile, other work during waits, refused copies."""
+"""Threads of one process: forks meanwhile, other work during waits, turns, refused copies."""
 
 import copy
 import pickle
+import signal
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
 
+import numpy as np
 import pytest
+from environments import MOVES, SMALL, assert_same, closed_later, make, make_vec, rollout
+from failures import fails
 from processes import script, server
+
+import emberwatch
 
 #: Forks while a thread opens connections, or steps with one; each child flies a robot of its own.
 FORKS = """
@@ -77,6 +87,140 @@ def test_a_wait_leaves_the_interpreter_to_other_threads() -> None:
 
 def test_what_is_open_is_not_copied() -> None:
     client = server().connect()
-    for make in (pickle.dumps, copy.deepcopy):
+    for copied in (pickle.dumps, copy.deepcopy):
         with pytest.raises(TypeError, match="cannot pickle"):
-            make(client)
+            copied(client)
+
+
+#: Environments, with the action that all steps take.
+SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
+    "path": (make, np.array([1, 3, 1, 3])),
+    "move": (lambda: make(MOVES, observation=("belief", "local")), 3),
+    "paths": (lambda: make_vec(3), np.array([[1, 3, 1, 3]] * 3)),
+    "moves": (lambda: make_vec(3, MOVES, observation=("belief", "local")), np.array([3, 1, 0])),
+    "team": (
+        lambda: closed_later(emberwatch.parallel_env(robots=2, **SMALL)),
+        {"robot_0": 1, "robot_1": 3},
+    ),
+}
+
+
+@contextmanager
+def repeated(call: Callable[[], object]) -> Iterator[None]:
+    """Another thread calls meanwhile, and fails the test if that raises."""
+    errors, is_over = list[BaseException](), threading.Event()
+
+    def repeat() -> None:
+        try:
+            while not is_over.is_set():
+                call()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+    assert not errors
+
+
+@pytest.mark.parametrize("kind", SHARED)
+def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
+    maker, action = SHARED[kind]
+    env, alone = maker(), maker()
+    expected = [alone.reset(seed=1000), *(alone.step(action) for _ in range(80))]
+    env.reset(seed=1000)
+    steps = list[Any]()
+
+    def step() -> None:
+        for _ in range(20):
+            steps.append(env.step(action))
+
+    threads = [threading.Thread(target=step) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    # They may be appended in another order.
+    def moment(outcome: Any) -> str:
+        return repr(outcome[-1]) + repr(outcome[0]) + repr(outcome[1])
+
+    assert sorted(map(moment, steps)) == sorted(map(moment, expected[1:]))
+
+
+@pytest.mark.parametrize("kind", SHARED)
+def test_a_thread_that_resets_waits_for_a_step_of_another(kind: str) -> None:
+    maker, action = SHARED[kind]
+    env, alone = maker(), maker()
+    env.reset(seed=1000)
+    with repeated(lambda: env.step(action)):
+        for _ in range(20):
+            env.reset(seed=1000)
+    first = [env.reset(seed=1001), *(env.step(action) for _ in range(8))]
+    assert_same(first, [alone.reset(seed=1001), *(alone.step(action) for _ in range(8))])
+
+
+@pytest.mark.parametrize("height", [7, 130])
+def test_a_thread_that_watches_reads_masks_and_parts_of_the_path(height: int) -> None:
+    # Beyond 16,384 cells in all, too.
+    envs = make_vec(2, MOVES, height=height, width=height)
+    envs.reset(seed=1000)
+    flights = envs.unwrapped._flights
+
+    def watch() -> None:
+        assert envs.unwrapped.action_masks().shape == (2, 4)
+        assert flights.visited.shape == (2, height, height)
+        assert pickle.dumps(flights) and flights.robots.shape == (2, 2)
+
+    with repeated(watch):
+        for _ in range(400):
+            envs.step(envs.action_space.sample())
+
+
+def test_a_forked_child_does_not_wait_for_a_thread_that_steps() -> None:
+    env = make()
+    env.reset(seed=1000)
+    is_in, may_leave = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with env.unwrapped._session.turn:
+            is_in.set()
+            may_leave.wait()
+
+    def step() -> None:
+        with fails("forked"):
+            env.step([1, 3, 1, 3])
+
+    thread, child = threading.Thread(target=hold), get_context("fork").Process(target=step)
+    thread.start()
+    is_in.wait()
+    child.start()
+    child.join(60)
+    assert child.exitcode == 0
+    may_leave.set()
+    thread.join()
+
+
+def test_ctrl_c_ends_the_wait_for_another_thread_and_leaves_the_environment_usable() -> None:
+    env, alone = make(), make()
+    expected = rollout(alone, 3, seed=1000)
+    env.reset(seed=1000)
+    may_leave = threading.Event()
+
+    def hold() -> None:
+        with env.unwrapped._session.turn:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            may_leave.wait()
+
+    thread = threading.Thread(target=hold)
+    with pytest.raises(KeyboardInterrupt):
+        thread.start()
+        while True:
+            env.reset(seed=1000)
+    may_leave.set()
+    thread.join()
+    assert_same(rollout(env, 3, seed=1000), expected)

@@ -32,6 +32,7 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
         (MOVES, {"observation": "visited"}),
         (MOVES, {"observation": "move"}),
         (MOVES, {"observation": ("frame", "age", "visited", "robot", "move")}),
+        (MOVES, {"observation": ("move", "action_mask")}),
         (MOVES, {"reward": "move"}),
         (MOVES, {"observation": "local", "window": 37}),
         (MOVES, {"observation": "recent", "window": 37}),

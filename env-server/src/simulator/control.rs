@@ -255,6 +255,7 @@ impl Simulator {
             model: (config.reveal_model && recorded.is_none())
                 .then(|| toml::to_string(file).expect("invariant: model files serialise")),
             task: self.checked.task.clone(),
+            worlds_fingerprint: Some(self.spec.settings.worlds_fingerprint()),
             airspace: airspace_info(&self.checked.model),
             zones: zones_info(&self.checked.model),
             recorded_world: recorded.as_ref().map(|states| RecordedWorld {

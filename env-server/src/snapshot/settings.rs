@@ -5,10 +5,14 @@ use crate::config::Checked;
 use crate::world::Rules;
 use bincode::{Decode, Encode};
 use emberwatch_protocol::model::ModelError;
+use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
 /// Names the task; it stands last, and only where the worlds are one.
 const TASK: &str = "task";
+
+/// Raised whenever the same settings and seed give another trajectory or another reward.
+const WORLDS: u32 = 1;
 
 /// The settings of a server that its worlds depend on.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
@@ -84,6 +88,27 @@ impl Settings {
             model: model.expect("invariant: a model was read from TOML"),
             others: others.map(|(name, value)| (name.into(), value)).collect(),
         }
+    }
+
+    /// Returns 16 hexadecimal digits that identify the worlds: results can be compared only where they are equal.
+    ///
+    /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see every
+    /// cell. It leaves out the task's name and `max_steps`: a result has its own number of steps.
+    pub fn worlds_fingerprint(&self) -> String {
+        let mut hash = Sha256::new();
+        hash.update(format!("worlds {WORLDS}\n{}\n", self.model));
+        for (name, value) in &self.others {
+            // The path's cells are seen, unless a client asks for more.
+            let value = if value == "client" { "path" } else { value };
+            if name != TASK && name != "max_steps" {
+                hash.update(format!("{name} = {value}\n"));
+            }
+        }
+        let digits = hash.finalize();
+        digits[..8]
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
     }
 
     /// Checks that these settings of a file are those of a server.

@@ -6,6 +6,8 @@ use super::settings::{Settings, WorldSpec};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown, Rules, SavedWorld};
 use emberwatch_protocol::Move;
+use emberwatch_protocol::control::CoverageRule;
+use emberwatch_protocol::task::Start;
 
 const NEW: NewEpisode = NewEpisode {
     seed: 7,
@@ -233,4 +235,50 @@ fn the_first_other_setting_is_named() {
             .to_string()
             .starts_with("model: ")
     );
+}
+
+#[test]
+fn a_fingerprint_differs_exactly_where_the_worlds_differ() {
+    type Change = fn(&mut ServerConfig);
+    let fingerprint = |change: Change| {
+        let mut config = ServerConfig {
+            model: "wildfire-small".into(),
+            height: 8,
+            width: 8,
+            moves: 4,
+            burn_in: 10,
+            ..ServerConfig::default()
+        };
+        change(&mut config);
+        let checked = config.check().expect("valid settings");
+        Settings::of(&checked).worlds_fingerprint()
+    };
+    let usual = fingerprint(|_| ());
+    assert_eq!(usual.len(), 16);
+    let same: [Change; 5] = [
+        |config| config.max_steps = 7,
+        |config| config.worlds = 3,
+        |config| config.seed = 9,
+        |config| config.publish_truth = true,
+        |config| config.coverage = CoverageRule::Client,
+    ];
+    for (index, change) in same.into_iter().enumerate() {
+        assert_eq!(fingerprint(change), usual, "{index}");
+    }
+    let other: [Change; 9] = [
+        |config| config.height = 9,
+        |config| config.width = 9,
+        |config| config.moves = 5,
+        |config| config.robots = 2,
+        |config| config.burn_in = 11,
+        |config| config.start = Start::Random,
+        |config| config.model = "wildfire".into(),
+        |config| config.sensor_radius = 1,
+        |config| config.coverage = CoverageRule::Full,
+    ];
+    let mut all: Vec<String> = other.into_iter().map(fingerprint).collect();
+    all.push(usual);
+    all.sort();
+    all.dedup();
+    assert_eq!(all.len(), 10, "{all:?}");
 }

@@ -2,9 +2,7 @@
 //!
 //! Nothing returned points into shared memory.
 
-use super::channels::{
-    Channel, Entries, Instance, Ipc, Services, StepService, create_node, limited_error,
-};
+use super::channels::{Entries, Instance, Ipc, Services, StepService, create_node, limited_error};
 use super::control::{Reply, Request, ServerInfo};
 use super::exchange::{check_answer, copied, garbled};
 use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
@@ -94,7 +92,7 @@ impl Connection {
         };
         let control = services.open_control()?;
         let step_service = services.open_step()?;
-        let texts = TextPort::create(node, instance, &control, Channel::WakeServer)?;
+        let texts = TextPort::create(node, instance, &control)?;
         let node = &texts.exchange.node;
         fill_ports(node, true)?;
         let entries = Entries::of(node)?;

@@ -52,17 +52,6 @@ pub enum ChannelError {
         /// What the server speaks.
         version: u32,
     },
-    /// No agent takes decisions for the world.
-    #[error(
-        "no agent serves decisions of world {world} on instance {instance:?}: start one with \
-         `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
-    )]
-    NoAgent {
-        /// Name of the instance.
-        instance: String,
-        /// The world that has no agent.
-        world: u32,
-    },
     /// Its server is in another PID namespace, where process ids mean other processes.
     #[error(
         "instance {instance:?} is served from another PID namespace: run both programs in one (docker: \

@@ -33,11 +33,9 @@ pub enum ConnectionError {
     /// There is too little memory for the answer, which has come.
     #[error(transparent)]
     Memory(#[from] NoMemory),
-    /// The server, or the agent asked for decisions, ended while, or before, it was asked.
-    #[error("the {who} on instance {instance:?} is gone")]
+    /// The server ended while, or before, it was asked.
+    #[error("the server on instance {instance:?} is gone")]
     ServerGone {
-        /// "server" or "agent".
-        who: &'static str,
         /// Name of the instance.
         instance: String,
     },
@@ -73,7 +71,6 @@ pub enum ConnectionError {
 
 /// What a request and its answer need: both ends of waking, and the server's process.
 pub(super) struct Exchange {
-    pub(super) who: &'static str,
     pub(super) instance: Instance,
     pub(super) server: Notifier<Ipc>,
     pub(super) listener: Listener<Ipc>,
@@ -151,7 +148,6 @@ impl Exchange {
     pub(super) fn server_gone(&self) -> ConnectionError {
         let _ = remove_leftovers(); // Else the next program removes them.
         ConnectionError::ServerGone {
-            who: self.who,
             instance: self.instance.name().into(),
         }
     }

@@ -36,6 +36,10 @@ pub struct ServerInfo {
     /// The task that the worlds are, by its name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
+    /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that a reward depends on, besides the
+    /// seed and the policy. Absent from servers before release 0.3.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub worlds_fingerprint: Option<String>,
     /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,

@@ -1,4 +1,4 @@
-//! A client's side of a channel of JSON text: `control`, or the decisions of a world.
+//! A client's side of `control`, the channel of JSON text.
 
 use super::channel_files::lives_elsewhere;
 use super::channels::{
@@ -40,19 +40,21 @@ struct Common {
 }
 
 impl TextPort {
-    /// Makes the port of a service whose server listens on `wake`; it keeps the node, which dies with it.
+    /// Makes the port of the service; it keeps the node, which dies with it.
     pub(super) fn create(
         node: Node<Ipc>,
         instance: &Instance,
         service: &ControlService,
-        wake: Channel,
     ) -> Result<Self, ChannelError> {
         let services = Services {
             node: &node,
             instance,
         };
         let server_process = server_process(service, instance)?;
-        let notifier = services.wake(wake)?.notifier_builder().create();
+        let notifier = services
+            .wake(Channel::WakeServer)?
+            .notifier_builder()
+            .create();
         let server = notifier.map_err(ipc_error("create a notifier"))?;
         let listener = services.listener(Channel::WakeClient)?;
         let client = service.client_builder().initial_max_slice_len(SLICE);
@@ -60,16 +62,10 @@ impl TextPort {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(limited_error("create a control client", "16 clients"))?;
-        let who = if wake == Channel::WakeServer {
-            "server"
-        } else {
-            "agent"
-        };
         Ok(Self {
             client,
             sequence: 0,
             exchange: Exchange {
-                who,
                 instance: instance.clone(),
                 server,
                 listener,

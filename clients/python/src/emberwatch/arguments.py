@@ -1,8 +1,8 @@
 """What callers hand in: seeds, choices, moves, each checked before anything is sent."""
 
+import json
 import operator
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from os import PathLike, fspath
 from typing import Any, SupportsIndex, TypeVar, cast
@@ -12,13 +12,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import _native, wire
 from emberwatch.errors import invalid
+from emberwatch.paths import utf8
 
 _Value = TypeVar("_Value")
 
 
-def check_settings(flags: Sequence[str]) -> dict[str, Any]:
-    """What a server would run with, given these flags; a refusal is in its words."""
-    return tomllib.loads(_native.check_settings(flags))
+def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
+    """All settings that a server with these would have, by their names in `config/server.toml`."""
+    return json.loads(_native.check_settings(json.dumps(settings)))
+
+
+def as_setting(name: str, value: object) -> bool | int | str:
+    """The value of a setting, as JSON and programs take it."""
+    if isinstance(value, np.generic):
+        value = cast("object", value.item())
+    if isinstance(value, bool | int):
+        return value
+    if isinstance(value, str | PathLike):
+        return utf8(name, cast("str | PathLike[str]", value))
+    raise invalid(name, "an integer, True or False, text or a path", told(value))
 
 
 def as_seed(seed: object) -> int:

@@ -21,11 +21,6 @@ NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
-#: Fields of a result that become `info`, and those that do beside hidden states; never the seed,
-#: which gives all of them away.
-REPORTED: Final = {"step": "world", "n_visited": "robot"}
-REVEALED: Final = REPORTED | {"n_target_cells": "world", "n_hits": "robot"}
-
 #: What a robot's step can pay, and the field of a result that says it.
 REWARDS: Final = {
     "share": ("robot", "reward"),
@@ -105,13 +100,13 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        fields = REVEALED if self._reveals else REPORTED
-        info: dict[str, Any] = {
-            name: getattr(getattr(result, part), name) for name, part in fields.items()
-        }
+        """The info of a step: never the seed, which gives the hidden states away."""
+        world, robot = result.world, result.robot
+        info: dict[str, Any] = {"step": world.step, "n_visited": robot.n_visited}
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
+            info |= {"n_target_cells": world.n_target_cells, "n_hits": robot.n_hits}
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
         return info

@@ -4,17 +4,17 @@
 Every call waits `timeout` seconds for its answer; everything returned is a copy.
 """
 
+import json
 import logging
 import os
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable, Sequence
-from typing import Any, Final, TypeVar, cast
-
-import numpy as np
+from collections.abc import Callable
+from typing import Final, TypeVar
 
 from emberwatch import _native, wire
+from emberwatch.arguments import as_setting
 from emberwatch.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
 from emberwatch.lease import Lease
@@ -186,33 +186,20 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
     after their last use. Ctrl-C ends the wait for a reset or a file, and comes after a step.
 
     Args:
-        settings: Those of `emberwatch-server --help`, with underscores, such as `worlds=4`,
-            `task="small"`, `seed=7`; None: the default. Not `instance`, nor the server's own
-            snapshots.
+        settings: Those of `config/server.toml`, such as `worlds=4`, `task="small"`, `seed=7`; None:
+            the default. Not `instance`, nor the server's own snapshots.
 
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
         NotEnoughMemoryError: If they would take more than the machine, a cgroup or a `ulimit` has.
         EmberwatchError: With code `"threads"` if the system starts none.
     """
-    flags = list[str]()
+    # Nobody else waits for its robots.
+    chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
     for name, given in settings.items():
-        if given is None:
-            continue
-        value: Any = cast("Any", given).item() if isinstance(given, np.generic) else given
-        if isinstance(value, bool):
-            value = str(value).lower()
-        elif not isinstance(value, int | float):
-            value = utf8(name, value)
-        flags.append(f"--{name.replace('_', '-')}={value}")
-    return embed_flags(flags)
-
-
-def embed_flags(flags: Sequence[str]) -> Client:
-    """As `embed`, with the flags of a server."""
-    if not any(flag.startswith("--lease-millis") for flag in flags):
-        flags = [*flags, f"--lease-millis={_EMBEDDED_LEASE}"]  # nobody else waits for its robots
-    return Client("(embedded)", embedded=_native.Server.embedded(flags))
+        if given is not None:
+            chosen[name] = as_setting(name, given)
+    return Client("(embedded)", embedded=_native.Server.embedded(json.dumps(chosen)))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

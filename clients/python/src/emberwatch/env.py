@@ -160,10 +160,11 @@ class WildfireEnv(WorldEnv):
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
-        self._answer = answer = self._begin(seed, options)
-        self._observations.reset(ONE_ROW, answer.frames)
-        seen = self._seen(answer, answer.result())
-        self._session.finish()
+        with self._session.turn:
+            self._answer = answer = self._begin(seed, options)
+            self._observations.reset(ONE_ROW, answer.frames)
+            seen = self._seen(answer, answer.result())
+            self._session.finish()
         return seen
 
     def step(
@@ -179,15 +180,16 @@ class WildfireEnv(WorldEnv):
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
                 as after Ctrl-C: reset or resume. Nothing is sent.
         """
-        self._session.begin_step()
-        self._answer = answer = self._session.step(action)
-        self._update(self._observations, answer)
-        result = answer.result()
-        if self.render_mode is not None:
-            self._trace(result.robot, as_moves(action, 1, self._spec.n_moves).reshape(-1))
-        observation, info = self._seen(answer, result)
-        reward, world = paid(result, self._pays), result.world
-        self._session.finish()
+        with self._session.turn:
+            self._session.begin_step()
+            self._answer = answer = self._session.step(action)
+            self._update(self._observations, answer)
+            result = answer.result()
+            if self.render_mode is not None:
+                self._trace(result.robot, as_moves(action, 1, self._spec.n_moves).reshape(-1))
+            observation, info = self._seen(answer, result)
+            reward, world = paid(result, self._pays), result.world
+            self._session.finish()
         return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:

@@ -72,20 +72,27 @@ class RequestTimeoutError(EmberwatchError, TimeoutError):
 
 
 class ServerGoneError(EmberwatchError, ConnectionError):
-    """The server, or the agent asked for decisions, ended while or before it was asked."""
+    """The server ended while or before it was asked."""
 
     code = "server_gone"
 
 
-#: Name and sentence of each status code, from code 1; `step` sends the code alone.
-STATUSES: Final = (
+class TrainingOnTestWorldsWarning(UserWarning):
+    """A reset has begun an episode on a test seed of the task, outside of an evaluation."""
+
+
+#: Name and sentence of each status code, from code 1; `step` sends the code alone. None: not used.
+STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
     (
         "version_mismatch",
         "protocol version mismatch: the server speaks {}; use a client and a server of one release",
     ),
     ("unknown_operation", "operation: expected 1 (step), 2 (observe) or 3 (recall), got {}"),
     ("malformed", "malformed control message"),
-    ("no_such_world", "no such world: the server has worlds 0 to {last}"),
+    (
+        "no_such_world",
+        "no such world: the server has worlds 0 to {last}; start it with --worlds N for more",
+    ),
     ("wrong_length", "wrong payload length: expected {} bytes"),
     ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
     ("bad_move", "byte {} of the payload: expected a move in 0..=3"),
@@ -100,8 +107,8 @@ STATUSES: Final = (
         "takes no steps",
     ),
     ("unknown_flags", "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {}"),
-    ("bad_objective", "objective: expected one below {}"),
-    ("agent_ends", "the agent ends"),
+    None,
+    None,
     ("bad_file", "the file cannot be used"),
     ("not_kept", "not kept: the nearest step that is kept is {}"),
     (
@@ -114,23 +121,24 @@ STATUSES: Final = (
         "incomplete: robot {} is missing; a step names all robots that its client holds in a "
         "world, and a step of several worlds needs them all",
     ),
-    ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
+    (
+        "no_such_robot",
+        "no such robot: the server has robots 0 to {last}; start it with --worlds N for more "
+        "worlds, or --robots N for more in each",
+    ),
     ("no_memory", "memory: expected {} bytes for the answer, got less; ask for fewer robots"),
 )
 
-_CLASSES: Final = {
-    "agent_ends": ServerGoneError,
-    "lease_lost": LeaseLostError,
-    "no_memory": NotEnoughMemoryError,
-}
+_CLASSES: Final = {"lease_lost": LeaseLostError, "no_memory": NotEnoughMemoryError}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
     """The error of a status code other than 0, in the server's words if they fit Python."""
-    if not 1 <= status <= len(STATUSES):
+    known = STATUSES[status - 1] if 1 <= status <= len(STATUSES) else None
+    if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"
         return EmberwatchError(message, detail=detail)
-    code, sentence = STATUSES[status - 1]
+    code, sentence = known
     if code == "lease_lost" and detail == 0:
         sentence = "lease lost: it expired or was released; acquire the robots again"
     if code == "no_memory" and detail == 0:

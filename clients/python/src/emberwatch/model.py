@@ -18,7 +18,7 @@ from emberwatch import _native
 from emberwatch.airspace import MAX_RADIUS, Airspace, Zones
 from emberwatch.arguments import as_count, check_settings
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.paths import utf8
+from emberwatch.paths import BYTE_ORDER_MARK, utf8
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
@@ -59,6 +59,7 @@ class Description:
     @classmethod
     def from_toml(cls, text: str) -> Self:
         """Reads the text of a file that a server has accepted."""
+        text = text.removeprefix(BYTE_ORDER_MARK)
         try:
             values = cls._read(text)
             values["airspace"] = Airspace(**values["airspace"])
@@ -153,15 +154,14 @@ class Model(Description):
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
         """The built-in model of a name, or that of a file, which the server checks first."""
-        utf8("model", name)
-        flags = [f"--model={fspath(name)}"]
+        settings = {"model": utf8("model", name)}
         try:
-            check_settings(flags)
+            check_settings(settings)
         except InvalidArgumentError:
             grid = _native.grid_of_maps(fspath(name))
             if grid is None:
                 raise
-            check_settings([*flags, f"--height={grid[0]}", f"--width={grid[1]}"])
+            check_settings({**settings, "height": grid[0], "width": grid[1]})
         return cls.checked(name)
 
     @classmethod

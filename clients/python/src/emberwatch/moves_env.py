@@ -19,7 +19,7 @@ from emberwatch.observations import WINDOW, MovesParts, Observations
 from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
-from emberwatch.wire import StepAnswer
+from emberwatch.wire import StepAnswer, StepResult
 
 MovesReward: TypeAlias = Literal[Reward, "move"]
 
@@ -35,7 +35,11 @@ class WildfireMovesEnv(WorldEnv):
     ## Action Space
 
     `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. A move off the grid or into a no-fly cell leaves
-    the robot in place; `action_masks` tells which do not, as MaskablePPO of sb3-contrib asks.
+    the robot in place. The action mask, `(4,)` int8, has 1 for each move that does not, and only 1
+    where all moves do. It is `info["action_mask"]`, `action_masks()`, which MaskablePPO of
+    sb3-contrib calls, and on request a part of the observation:
+
+        action = env.action_space.sample(info["action_mask"])
 
     ## Observation Space
 
@@ -48,6 +52,7 @@ class WildfireMovesEnv(WorldEnv):
     | `move` | `Discrete(T)` | moves made of this path |
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
     | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | what frames alone told of the same cells |
+    | `action_mask` | `Box(0, 1, (4,), int8)` | 1 for each move that leads to another cell |
 
     The channels of `local`, times 255: the probability of the state that pays most, and the entropy
     of the belief divided by log S, both 0 where this path has been (and what it has seen, where
@@ -77,7 +82,7 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Starting State, Information
 
-    As `WildfireEnv`; the information is about the last complete path.
+    As `WildfireEnv`; the information is about the last complete path, except `action_mask`.
 
     ## Arguments
 
@@ -121,11 +126,12 @@ class WildfireMovesEnv(WorldEnv):
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
-        answer = self._begin(seed, options)
-        self._observations.reset(ONE_ROW, answer.frames)
-        self._begin_path(answer)
-        seen = self._seen(answer)
-        self._session.finish()
+        with self._session.turn:
+            answer = self._begin(seed, options)
+            self._observations.reset(ONE_ROW, answer.frames)
+            self._begin_path(answer)
+            seen = self._seen(answer)
+            self._session.finish()
         return seen
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -135,14 +141,18 @@ class WildfireMovesEnv(WorldEnv):
             EmberwatchError: As `WildfireEnv.step`.
         """
         move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
-        self._session.begin_step()
-        completes = self._flights.completes()[0]
-        outcome = self._complete(move) if completes else self._move(move)
-        self._session.finish()
+        with self._session.turn:
+            self._session.begin_step()
+            completes = self._flights.completes()[0]
+            outcome = self._complete(move) if completes else self._move(move)
+            self._session.finish()
         return outcome
 
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Which moves take the robot to another cell, `(4,)`; all, where none does."""
+    def action_masks(self) -> NDArray[np.int8]:
+        """1 for each move that takes the robot to another cell, else 0; `(4,)` int8.
+
+        All 1 in a cell that no move leads out of. As `info["action_mask"]`.
+        """
         if not self.is_open:
             raise not_reset()
         return self._flights.masks[0]
@@ -159,25 +169,26 @@ class WildfireMovesEnv(WorldEnv):
         """The last move of a path, which the server flies."""
         path = self._flights.paths(move)
         answer = self._session.step(path)
-        result = answer.result()
-        reward = paid(result, self._pays) - float(self._flights.paid[0])
+        before = float(self._flights.paid[0])
+        self._update(self._observations, answer)
+        result = self._begin_path(answer)
         if self.render_mode is not None:
             self._trace(result.robot, path[0])
-        self._update(self._observations, answer)
-        self._begin_path(answer)
         observation, info = self._seen(answer)
-        world = result.world
+        reward, world = paid(result, self._pays) - before, result.world
         return observation, reward, bool(world.terminated), bool(world.truncated), info
 
-    def _begin_path(self, answer: StepAnswer) -> None:
-        self._answer = answer
-        self._start = answer.result().robot.cell
+    def _begin_path(self, answer: StepAnswer) -> StepResult:
+        self._answer, self._result = answer, answer.result()
+        self._start = self._result.robot.cell
         self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
         self._flights.begin(ONE_ROW, np.array([self._start], np.int64), states)
+        return self._result
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
-        info = self._describe(answer, answer.result())
+        info = self._describe(answer, self._result)
+        info["action_mask"] = self._flights.masks[0]
         if self.render_mode == "human":
             self._draw()
         # Copies: each move of a path returns the frame again.
@@ -231,8 +242,8 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
             autoreset_mode=autoreset_mode,
         )
 
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Which moves take each robot to another cell, `(num_envs, 4)`; all, where none does."""
+    def action_masks(self) -> NDArray[np.int8]:
+        """The masks of all robots, `(num_envs, 4)`; see `WildfireMovesEnv.action_masks`."""
         if not self.is_open:
             raise not_reset()
         return self._flights.masks
@@ -258,6 +269,9 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         rewards = self._flights.move(moved, actions)
         self._parts.visit(moved)
         return rewards
+
+    def _reported(self) -> dict[str, NDArray[Any]]:
+        return {**super()._reported(), "action_mask": self._flights.masks}
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
         self._flights.begin(begun, super()._robots(), self._truths)

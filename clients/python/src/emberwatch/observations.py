@@ -17,7 +17,7 @@ from emberwatch.settings import WorldSpec
 from emberwatch.window import N_OF_BELIEF, N_OF_PATH, Windows, of_belief
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
-MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move"]
+MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "action_mask"]
 
 #: One part makes a plain observation, several make a flat dictionary.
 Parts: TypeAlias = Part | Sequence[Part]
@@ -165,6 +165,8 @@ class Observations:
             return self._windows[name].around(self._flights)
         if name == "visited":
             return self._flights.visited[..., np.newaxis]
+        if name == "action_mask":
+            return self._flights.masks
         return self._flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -249,4 +251,5 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
         "recent": around(spec.n_observations),
         "visited": image(1),
         "move": spaces.Discrete(spec.n_moves),
+        "action_mask": spaces.Box(0, 1, (wire.N_MOVES,), np.int8),
     }

@@ -67,6 +67,10 @@ class SessionOwner:
         """Whether there has been a reset since it was made or closed."""
         return self._session.is_open
 
+    def allow_test_worlds(self) -> None:
+        """Resets on a task's test seeds are meant, and warn no more."""
+        self._session.allows_test_worlds = True
+
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which only a closed environment has: no two may act on the same worlds."""
         return state_of(self, self.is_open, "gymnasium.make(env.spec)")

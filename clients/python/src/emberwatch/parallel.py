@@ -18,7 +18,7 @@ from emberwatch.base import NOTHING_TO_DRAW, as_options
 from emberwatch.env import WildfireVectorEnv
 from emberwatch.errors import invalid
 from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
-from emberwatch.observations import MovesParts, of_row
+from emberwatch.observations import MovesParts, names_of, of_row
 from emberwatch.owner import state_of
 from emberwatch.settings import WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, info_of
@@ -34,7 +34,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     With `action="move"` each agent acts, observes and is paid as in `WildfireMovesEnv`, with
     `action="path"` as in `WildfireEnv`. The robots begin together, fly together and end together.
-    Seeds, `resume`, infos and pictures are as there; a picture shows the whole team.
+    Seeds, `resume`, infos and pictures are as there; a picture shows the whole team. The action
+    mask of each agent is where PettingZoo's tools look: in `infos[agent]["action_mask"]` or, if
+    `observation` names it, in the observation.
 
     Arguments, all by keyword, are those of these environments, and:
 
@@ -71,6 +73,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             autoreset_mode=AutoresetMode.DISABLED,
             **keywords,
         )
+        self._observes_masks = "action_mask" in names_of(keywords["observation"])
         self.possible_agents = [f"robot_{row}" for row in range(self._worlds.num_envs)]
         self.agents: list[str] = []
         self.metadata = {
@@ -136,8 +139,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             self._infos(infos),
         )
 
-    def action_masks(self) -> dict[str, NDArray[np.bool_]]:
-        """Which moves take each robot to another cell, `(4,)`; all, where none does.
+    def action_masks(self) -> dict[str, NDArray[np.int8]]:
+        """The mask of each agent, as in its info; see `WildfireMovesEnv.action_masks`.
 
         Of moves only: where a move of a path leads depends on those before it.
         """
@@ -180,4 +183,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         return {agent: of_row(seen, row) for row, agent in enumerate(self.possible_agents)}
 
     def _infos(self, infos: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        if self._observes_masks:
+            # PettingZoo has a mask in the observation or in the info; TorchRL fails on both.
+            infos = {name: each for name, each in infos.items() if name != "action_mask"}
         return {agent: info_of(infos, row) for row, agent in enumerate(self.possible_agents)}

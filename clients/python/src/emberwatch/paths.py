@@ -2,8 +2,12 @@
 
 import os
 import sys
+from typing import Final
 
 from emberwatch.errors import invalid
+
+#: What editors on Windows write before text in UTF-8.
+BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def utf8(subject: str, path: str | os.PathLike[str]) -> str:

@@ -57,6 +57,9 @@ class ServerInfo:
     deadline_millis: int
     #: The task that its worlds are, by its name.
     task: str | None = None
+    #: Identifies the worlds: a hash of every setting that a reward depends on, besides seed and
+    #: policy. None from servers before release 0.3.
+    worlds_fingerprint: str | None = None
     #: None of simulated worlds.
     recorded_world: RecordedWorld | None = None
     #: That of the number `pid`.
@@ -148,53 +151,6 @@ class LeftBelief(NamedTuple):
     data: bytes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DecisionsInfo:
-    """How an agent that serves decisions describes itself."""
-
-    protocol: int
-    build: str
-    pid: int
-    instance: str
-    #: The first of its worlds.
-    first_world: int
-    n_worlds: int
-    height: int
-    width: int
-    n_moves: int
-    max_steps: int
-    states: tuple[str, ...]
-    #: What can be decided, by position: plans, by their names.
-    objectives: tuple[str, ...]
-    #: What keeps the belief.
-    estimator: str
-    #: Names of the numbers that describe a plan.
-    features: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
-    """What came of a world's last decision: the step's result, and what the next plans promise.
-
-    `seed` and `n_target_cells` are not for learners.
-    """
-
-    step: int
-    reward: float
-    n_target_cells: int
-    n_visited: int
-    n_hits: int
-    robot: tuple[int, int]
-    terminated: bool
-    truncated: bool
-    seed: int
-    episode: int
-    #: What was decided; None after a reset.
-    objective: int | None
-    #: Of each objective's plan, in base64: `Decisions.features` reads them.
-    features: str
-
-
 def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
     """The records of a reply's worlds."""
     worlds = reply.get("worlds")
@@ -212,7 +168,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     for name, types in _types(kind).items():
         if name in ("airspace", "zones"):
             continue
-        if name in ("pid_namespace", "task") and name not in given:
+        if name in ("pid_namespace", "task", "worlds_fingerprint") and name not in given:
             continue
         if name == "recorded_world":  # it may be missing, too
             nested = given.get(name)

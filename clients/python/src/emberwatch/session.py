@@ -6,30 +6,36 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 
 import inspect
 import logging
+import os
+import threading
 import warnings
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+import weakref
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.client import Client, connect, embed_flags
+from emberwatch.client import Client, connect, embed
 from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
     LeaseLostError,
     RequestTimeoutError,
     ServerGoneError,
+    TrainingOnTestWorldsWarning,
     invalid,
 )
 from emberwatch.lease import Lease
 from emberwatch.observer import Newest, Present, Truth, TruthReader
 from emberwatch.programs import Program, unused_instance
+from emberwatch.replies import LeftBelief
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
+from emberwatch.tasks import FIRST_TRAINING_SEED
 from emberwatch.wire import StepAnswer, WorldResult
 
 _log: Final = logging.getLogger("emberwatch")
@@ -54,6 +60,17 @@ _OVER: Final = (
     "the episode of the world is over: a reset is for a client that holds all its robots",
 )
 
+#: A forked child waits for no thread of its parent's, which it does not have.
+_sessions: Final = weakref.WeakSet["Session"]()
+
+
+def _free_turns() -> None:
+    for session in _sessions:
+        session.turn = threading.RLock()
+
+
+os.register_at_fork(after_in_child=_free_turns)
+
 
 class Session:
     """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
@@ -61,6 +78,7 @@ class Session:
     It flies all robots of its worlds, or one robot of a world that others fly in. An environment
     calls `begin_step` or `begin_reset` first and `finish` last: anything between the two may be
     interrupted, by Ctrl-C or by a signal's handler, after which the worlds may have moved unseen.
+    All of it is within `with turn`, for programs whose threads share an environment.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -72,6 +90,11 @@ class Session:
         self._program: Program | None = None
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
+        #: Whether test worlds are meant, as in an evaluation.
+        self.allows_test_worlds = False
+        #: Lets one thread at a time step or reset. A signal leaves it free again.
+        self.turn: AbstractContextManager[object] = threading.RLock()
+        _sessions.add(self)
         #: Why there is no next step, such as one that did not finish: worlds may have moved unseen.
         self._unfinished: tuple[str, str] | None = _CLOSED
         #: Whether the worlds may have moved since it began: a refusal alone changes nothing.
@@ -114,6 +137,14 @@ class Session:
     def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._lease is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which wait for no thread of this one."""
+        return {name: value for name, value in vars(self).items() if name != "turn"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, turn=threading.RLock())
+        _sessions.add(self)
 
     def begin_step(self) -> None:
         """Refuses a step before a reset, and after what did not finish."""
@@ -219,13 +250,39 @@ class Session:
         step = int(answer.worlds["step"][0])
         return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
+    def left_belief(self, row: int) -> LeftBelief | None:
+        """The belief that was left for a robot's present step."""
+        if self._client is None:
+            raise not_reset()
+        try:
+            return self._client.belief(self._robots[row], timeout=self.settings.timeout)
+        except LOST as error:
+            raise self._lost(error) from None
+
+    def history(self, row: int, step: int) -> Iterator[StepAnswer]:
+        """The steps of a robot's episode before this one, from the first on whose are all kept."""
+        client, robot, past = self._client, self._robots[row], 0
+        while client is not None and past < step:
+            try:
+                yield client.recall(past, robot, timeout=self.settings.timeout)
+            except LOST as error:
+                raise self._lost(error) from None
+            except EmberwatchError as error:
+                if error.code != "not_kept":
+                    raise
+                if past > 0:
+                    return
+                past = error.detail - 1
+            past += 1
+
     def launch(self, seed: int) -> Client:
         """Begins worlds of its own, with this seed for world 0; `close` ends them."""
-        flags = [f"--seed={seed}", *self.settings.server_flags(self.n_worlds)]
         if self.settings.is_embedded:
-            return embed_flags(flags)
+            return embed(seed=seed, **self.settings.of_server(self.n_worlds))
         instance = unused_instance()
-        self._program = Program("emberwatch-server", [f"--instance={instance}", *flags])
+        flags = [f"--instance={instance}", f"--seed={seed}"]
+        flags += self.settings.server_flags(self.n_worlds)
+        self._program = Program("emberwatch-server", flags)
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:
@@ -314,6 +371,7 @@ class Session:
         return connect(instance, timeout=self.settings.timeout, wait=self.settings.timeout)
 
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        self._warn_of_test_worlds(seeds)
         self._open((seeds[0] - indices[0]) & (2**64 - 1))
         with self._told():
             self._settle()
@@ -337,6 +395,25 @@ class Session:
             f"no cell of world {barren[0]} (of {len(barren)} of {len(worlds)} worlds) is in the "
             "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
             "model='wildfire-small'"
+        )
+
+    def _warn_of_test_worlds(self, seeds: Sequence[int]) -> None:
+        task = self.spec.task
+        if (
+            task is None
+            or self.allows_test_worlds
+            or not any(it in task.test_seeds for it in seeds)
+        ):
+            return
+        tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
+        # Of this line, wherever the reset is: Python shows it once in a process.
+        warnings.warn(
+            f"task {task.name!r}: an episode begins on a test world, as seeds {tests.start} to "
+            f"{tests.stop - 1} do; train on seeds from {others} on, with reset(seed={others}) or a "
+            f"trainer's seed={others}; to test, use emberwatch.benchmark.evaluate, or ignore "
+            "emberwatch.TrainingOnTestWorldsWarning with warnings.filterwarnings",
+            TrainingOnTestWorldsWarning,
+            stacklevel=1,
         )
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
-from os import fspath
 from pathlib import Path
 from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
 from emberwatch.airspace import Airspace, Zones
-from emberwatch.arguments import check_settings
+from emberwatch.arguments import as_setting, check_settings
 from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model, built_in
 from emberwatch.paths import local, utf8
 from emberwatch.replies import ServerInfo
-from emberwatch.tasks import Task
+from emberwatch.tasks import Task, built_in_tasks
 from emberwatch.wire import Shape
 
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
@@ -27,6 +26,14 @@ SEEDS: Final = 2**53
 #: Where the worlds are: at a server, or in this process.
 SERVER: Final = "server"
 EMBEDDED: Final = "embedded"
+
+#: Keywords whose settings of a server have other names.
+_KEYWORDS: Final = {
+    "moves": "n_moves",
+    "worlds": "num_envs",
+    "worlds times robots": "num_envs",
+    "cells times robots": "height times width times robots",
+}
 
 _Init = TypeVar("_Init")
 
@@ -85,15 +92,15 @@ class Settings:
 
     def __post_init__(self) -> None:
         kinds = get_type_hints(Settings)
-        for field in fields(self):
-            value: Any = getattr(self, field.name)
-            kind = kinds[field.name]
+        for each in fields(self):
+            value: Any = getattr(self, each.name)
+            kind = kinds[each.name]
             if isinstance(value, np.generic):
                 value = cast("Any", value.item())
-                object.__setattr__(self, field.name, value)
+                object.__setattr__(self, each.name, value)
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
-                raise invalid(field.name, field.type, repr(value))
+                raise invalid(each.name, each.type, repr(value))
         if self.backend not in (SERVER, EMBEDDED):
             raise invalid("backend", f"{SERVER!r} or {EMBEDDED!r}", repr(self.backend))
         if self.is_embedded and self.instance is not None:
@@ -132,9 +139,9 @@ class Settings:
         asked = cls(**world)
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
-    def server_flags(self, n_worlds: int) -> list[str]:
-        """The flags of a private server with these worlds, or of embedded ones."""
-        flags = {
+    def of_server(self, n_worlds: int) -> dict[str, Any]:
+        """The settings of these worlds, by their names in `config/server.toml`."""
+        given = {
             "worlds": n_worlds,
             "robots": self.robots,
             "task": self.task,
@@ -143,15 +150,32 @@ class Settings:
             "height": self.height,
             "width": self.width,
             "moves": self.n_moves,
-            "burn-in": self.burn_in,
-            "sensor-radius": self.sensor_radius,
+            "burn_in": self.burn_in,
+            "sensor_radius": self.sensor_radius,
             "start": self.start,
-            "publish-truth": str(self.truth).lower(),
+            "publish_truth": self.truth,
             # Refused where there is no states file.
-            "states-symmetries": "true" if self.states_symmetries else None,
-            "states-offset": self.states_offset or None,
+            "states_symmetries": self.states_symmetries or None,
+            "states_offset": self.states_offset or None,
         }
-        return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
+        return {name: as_setting(name, it) for name, it in given.items() if it is not None}
+
+    def server_flags(self, n_worlds: int) -> list[str]:
+        """The same as flags of `emberwatch-server`."""
+        settings = self.of_server(n_worlds).items()
+        return [
+            f"--{name.replace('_', '-')}={str(it).lower() if isinstance(it, bool) else it}"
+            for name, it in settings
+        ]
+
+    def check(self, n_worlds: int) -> dict[str, Any]:
+        """All settings of a server with these worlds. A refusal names the keyword."""
+        try:
+            return check_settings(self.of_server(n_worlds))
+        except InvalidArgumentError as error:
+            setting, colon, words = str(error).partition(":")
+            words = f"{_KEYWORDS.get(setting, setting)}{colon}{words}"
+            raise InvalidArgumentError(words) from None
 
 
 def shows_keywords(init: _Init) -> _Init:
@@ -193,6 +217,8 @@ class WorldSpec:
     is_recorded: bool
     #: What recorded worlds say of their states; None if a running server hides it.
     description: Description | None = None
+    #: The task that the worlds are, if it is known.
+    task: Task | None = field(default=None, compare=False, repr=False)
 
     @property
     def described(self) -> Description | None:
@@ -219,11 +245,10 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
             "takeover, world, robot: expected instance=..., a running server to attach to, and no "
             f"backend; without one, worlds are an environment's own, got world {settings.world}"
         )
-    n_robots = settings.robots or 1
-    if settings.task is not None:
-        n_robots = check_settings(settings.server_flags(1))["robots"]
+    task = None if settings.task is None else Task.named(settings.task)
+    n_robots = settings.robots or (1 if task is None else task.robots)
     robots = _robots(settings, n_rows, n_robots)
-    checked = check_settings(settings.server_flags(len(robots) // n_robots))
+    checked = settings.check(len(robots) // n_robots)
     described = _described(checked)
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
@@ -237,6 +262,7 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_robots=checked["robots"],
         is_recorded=bool(checked["states"]),
         description=described if checked["states"] else None,
+        task=task,
     )
     return spec, robots
 
@@ -251,8 +277,9 @@ def running_spec(
             raise InvalidArgumentError(
                 f"{name}: expected {default}, as the running server has its own"
             )
+    task = built_in_tasks().get(info.task or "")
     if settings.task is not None:
-        _check_task(settings.task, info)
+        task = _check_task(settings.task, info)
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
     known = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
@@ -288,16 +315,17 @@ def running_spec(
         n_robots=info.n_robots,
         is_recorded=info.recorded_world is not None,
         description=description,
+        task=task,
     )
     return spec, robots
 
 
-def _check_task(asked: str | Path, info: ServerInfo) -> None:
-    """Refuses a server of another task, and one whose worlds are not those of the task."""
+def _check_task(asked: str | Path, info: ServerInfo) -> Task:
+    """The task; refuses a server of another, and one whose worlds are not the task's."""
     task = Task.named(asked)
     if task.name != info.task:
         raise invalid("task", f"{info.task!r}, as the server has, or None", repr(task.name))
-    own = check_settings([f"--task={fspath(asked)}"])
+    own = check_settings({"task": utf8("task", asked)})
     has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
     has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
     for name, got in has.items():
@@ -315,6 +343,7 @@ def _check_task(asked: str | Path, info: ServerInfo) -> None:
         served = Model.from_toml(info.model)
     if served not in (None, described):
         raise invalid(f"states of task {task.name!r}", "those that the server has", described.name)
+    return task
 
 
 def _described(checked: dict[str, Any]) -> Description:

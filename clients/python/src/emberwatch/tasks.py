@@ -4,11 +4,14 @@ import tomllib
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 from emberwatch.arguments import check_settings
 from emberwatch.model import built_in
-from emberwatch.paths import utf8
+from emberwatch.paths import BYTE_ORDER_MARK, utf8
+
+#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+FIRST_TRAINING_SEED: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,14 +28,13 @@ class Task:
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
         """The built-in task of a name, or that of a file, which the server checks first."""
-        utf8("task", name)
-        check_settings([f"--task={fspath(name)}"])
+        check_settings({"task": utf8("task", name)})
         return cls.from_toml(built_in("tasks").get(fspath(name), Path(name)).read_text("utf-8"))
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
         """Reads the text of a file that a server has accepted."""
-        file = tomllib.loads(text)
+        file = tomllib.loads(text.removeprefix(BYTE_ORDER_MARK))
         return cls(
             name=file["name"],
             n_moves=file["moves"],

@@ -15,12 +15,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from emberwatch.agent_session import Features
 from emberwatch.arguments import as_array, as_integer, as_seed, told
 from emberwatch.base import (
     NOTHING_TO_DRAW,
-    REPORTED,
-    REVEALED,
     WorldEnv,
     as_options,
     wants_to_resume,
@@ -29,6 +26,7 @@ from emberwatch.errors import invalid
 from emberwatch.moves import fly
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.owner import SessionOwner
+from emberwatch.plans import Plans
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import View
@@ -46,7 +44,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def __init__(
         self,
         session: Session,
-        observations: Observations | Features,
+        observations: Observations | Plans,
         action_space: spaces.Space[Any],
         *,
         max_episode_steps: int | None,
@@ -73,8 +71,9 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
-        #: What infos tell of the results, once it was asked for.
-        self._numbers: dict[str, NDArray[np.int64]] | None = None
+        #: The numbers that infos have of the results, once they were asked for.
+        self._numbers: dict[str, NDArray[Any]] | None = None
+        self._every = np.ones(num_envs, np.bool_)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
         # Robots that completed a path in this step.
@@ -101,22 +100,25 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
-        if not mask.all() and not self.is_open:
-            raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
-        if not mask.all() and self._session.is_unfinished:
-            raise gymnasium.error.ResetNeeded(
-                "reset_mask: expected all worlds, as an earlier step or reset did not finish"
-            )
-        self.closed = False
-        self._session.begin_reset()
-        chosen = np.flatnonzero(mask).tolist()
-        if resumes:
-            self._take(self._session.resume())
-            self._reset_episodes(chosen)
-        else:
-            self._restart(chosen, seeds)
-        outcome = self._seen(), self._infos(mask)
-        self._session.finish()
+        with self._session.turn:
+            if not mask.all() and not self.is_open:
+                raise gymnasium.error.ResetNeeded(
+                    "reset_mask: expected a reset of all worlds before"
+                )
+            if not mask.all() and self._session.is_unfinished:
+                raise gymnasium.error.ResetNeeded(
+                    "reset_mask: expected all worlds, as an earlier step or reset did not finish"
+                )
+            self.closed = False
+            self._session.begin_reset()
+            chosen = np.flatnonzero(mask).tolist()
+            if resumes:
+                self._take(self._session.resume())
+                self._reset_episodes(chosen)
+            else:
+                self._restart(chosen, seeds)
+            outcome = self._seen(), self._infos(mask)
+            self._session.finish()
         return outcome
 
     def step(
@@ -129,22 +131,23 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             EmberwatchError: As `WildfireEnv.step`.
         """
         chosen = self._check_actions(actions)
-        over, has_ended = self._over, bool(self._over.any())
-        if has_ended and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
-            raise gymnasium.error.ResetNeeded(
-                f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
-                "options={'reset_mask': ...}"
-            )
-        self._session.begin_step()
-        flown = ~over
-        self._exchanged = np.zeros_like(flown)
-        rewards = self._fly(chosen, flown)
-        self._elapsed += flown
-        if has_ended:
-            rewards = np.where(flown, rewards, 0.0)
-            self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
-        outcome = self._outcome(flown, rewards)
-        self._session.finish()
+        with self._session.turn:
+            over, has_ended = self._over, bool(self._over.any())
+            if has_ended and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+                raise gymnasium.error.ResetNeeded(
+                    f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
+                    "options={'reset_mask': ...}"
+                )
+            self._session.begin_step()
+            flown = ~over
+            self._exchanged = np.zeros_like(flown)
+            rewards = self._fly(chosen, flown)
+            self._elapsed += flown
+            if has_ended:
+                rewards = np.where(flown, rewards, 0.0)
+                self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
+            outcome = self._outcome(flown, rewards)
+            self._session.finish()
         return outcome
 
     def render(self) -> tuple[Any, ...] | None:
@@ -277,7 +280,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         else:
             self._over = over
-        infos |= self._infos(np.ones(self.num_envs, np.bool_))
+        infos |= self._infos(self._every)
         return self._seen(), rewards, terminations, truncations, infos
 
     def _final(self, over: NDArray[np.bool_]) -> dict[str, Any]:
@@ -296,21 +299,25 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of some rows, zero for the others, as Gymnasium stacks them."""
         infos: dict[str, Any] = {}
-        for name, numbers in self._told().items():
-            infos[name] = numbers * mask
+        for name, values in self._reported().items():
+            if mask is self._every:
+                infos[name] = values.copy()
+            else:
+                infos[name] = np.zeros_like(values)
+                infos[name][mask] = values[mask]
             infos[f"_{name}"] = mask.copy()
-        if self._truths is not None and self._reveals:
-            infos["truth"] = np.where(mask[:, np.newaxis, np.newaxis], self._truths, np.uint8(0))
-            infos["_truth"] = mask.copy()
         return infos
 
-    def _told(self) -> dict[str, NDArray[np.int64]]:
-        """The numbers of the results that are told to learners."""
+    def _reported(self) -> dict[str, NDArray[Any]]:
+        """What the infos of `WorldEnv` report, of all rows."""
         if self._numbers is None:
-            fields = REVEALED if self._reveals else REPORTED
-            self._numbers = {
-                name: self._results[part][name].astype(np.int64) for name, part in fields.items()
-            }
+            world, robot = self._results["world"], self._results["robot"]
+            numbers = {"step": world["step"], "n_visited": robot["n_visited"]}
+            if self._reveals:
+                numbers |= {"n_target_cells": world["n_target_cells"], "n_hits": robot["n_hits"]}
+            self._numbers = {name: each.astype(np.int64) for name, each in numbers.items()}
+        if self._truths is not None and self._reveals:
+            return {**self._numbers, "truth": self._truths}
         return self._numbers
 
     def _seen(self) -> Any:

@@ -19,6 +19,7 @@ from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice
+from emberwatch.landscape.lengths import side
 from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 from emberwatch.paths import shown, utf8
@@ -102,7 +103,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="cells of the input to use")
     add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
     add("--width", type=_whole, metavar="N", help="columns of the world [the input's]")
-    add("--cell", type=float, metavar="METRES", help="side of a cell, instead of rows and columns")
+    add(
+        "--cell", metavar="METRES", help="side of a cell, or '98.4 ft', instead of rows and columns"
+    )
     add(
         "--resample",
         choices=("earliest", "nearest"),
@@ -150,6 +153,8 @@ def _import(flags: argparse.Namespace) -> None:
     write(contents)
     for states_of_fire in sequences:
         print(_told(states_of_fire))
+    if first is not None and flags.cell is not None and first.ground() is None:
+        print("cells taken as metres, as nothing says their unit; --height N does not need it")
     n_bytes = flags.out.stat().st_size
     told = f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}"
     print(shown(told))
@@ -170,8 +175,7 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
     if flags.begin is not None and not math.isfinite(flags.begin):
         raise invalid("--begin", "a number", flags.begin)
-    if flags.cell is not None and not 1e-3 <= flags.cell < math.inf:
-        raise invalid("--cell", "at least 0.001 metres", flags.cell)
+    flags.cell = None if flags.cell is None else side("--cell", flags.cell).metres
     return Meaning(
         kind=flags.kind,
         step=length(flags.step),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
+from emberwatch.landscape.lengths import METRES, unit_named
 from emberwatch.landscape.packing import Attributes, attributes, unpacked
 from emberwatch.landscape.schedule import Clock
 
@@ -28,11 +29,6 @@ _EVEN: Final = 0.1  # share of a cell by which one may be beside its place, as 3
 #: Names of dimensions and coordinates that are hardly metres.
 _ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
 
-_METRES: Final = {
-    "": 1.0, "1": 1.0, "m": 1.0, "meter": 1.0, "metre": 1.0, "km": 1e3, "kilometer": 1e3,
-    "kilometre": 1e3, "foot": 0.3048, "us_survey_foot": 1200 / 3937,
-}  # fmt: skip
-
 
 class Axis(NamedTuple):
     """A dimension of a variable."""
@@ -49,11 +45,12 @@ class Line(NamedTuple):
     """Cells side by side, along an axis."""
 
     low: float
-    """The least coordinate of their edges, in metres or degrees."""
+    """The least coordinate of their edges."""
     cell: float
     """0 if the file does not say."""
     is_falling: bool
-    is_in_degrees: bool
+    unit: str
+    """`m`, `degrees`, or empty if the file does not say."""
 
 
 def axes_of(file: Path, variable: Any) -> dict[str, Axis]:
@@ -83,8 +80,8 @@ def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
         return None
     given, name = attributes(axis.coordinate), f"{file}, {axis.coordinate.name}"
     is_angle = not _ANGLES.isdisjoint((axis.name.lower(), axis.coordinate.name.lower()))
-    factor, is_in_degrees = _unit(name, given, mapping, is_angle=is_angle)
-    is_longitude = is_in_degrees and axis.letter == "X"
+    factor, unit = _unit(name, given, mapping, is_angle=is_angle)
+    is_longitude = unit == "degrees" and axis.letter == "X"
     middles, sizes = _cells(file, axis.coordinate, given, is_longitude=is_longitude)
     middles = np.unwrap(middles, period=360) if is_longitude else middles
     n = middles.size
@@ -95,7 +92,7 @@ def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
         got = f"some of {sizes.min():.6g} and some of {sizes.max():.6g}" if n > 1 else middles[0]
         raise invalid(name, "cells of one size side by side", got)
     low = min(middles[0], middles[-1]) - abs(step) / 2
-    return Line(low * factor, abs(step) * factor, bool(step < 0), is_in_degrees)
+    return Line(low * factor, abs(step) * factor, bool(step < 0), unit)
 
 
 def auxiliary(variable: Any) -> Iterator[Any]:
@@ -149,19 +146,20 @@ def _axis(file: Path, variable: Any, name: str, position: int) -> Axis:
 
 def _unit(
     name: str, given: Attributes, mapping: Attributes, *, is_angle: bool
-) -> tuple[float, bool]:
-    """Metres of a unit of coordinates, or 1 and that they are degrees."""
+) -> tuple[float, str]:
+    """What coordinates are multiplied by, and the unit that they are then in, as in `Line`."""
     unit = str(given.get("units", "")).strip().lower()
     is_said = "itude" in str(given.get("standard_name", ""))
     if unit.startswith("degree") or (is_said and not unit):
-        return 1.0, True
+        return 1.0, "degrees"
     if unit in ("rad", "radian", "radians") and "perspective_point_height" in mapping:
-        return float(mapping["perspective_point_height"]), False  # of a geostationary satellite
-    unit = unit.replace("feet", "foot")
-    metres = _METRES.get(unit, _METRES.get(unit.removesuffix("s")))
-    if metres is None or (is_angle and not unit):
+        return float(mapping["perspective_point_height"]), "m"  # of a geostationary satellite
+    if unit in ("", "1") and not (is_angle and not unit):
+        return 1.0, ""
+    known = unit_named(unit)
+    if known is None:
         raise invalid(f"{name}, units", "degrees, m, km or feet", f"'{unit}'")
-    return metres, False
+    return METRES[known], "m"
 
 
 def _cells(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.landscape.ground import Ground, is_same, unit_cell
 
 MAX_SIDE: Final = 4096
 """Most rows, and most columns, that the server takes."""
@@ -28,25 +29,44 @@ class Place:
     corner: tuple[float, float] | None = None
     """x and y of the north-west corner; None if the file does not say."""
     cell: tuple[float, float] = (1.0, 1.0)
-    """Width and height of a cell."""
+    """Width and height of a cell, in units of x and y."""
     projection: str | None = None
     """As well-known text."""
-    is_in_degrees: bool = False
-    metres: float = 1.0
-    """Length of a unit of x and y; cells without a projection count in metres."""
+    metres: float | None = None
+    """Length of a unit of x and y without a projection; None if nothing says it."""
+
+    def ground(self, down: float = 0.5, right: float = 0.5) -> Ground | None:
+        """The cell at these shares of the way from the first row and column to the last.
+
+        None if nothing says how large it is on the ground.
+        """
+        (rows, columns), (width, height) = self.shape, self.cell
+        if self.corner is None or (self.projection is None and self.metres is None):
+            return None
+        unit = Ground(self.metres or 1.0, self.metres or 1.0)
+        if self.projection is not None:
+            x = self.corner[0] + width * (0.5 + right * (columns - 1))
+            y = self.corner[1] - height * (0.5 + down * (rows - 1))
+            unit = unit_cell(self.projection, x, y)
+        return unit and unit._replace(width=width * unit.width, height=height * unit.height)
 
     def sides(self) -> tuple[float, float]:
-        """Width and height of a cell in one unit, in the middle of the grid."""
-        width, height = self.cell
-        if self.is_in_degrees and self.corner is not None:
-            middle = self.corner[1] - height * self.shape[0] / 2
-            width *= math.cos(math.radians(middle))
-        return width, height
+        """Width and height of a cell in the middle, on the ground as far as that is known."""
+        ground = self.ground()
+        return self.cell if ground is None else (ground.width, ground.height)
+
+    def could_be_in_degrees(self) -> bool:
+        """Whether nothing says the unit of x and y, and all of them could be degrees."""
+        if self.corner is None or (self.projection, self.metres) != (None, None):
+            return False
+        west, south, east, north = _extent(self)
+        # Edges may be half a cell beyond the poles.
+        return west >= -181 and east <= 361 and south >= -91 and north <= 91
 
 
 def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
     """Refuses a layer whose cells are not those of the first."""
-    if place.projection != first.projection:
+    if not is_same(place.projection, first.projection):
         raise invalid(
             name, f"the projection of {first_name}, {_projection(first)}", _projection(place)
         )
@@ -59,13 +79,45 @@ def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
 
 def check_square(place: Place, name: str) -> None:
     """Refuses a layer whose cells are not square on the ground."""
-    width, height = place.sides()
-    if not (1 - _SQUARE) * height <= width <= (1 + _SQUARE) * height:
-        unit = " degrees of latitude" if place.is_in_degrees else ""
+    ground = place.ground() or Ground(*place.cell)
+    unit = "" if place.ground() is None else " metres on the ground"
+    got = f"{ground.width:.6g} x {ground.height:.6g}{unit}"
+    if abs(math.cos(math.radians(ground.angle))) > _SQUARE:
+        got = f"rows and columns at {ground.angle:.0f} degrees"
+    elif abs(ground.width / ground.height - 1) <= _SQUARE:
+        return
+    raise InvalidArgumentError(
+        f"{name}: expected square cells, got {got}; reproject it (gdalwarp -t_srs), or take them "
+        "as squares with --oblong"
+    )
+
+
+def check_even(place: Place, name: str) -> None:
+    """Refuses a layer whose cells differ in size on the ground, from the middle to the edges."""
+    middle = place.ground()
+    if middle is None:
+        return
+    shares = (0.0, 0.5, 1.0)
+    found = [place.ground(down, right) or middle for down in shares for right in shares]
+    sides = np.array([(one.width, one.height) for one in found])
+    if (np.abs(sides / (middle.width, middle.height) - 1) > _SQUARE).any():
         raise InvalidArgumentError(
-            f"{name}: expected square cells, got {width:.6g} x {height:.6g}{unit}; reproject it "
-            "(gdalwarp), or take them as squares with --oblong"
+            f"{name}: expected cells of one size on the ground, got {sides.min():.6g} to "
+            f"{sides.max():.6g} metres; reproject it (gdalwarp -t_srs), take a part "
+            "(gdal_translate -srcwin), or take all as the one in the middle with --oblong"
         )
+
+
+def check_unit(place: Place, subject: str, remedy: str) -> None:
+    """Refuses cells of unknown size; without a projection they count in metres if they can."""
+    got = _projection(place)
+    if place.could_be_in_degrees():
+        got = "no projection, and numbers that may be degrees"
+    elif place.corner is not None and (place.projection is None or place.ground() is not None):
+        return
+    raise invalid(
+        subject, "cells in metres, or a projection that says their size", f"{got}; {remedy}"
+    )
 
 
 def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
@@ -80,7 +132,8 @@ def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
         )
     if mixed:
         return
-    if (place.projection, place.corner is None) != (first.projection, first.corner is None):
+    has_place = place.corner is not None
+    if not is_same(place.projection, first.projection) or has_place != (first.corner is not None):
         raise InvalidArgumentError(
             f"{name}: expected the projection of the first sequence, {_projection(first)}, got "
             f"{_projection(place)}; --mixed takes both"
@@ -138,9 +191,8 @@ def target_shape(
     """Rows and columns of the world."""
     rows, columns = place.shape
     if cell is not None:
-        if place.corner is None or place.is_in_degrees:
-            raise invalid("--cell", "a grid in metres", f"{_projection(place)}; use --height")
-        share = place.sides()[1] * place.metres / cell
+        check_unit(place, "--cell", "use --height")
+        share = place.sides()[1] / cell
         height, width = max(1, round(rows * share)), max(1, round(columns * share))
     elif height is None and width is None:
         height, width = rows, columns

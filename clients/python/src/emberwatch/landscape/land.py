@@ -1,7 +1,6 @@
 """`python -m emberwatch.landscape land`: a model file with zones from elevation and wind."""
 
 import argparse
-import math
 import tomllib
 from collections.abc import Sequence
 from contextlib import closing
@@ -13,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
-from emberwatch.landscape.grid import MAX_SIDE, check_same, check_square
+from emberwatch.landscape.compass import POINTS, bearing
+from emberwatch.landscape.elevation import slopes
+from emberwatch.landscape.grid import MAX_SIDE, check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice, Layer
-from emberwatch.landscape.terrain import Zone, gradient, zones
+from emberwatch.landscape.lengths import METRES, side
+from emberwatch.landscape.terrain import Zone, zones
 from emberwatch.landscape.world import Fill, check_new, write
 from emberwatch.landscape.zoned import Table, check_base, kernels, toml
 from emberwatch.model import Model
@@ -27,15 +29,17 @@ _EXAMPLES: Final = """
 examples:
   # Fire climbs, and follows a wind of 5 m/s to the east-north-east:
   python -m emberwatch.landscape land dem.tif --wind-speed 5 --wind-towards 20 --out hills.toml
+  # Heights in feet, and a wind from the west-south-west as weather reports name it:
+  python -m emberwatch.landscape land dem.tif --height-unit ft --wind-speed 5 --wind-from WSW \\
+      --out hills.toml
   # Zones of your own, of which 7 and 8 are rivers, and where robots may not be:
   python -m emberwatch.landscape land --zones fuel.tif --unburnable 7,8 --no-fly towns.tif \\
       --out fuels.toml
 """
 #: Larger maps are in a `.npy` file beside the model file, which may have 16 MiB.
 _MOST_INLINE: Final = 1 << 16
-_METRES: Final = ("", "1", "m", "meter", "meters", "metre", "metres")
+_MOST_NUMBER: Final = 10**15  # of a zone; doubles hold all whole numbers up to it
 _MOST_WIND: Final = 100.0  # m/s: more than any hurricane
-_HEIGHTS: Final = (-1000.0, 10_000.0)  # metres: all land, and not -9999
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -58,10 +62,19 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of metres")
+    add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
     add("--out", type=Path, required=True, metavar="FILE.toml", help="the model file")
-    add("--cell", type=float, metavar="METRES", help="side of a cell [as the raster says]")
-    add("--oblong", action="store_true", help="take cells that are not square as squares")
+    add(
+        "--cell",
+        metavar="METRES",
+        help="side of a cell on the ground, where the raster does not say it; '98.4 ft' is in feet",
+    )
+    add(
+        "--height-unit",
+        choices=tuple(METRES),
+        help="what heights count [as the raster says, else m]",
+    )
+    add("--oblong", action="store_true", help="take cells that are not square or differ in size")
     add("--slope-step", type=float, metavar="DEGREES", help="of the classes of slope [5]")
     add("--wind-speed", type=float, default=0.0, metavar="M/S", help="[0: no wind]")
     add(
@@ -69,11 +82,28 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         metavar="DEGREES",
         help="where the wind blows to, from the east towards the north: 0 is to the east, 90 to "
-        "the north; a weather report's direction D, where it comes from, is 270 - D here",
+        "the north",
+    )
+    add(
+        "--wind-from",
+        metavar="POINT|DEGREES",
+        help="instead: where the wind comes from, as weather reports say it: N, NNE, ..., or "
+        "degrees clockwise from the north",
     )
     add("--zones", type=Path, metavar="RASTER", help="whole numbers: each is a zone of its own")
+    add(
+        "--missing-zone",
+        type=int,
+        metavar="N",
+        help="the number of cells of --zones that have none",
+    )
     add("--unburnable", type=_values, metavar="N,N", help="values of --zones that never burn")
-    add("--no-fly", type=Path, metavar="RASTER", help="other than 0 where robots may not be")
+    add(
+        "--no-fly",
+        type=Path,
+        metavar="RASTER",
+        help="a number other than 0 where robots may not be",
+    )
     add(
         "--model",
         default="wildfire-burnout",
@@ -100,7 +130,15 @@ def _make(flags: argparse.Namespace) -> None:
     name = utf8("--name", flags.name or flags.out.stem)
     check_new("--out", flags.out, force=flags.force)
     base, layers = _base(flags), _layers(flags)
-    cells, found = _zones(flags, layers)
+    slope = None
+    if "elevation" in layers:
+        slope = slopes(
+            layers["elevation"],
+            cell=flags.cell,
+            height_unit=flags.height_unit,
+            oblong=flags.oblong,
+        )
+    cells, found = _zones(flags, layers, None if slope is None else slope.rise)
     is_changed = flags.elevation is not None or flags.wind_speed > 0.0
     check_base(base, found, flags.state, is_changed=is_changed)
     maps = {"zone_map": cells} | _no_fly(layers)
@@ -112,11 +150,17 @@ def _make(flags: argparse.Namespace) -> None:
     wind, is_even = (flags.wind_speed, flags.wind_towards), is_changed and not flags.base_wind
     entries = [kernels(base, zone, flags.state, *wind, is_even=is_even) for zone in found]
     model |= {"kernel": [entry for some in entries for entry in some]}
-    text = f"{_origin(flags, layers)}\n{toml(model)}".encode()
+    notes = [] if slope is None else slope.notes
+    comments = "".join(f"# {line}\n" for line in (_origin(flags, layers), *notes))
+    text = f"{comments}\n{toml(model)}".encode()
     contents[flags.out] = lambda file: file.write(text)
     write(contents)
     height, width = cells.shape
     print(shown(f"{flags.out}: {height} x {width} cells, zones: {len(found)}"))
+    for note in notes:
+        print(shown(f"{flags.elevation}: {note}"))
+    if "no_fly" in layers:
+        print(shown(f"{flags.no_fly}: {_told_no_fly(layers['no_fly'])}"))
 
 
 def _check_flags(flags: argparse.Namespace) -> None:
@@ -124,21 +168,38 @@ def _check_flags(flags: argparse.Namespace) -> None:
         raise invalid("--out", "a .toml", flags.out)
     if (flags.elevation, flags.zones, flags.no_fly) == (None, None, None):
         raise InvalidArgumentError("rasters: expected ELEVATION, --zones or --no-fly, got none")
-    needs = dict.fromkeys(("cell", "oblong", "slope_step"), "elevation") | {"unburnable": "zones"}
+    needs = dict.fromkeys(("cell", "height_unit", "oblong", "slope_step"), "elevation")
+    needs |= dict.fromkeys(("unburnable", "missing_zone"), "zones")
     for flag, needed in needs.items():
-        if getattr(flags, flag) not in (None, False) and getattr(flags, needed) is None:
+        value = getattr(flags, flag)
+        if value is not None and value is not False and getattr(flags, needed) is None:
             word = "ELEVATION" if needed == "elevation" else "--zones"
             raise invalid(f"--{flag.replace('_', '-')}", f"{word} beside it", "none")
     flags.slope_step = 5.0 if flags.slope_step is None else flags.slope_step
     if not 0.1 <= flags.slope_step <= 90.0:
         raise invalid("--slope-step", "0.1 to 90 degrees", flags.slope_step)
-    if flags.cell is not None and not 1e-3 <= flags.cell < math.inf:
-        raise invalid("--cell", "at least 0.001 metres", flags.cell)
+    flags.cell = None if flags.cell is None else side("--cell", flags.cell)
+    if flags.missing_zone is not None and abs(flags.missing_zone) > _MOST_NUMBER:
+        raise invalid("--missing-zone", f"at most {_MOST_NUMBER}", flags.missing_zone)
+    _check_wind(flags)
+
+
+def _check_wind(flags: argparse.Namespace) -> None:
+    """Also finds where the wind blows to, whichever flag says it."""
     if not 0.0 <= flags.wind_speed <= _MOST_WIND:
         raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
+    if None not in (flags.wind_towards, flags.wind_from):
+        raise InvalidArgumentError("wind: expected --wind-towards or --wind-from, got both")
+    if flags.wind_from is not None:
+        degrees = bearing(flags.wind_from)
+        if degrees is None or not -360.0 <= degrees <= 360.0:
+            expected = f"one of {', '.join(POINTS)}, or -360 to 360 degrees"
+            raise invalid("--wind-from", expected, f"'{flags.wind_from}'")
+        flags.wind_towards = (270.0 - degrees) % 360.0
     if (flags.wind_speed > 0.0) != (flags.wind_towards is not None):
         raise InvalidArgumentError(
-            "wind: expected a --wind-speed above 0 and --wind-towards, or neither, got one of them"
+            "wind: expected a --wind-speed above 0 and --wind-from (or --wind-towards), or "
+            "neither, got one of them"
         )
     flags.wind_towards = flags.wind_towards or 0.0
     if not -360.0 <= flags.wind_towards <= 360.0:
@@ -178,14 +239,10 @@ def _check_grid(layer: Layer, first: Layer) -> None:
 
 
 def _zones(
-    flags: argparse.Namespace, layers: dict[str, Layer]
+    flags: argparse.Namespace, layers: dict[str, Layer], rise: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.uint8], list[Zone]]:
     """The zone of each cell, and the zones."""
-    rise, values = None, None
-    if "elevation" in layers:
-        rise = gradient(layers["elevation"].values, _cell(layers["elevation"], flags))
-    if "zones" in layers:
-        values = _whole(layers["zones"])
+    values = _whole(layers["zones"], flags.missing_zone) if "zones" in layers else None
     unburnable = flags.unburnable or ()
     missing = set(unburnable).difference(() if values is None else values.flat)
     if missing:
@@ -195,12 +252,20 @@ def _zones(
 
 
 def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
+    """Polygons burnt into a raster leave the rest without a value: robots may be there."""
     if "no_fly" not in layers:
         return {}
-    cells = layers["no_fly"].values != 0.0
+    cells = np.nan_to_num(layers["no_fly"].values, nan=0.0) != 0.0
     if cells.all():
         raise invalid(layers["no_fly"].name, "a cell of 0, where robots may be", "none")
     return {"no_fly": cells.astype(np.uint8)}
+
+
+def _told_no_fly(layer: Layer) -> str:
+    missing = np.isnan(layer.values)
+    n_closed = np.count_nonzero(layer.values[~missing])
+    free = f"; of the others {missing.sum()} have no value" if missing.any() else ""
+    return f"robots may not be in {n_closed} cells{free}"
 
 
 def _layer(file: Path, choice: Choice) -> Layer:
@@ -214,44 +279,21 @@ def _layer(file: Path, choice: Choice) -> Layer:
     if max(height, width) > MAX_SIDE:
         most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes"
         raise invalid(layer.name, most, f"{height} x {width}")
-    missing = np.argwhere(~np.isfinite(layer.values))
-    if missing.size:
-        (row, column), value = missing[0], layer.values[tuple(missing[0])]
-        got = f"{value} in row {row}, column {column}"
-        raise invalid(layer.name, "a number in each cell", got)
     return layer
 
 
-def _cell(layer: Layer, flags: argparse.Namespace) -> float:
-    """The side of a cell of elevation, in metres."""
-    place, unit = layer.place, layer.clock.words.strip()
-    if min(place.shape) < 2:
-        got = f"{place.shape[0]} x {place.shape[1]}"
-        raise invalid(layer.name, "at least 2 x 2 cells, as slopes are between cells", got)
-    if unit.lower() not in _METRES:
-        raise invalid(layer.name, "elevation in metres", f"it in '{unit}'")
-    wrong = layer.values[(layer.values < _HEIGHTS[0]) | (layer.values > _HEIGHTS[1])]
-    if wrong.size:
-        expected = f"elevations of {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} metres"
-        raise invalid(layer.name, expected, f"{wrong[0]:g}; if it means no value, fill it")
-    if not flags.oblong:
-        check_square(place, layer.name)
-    if place.corner is not None and not place.is_in_degrees:
-        if flags.cell is not None:
-            side = f"{place.sides()[1] * place.metres:g} metres"
-            raise invalid("--cell", f"none, as {layer.name} says {side}", flags.cell)
-        return place.sides()[1] * place.metres
-    if flags.cell is None:
-        got = "cells in degrees" if place.is_in_degrees else "no place on the ground"
-        raise invalid(layer.name, "cells in metres", f"{got}; say --cell METRES, or reproject it")
-    return flags.cell
-
-
-def _whole(layer: Layer) -> NDArray[np.int64]:
-    wrong = layer.values[(layer.values % 1 != 0) | (np.abs(layer.values) > 1e15)]
+def _whole(layer: Layer, missing_zone: int | None) -> NDArray[np.int64]:
+    missing = np.isnan(layer.values)
+    if missing.any() and missing_zone is None:
+        row, column = np.argwhere(missing)[0].tolist()
+        got = f"none in {missing.sum()} cells, the first in row {row}, column {column}"
+        remedy = "--missing-zone N gives them the number N"
+        raise invalid(layer.name, "a number in each cell", f"{got}; {remedy}")
+    values = np.where(missing, missing_zone or 0, layer.values)
+    wrong = values[(values % 1 != 0) | (np.abs(values) > _MOST_NUMBER)]
     if wrong.size:
         raise invalid(layer.name, "whole numbers, each a zone", wrong[0])
-    return layer.values.astype(np.int64)
+    return values.astype(np.int64)
 
 
 def _map(
@@ -270,7 +312,7 @@ def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
     """A comment that says what the file was made of."""
     files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
     wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
-    return f"# {_NAME}: {files}; model {ascii(flags.model)}; wind of {wind}"
+    return f"{_NAME}: {files}; model {ascii(flags.model)}; wind of {wind}"
 
 
 def _values(text: str) -> tuple[int, ...]:

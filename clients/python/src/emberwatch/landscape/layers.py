@@ -1,6 +1,5 @@
 """A layer: numbers with the place of their cells; and what the readers of all formats share."""
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.schedule import Clock, Time
 
@@ -40,17 +39,6 @@ class Layer:
     """What single numbers mean, as far as the file says."""
     time: Time | None = None
     """When the layer is, if the file says."""
-
-
-def library(name: str, file: object) -> Any:
-    """The module that reads a file."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InvalidArgumentError(
-            f"{file}: expected {name} to read it with, got: {error}; "
-            "pip install emberwatch[landscape]"
-        ) from None
 
 
 def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:

@@ -16,14 +16,9 @@ from numpy.typing import NDArray
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.axes import Axis, auxiliary, axes_of, find, letter_of, line
 from emberwatch.landscape.grid import Place
-from emberwatch.landscape.layers import (
-    Choice,
-    Layer,
-    check_cells,
-    choose_bands,
-    choose_variable,
-    library,
-)
+from emberwatch.landscape.ground import unit_of
+from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands, choose_variable
+from emberwatch.landscape.libraries import library
 from emberwatch.landscape.packing import Attributes, attributes, unpacked
 from emberwatch.landscape.schedule import Clock, Time
 
@@ -128,16 +123,19 @@ def _place(file: Path, variable: Any, axes: dict[str, Axis]) -> tuple[Place, tup
     if x is None or y is None:
         _check_straight(file, variable, axes)
         return Place(shape=shape), turned
-    if x.is_in_degrees != y.is_in_degrees:
+    is_in_degrees, unit = x.unit == "degrees", x.unit or y.unit
+    if is_in_degrees != (y.unit == "degrees"):
         raise invalid(file, "rows and columns in one unit", "degrees and metres")
-    cell = x.cell or y.cell or 1.0, y.cell or x.cell or 1.0
-    west = (round(x.low + 180, 9) % 360) - 180 if x.is_in_degrees else x.low
+    projection = _projection(file, mapping, is_in_degrees=is_in_degrees)
+    share = _share(file, projection, unit)
+    width, height = x.cell or y.cell or 1.0, y.cell or x.cell or 1.0
+    west = (round(x.low + 180, 9) % 360) - 180 if is_in_degrees else x.low
     place = Place(
         shape=shape,
-        corner=(west, y.low + shape[0] * cell[1]),
-        cell=cell,
-        projection=_projection(file, mapping, is_in_degrees=x.is_in_degrees),
-        is_in_degrees=x.is_in_degrees,
+        corner=(west * share, (y.low + shape[0] * height) * share),
+        cell=(width * share, height * share),
+        projection=projection,
+        metres=1.0 if unit == "m" else None,
     )
     return place, turned
 
@@ -168,14 +166,31 @@ def _mapping(variable: Any, column: str) -> Attributes:
 
 
 def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str | None:
-    """As well-known text, or in the words of the grid mapping."""
+    """As well-known text, or in the words of a grid mapping that pyproj does not know."""
+    pyproj = library("pyproj", file)
     text = mapping.get("crs_wkt") or mapping.get("spatial_ref")
     if text:
-        return library("rasterio.crs", file).CRS.from_wkt(text).to_wkt()
-    if mapping:
+        return str(text)
+    if not mapping:
+        return pyproj.CRS("EPSG:4326").to_wkt() if is_in_degrees else None
+    name = mapping.get("grid_mapping_name", "grid mapping")
+    try:
+        return pyproj.CRS.from_cf({"projected_crs_name": name} | dict(mapping)).to_wkt()
+    except Exception:  # of pyproj, for attributes of any name and kind
         told = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
-        return f'"{mapping.get("grid_mapping_name", "grid mapping")}" {told}'
-    return '"degrees"' if is_in_degrees else None
+        return f'"{name}" {told}'
+
+
+def _share(file: Path, projection: str | None, unit: str) -> float:
+    """What metres or degrees are multiplied by to be in the unit of the projection."""
+    known = None if projection is None else unit_of(projection)
+    if known is None or not unit:
+        return 1.0
+    length, is_angle = known
+    if is_angle != (unit == "degrees"):
+        words = ("metres", "degrees") if is_angle else ("degrees", "metres")
+        raise invalid(file, f"coordinates in {words[1]}, as its grid mapping is", words[0])
+    return (math.radians(1.0) if is_angle else 1.0) / length
 
 
 def _times(

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
-from emberwatch.landscape.layers import is_missing, library
+from emberwatch.landscape.layers import is_missing
+from emberwatch.landscape.libraries import library
 
 Attributes = Mapping[str, Any]
 

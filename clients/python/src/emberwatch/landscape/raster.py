@@ -11,14 +11,8 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import LIKE, Place
-from emberwatch.landscape.layers import (
-    Choice,
-    Layer,
-    check_cells,
-    choose_bands,
-    is_missing,
-    library,
-)
+from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands, is_missing
+from emberwatch.landscape.libraries import library
 from emberwatch.landscape.schedule import Clock
 from emberwatch.paths import utf8
 
@@ -74,8 +68,6 @@ def _place(file: Path, source: Any) -> Place:
         corner=(min(transform.c, far[0]), max(transform.f, far[1])),
         cell=(abs(transform.a), abs(transform.e)),
         projection=crs.to_wkt() if crs else None,
-        is_in_degrees=bool(crs and crs.is_geographic),
-        metres=crs.linear_units_factor[1] if crs and crs.is_projected else 1.0,
     )
 
 

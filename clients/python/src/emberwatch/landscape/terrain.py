@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.compass import facing
 
 MAX_ZONES: Final = 256
 """As many as the byte of a cell in a map of zones tells apart."""
@@ -36,13 +37,13 @@ class Zone:
     burns: bool = True
 
 
-def gradient(elevation: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
+def gradient(elevation: NDArray[np.float64], width: float, height: float) -> NDArray[np.float64]:
     """Metres of rise per metre to the east and to the north, shape (2, H, W).
 
-    `elevation`: shape (H, W), in metres, the first row in the north; `cell`: its side in metres.
-    Central differences, one-sided at the edges.
+    `elevation`: shape (H, W), in metres, the first row in the north; `width` and `height`: of a
+    cell on the ground, in metres. Central differences, one-sided at the edges.
     """
-    southward, eastward = np.gradient(elevation, cell)
+    southward, eastward = np.gradient(elevation, height, width)
     return np.stack([eastward, -southward])
 
 
@@ -121,7 +122,9 @@ def _kinds(
 
 
 def _slope_name(degrees: float, aspect: int) -> str:
-    return f"{degrees:g} degrees up to the {_ASPECTS[aspect]}" if degrees > 0 else "flat"
+    if degrees == 0:
+        return "flat"
+    return f"{degrees:g} degrees up to the {_ASPECTS[aspect]}, aspect {facing(aspect)}"
 
 
 def _color(degrees: float, aspect: int) -> str:

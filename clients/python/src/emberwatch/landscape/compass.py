@@ -1,0 +1,31 @@
+"""Directions as maps and weather reports name them: clockwise from the north."""
+
+import re
+from typing import Final
+
+POINTS: Final = tuple("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split())
+
+
+def bearing(text: str) -> float | None:
+    """Degrees clockwise from the north; None if the text is neither a point nor a number.
+
+    A point is one of `POINTS`, or in words, such as `north-west`.
+    """
+    words = re.sub(r"[\s-]", "", text.lower())
+    for name in ("north", "east", "south", "west"):
+        words = words.replace(name, name[0])
+    if words.upper() in POINTS:
+        return POINTS.index(words.upper()) * 360 / len(POINTS)
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def facing(eighths: int) -> str:
+    """The aspect of a slope: the point that it faces, downhill.
+
+    `eighths`: the direction in which it rises, in eighths of a circle from the east towards the
+    north.
+    """
+    return POINTS[(12 - 2 * eighths) % len(POINTS)]

@@ -1,0 +1,365 @@
+"""Land in any unit: what map units and heights are in metres on the ground, and what is assumed."""
+
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import CRS
+from rasters import ARRIVAL, UTM, ascii_grid, geotiff, netcdf
+from test_landscape_netcdf import Variable, written
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.__main__ import main
+from emberwatch.landscape.compass import bearing
+from emberwatch.landscape.ground import is_same
+from emberwatch.landscape.lengths import METRES, side, unit_named
+
+FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
+#: Of a degree, in metres; a sphere is near enough for 0.2 degrees of slope.
+DEGREE = 111_200.0
+SECOND = 1 / 3600
+LAT_60 = math.cos(math.radians(60))
+SINUSOIDAL = "+proj=sinu +R=6371007.181 +units=m"
+
+
+class Map(NamedTuple):
+    """A raster of a slope of 10 degrees."""
+
+    crs: str | None
+    cell: float
+    """Side in units of the map."""
+    corner: tuple[float, float]
+    ground: tuple[float, float]
+    """Width and height of a cell in metres."""
+    flags: str = ""
+    height: float = 1.0
+    """Metres of a unit of height."""
+    unit: str | None = None
+    """Of heights, as the raster says it."""
+    ending: str = ".tif"
+
+
+M30, NEW_YORK, OREGON = (30.0, 30.0), (1e6, 2e5), (8e5, 9e5)
+ARC = (DEGREE * SECOND, DEGREE * SECOND)
+SECONDS_60 = (ARC[0] * LAT_60, ARC[1])
+MERCATOR_60 = (1.6e6, 8.4e6 - 2e4)
+
+SLOPES: dict[str, Map] = {
+    "metres": Map(UTM, 30, (5e5, 4e6), M30),
+    "metres of no projection": Map(None, 30, (5e5, 4e6), M30),
+    "US survey feet by projection": Map(
+        "EPSG:2263", 100, NEW_YORK, (30.48, 30.48), "--height-unit us-ft", SURVEY_FOOT
+    ),
+    "US survey feet by projection, heights in metres": Map(
+        "EPSG:2263", 100, NEW_YORK, (30.48, 30.48), "--height-unit m"
+    ),
+    "US survey feet, heights too, by projection": Map(
+        "EPSG:2263+6360", 100, NEW_YORK, (30.48, 30.48), "", SURVEY_FOOT
+    ),
+    "US survey feet by flags": Map(
+        None, 100, NEW_YORK, (30.48, 30.48), "--cell 100us-ft --height-unit us-ft", SURVEY_FOOT
+    ),
+    "international feet by projection": Map(
+        "EPSG:2992", 100, OREGON, (30.48, 30.48), "--height-unit ft", FOOT
+    ),
+    "international feet by flags": Map(
+        None, 100, OREGON, (30.48, 30.48), "--cell 100ft --height-unit ft", FOOT
+    ),
+    "international feet, in a file beside an ASCII grid": Map(
+        "EPSG:2992", 100, OREGON, (30.48, 30.48), "--height-unit ft", FOOT, ending=".asc"
+    ),
+    "metres, heights in feet by band": Map(UTM, 30, (5e5, 4e6), M30, "", FOOT, "ft"),
+    "metres, heights in feet by projection": Map(
+        "EPSG:32610+8228", 30, (5e5, 4e6), M30, "", FOOT, ending=".asc"
+    ),
+    "metres, heights in feet by flag against the band": Map(
+        UTM, 30, (5e5, 4e6), M30, "--height-unit ft", FOOT, "metre"
+    ),
+    "metres, heights in decimetres by flag": Map(UTM, 30, (5e5, 4e6), M30, "--height-unit dm", 0.1),
+    "metres, heights in centimetres by band": Map(UTM, 30, (5e5, 4e6), M30, "", 0.01, "cm"),
+    "degrees at the equator": Map("EPSG:4326", SECOND, (-70, 0), ARC),
+    "degrees at 60 N": Map("EPSG:4326", SECOND, (10, 60), SECONDS_60, "--oblong"),
+    "degrees of no projection": Map(None, SECOND, (-120, 38), M30, "--cell 30"),
+    "degrees of no projection, in an ASCII grid": Map(
+        None, SECOND, (-120, 38), M30, "--cell 30", ending=".asc"
+    ),
+    "grads at 54 degrees": Map(
+        "EPSG:4807",
+        1e-3,
+        (2, 60),
+        (DEGREE * 9e-4 * math.cos(math.radians(54)), DEGREE * 9e-4),
+        "--oblong",
+    ),
+    "Web Mercator at 60 N": Map("EPSG:3857", 60, MERCATOR_60, M30),
+    "Mercator of an ellipsoid at 60 N": Map("EPSG:3395", 60, (1.6e6, 8.3625e6), M30),
+    "Mercator of Esri at 60 N": Map("ESRI:54004", 60, (1.6e6, 8.3625e6), M30),
+    "equal areas at 30 N": Map("EPSG:6933", 30, (1e6, 3.66e6), M30),
+    # Widths shrink by cos(60) / cos(30) and heights grow as much.
+    "equal areas at 60 N": Map(
+        "EPSG:6933", 30, (1e6, 6.33e6), (30 / 3**-0.5 * 3**-1.0, 30 * 3**0.5), "--oblong"
+    ),
+    "sinusoidal on its meridian": Map(SINUSOIDAL, 30, (0, 4e6), M30),
+}
+
+
+def raster(path: Path, place: Map, direction: tuple[float, float]) -> Path:
+    """Heights that rise by 10 degrees in a direction: east and north."""
+    rows, columns = np.indices((12, 12))
+    east, north = columns * place.ground[0], -rows * place.ground[1]
+    metres = (direction[0] * east + direction[1] * north) * math.tan(math.radians(10))
+    heights = (metres + 500) / place.height
+    file = path.with_suffix(place.ending)
+    if place.ending == ".tif":
+        cell = place.cell, place.cell
+        geotiff(file, heights, crs=place.crs, corner=place.corner, cell=cell)
+    else:
+        x, y = place.corner[0], place.corner[1] - 12 * place.cell
+        ascii_grid(file, heights, side=f"cellsize {place.cell:.15g}")
+        text = file.read_text().replace("xllcorner 0", f"xllcorner {x:.12f}")
+        file.write_text(text.replace("yllcorner 0", f"yllcorner {y:.12f}"))
+        if place.crs is not None:
+            file.with_suffix(".prj").write_text(CRS(place.crs).to_wkt("WKT1_GDAL"))
+    if place.unit is not None:
+        with rasterio.open(file, "r+") as opened:
+            opened.units = (place.unit,)
+    return file
+
+
+def made(folder: Path, *flags: object) -> dict[str, Any]:
+    out = folder / "out" / "land.toml"
+    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
+    return tomllib.loads(out.read_text("utf-8"))
+
+
+@pytest.mark.parametrize("direction", [(1, 0), (0, -1), (0.6, 0.8)])
+@pytest.mark.parametrize("case", SLOPES)
+def test_a_slope_of_10_degrees_is_one_in_every_unit_and_projection(
+    case: str, direction: tuple[float, float], tmp_path: Path
+) -> None:
+    place = SLOPES[case]
+    file = raster(tmp_path / "dem", place, direction)
+    model = made(tmp_path, file, "--slope-step=0.1", *place.flags.split())
+    names = [zone["name"] for zone in model["zones"]]
+    assert names
+    for name in names:
+        assert float(name.split()[0]) == pytest.approx(10, abs=0.2), name
+
+
+EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
+
+
+def notes(capsys: pytest.CaptureFixture[str]) -> str:
+    return capsys.readouterr().out
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, *flags: object) -> str:
+    with pytest.raises(SystemExit):
+        made(folder, *flags)
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assumed = "heights taken as metres, as nothing says their unit; --height-unit ft changes that"
+    model, dem = tmp_path / "out" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
+    made(tmp_path, dem)
+    assert assumed in notes(capsys) and f"# {assumed}" in model.read_text()
+    for unit, words in (("ft", "international feet"), ("US survey foot", "US survey feet")):
+        with rasterio.open(dem, "r+") as file:
+            file.units = (unit,)
+        made(tmp_path, dem)
+        assert f"heights in {words}, as the raster says" in notes(capsys)
+    made(tmp_path, dem, "--height-unit=cm")
+    words = "heights in centimetres, as --height-unit says, not in US survey feet, as the raster"
+    assert words in notes(capsys)
+    made(tmp_path, netcdf(tmp_path / "dem.nc", z=EASTWARD, unit="1"))
+    assert assumed in notes(capsys)
+    made(tmp_path, geotiff(tmp_path / "no.tif", EASTWARD, crs=None))
+    words = "cells of 30 x 30 metres, as nothing says another unit (--cell does); steepest slope 10"
+    assert words in notes(capsys)
+
+
+def test_cells_in_feet_with_heights_in_no_unit_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = "expected a unit of heights, as cells are in feet, got none; say --height-unit ft"
+    plane = geotiff(tmp_path / "plane.tif", EASTWARD, crs="EPSG:2263", cell=(100, 100))
+    assert words in refused(capsys, tmp_path, plane)
+    local = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'
+    local = geotiff(tmp_path / "local.tif", EASTWARD, crs=local, cell=(100, 100))
+    assert words in refused(capsys, tmp_path, local)
+    bare = geotiff(tmp_path / "bare.tif", EASTWARD, crs=None, cell=(100, 100))
+    assert words in refused(capsys, tmp_path, bare, "--cell=100 ft")
+
+
+@pytest.mark.parametrize(
+    ("corner", "cell"), [((-120, 38), SECOND), ((179.9, -16), 0.1), ((0, 91), 0.5), ((2, 54), 1e-3)]
+)
+def test_numbers_that_may_be_degrees_are_not_taken_as_metres(
+    corner: tuple[float, float], cell: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem = geotiff(tmp_path / "dem.tif", EASTWARD, crs=None, corner=corner, cell=(cell, cell))
+    words = "no projection, and numbers that may be degrees; say --cell METRES, or its projection ("
+    assert words in refused(capsys, tmp_path, dem)
+    fire = geotiff(tmp_path / "fire.tif", crs=None, corner=corner, cell=(cell, cell))
+    flags = "--kind=arrival --unit=min --burning=2 --cell=60".split()
+    with pytest.raises(SystemExit):
+        main([str(fire), *flags, "--step=10 min", "--out", str(tmp_path / "fire.npz")])
+    assert "numbers that may be degrees; use --height" in capsys.readouterr().err
+
+
+def test_cells_that_differ_on_the_ground_are_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    big, flat = (20_000, 20_000), np.zeros((40, 40))
+    mercator = geotiff(tmp_path / "web.tif", flat, crs="EPSG:3857", corner=(0, 9e6), cell=big)
+    words = "web.tif: expected cells of one size on the ground, got "
+    assert words in refused(capsys, tmp_path, mercator)
+    made(tmp_path, mercator, "--oblong")
+    # Far from its meridian, as MODIS tiles of California are, rows and columns are askew.
+    modis = geotiff(tmp_path / "modis.tif", EASTWARD, crs=SINUSOIDAL, corner=(-1e7, 4e6))
+    words = "modis.tif: expected square cells, got rows and columns at 139 degrees; reproject it"
+    assert words in refused(capsys, tmp_path, modis)
+    nowhere = geotiff(tmp_path / "no.tif", EASTWARD, crs="EPSG:4326", corner=(0, 900), cell=(1, 1))
+    words = "projection WGS 84: expected cells on the Earth, got one at 2.5, 898"
+    assert words in refused(capsys, tmp_path, nowhere)
+
+
+def test_a_grid_turned_from_true_north_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made(tmp_path, geotiff(tmp_path / "c.tif", EASTWARD, crs="EPSG:3979", corner=(-2e6, 8e5)))
+    assert "north is up here, which is 27 degrees west of true north" in notes(capsys)
+    made(tmp_path, geotiff(tmp_path / "utm.tif", EASTWARD, corner=(3e5, 4e6)))
+    assert "north" not in notes(capsys)
+
+
+@pytest.mark.parametrize("nodata", [0, 255])
+def test_cells_without_a_value_in_a_mask_are_free(
+    nodata: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    towns = np.full((4, 5), nodata, "u1")
+    towns[1:3, 2:] = 1
+    mask = geotiff(tmp_path / "towns.tif", towns, nodata=nodata, dtype="uint8")
+    model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), "--no-fly", mask)
+    np.testing.assert_array_equal(model["no_fly"], towns == 1)
+    assert f"{mask}: robots may not be in 6 cells; of the others 14 have no value" in notes(capsys)
+
+
+@pytest.mark.parametrize("nodata", [-9999, 255])
+def test_cells_without_a_zone_get_the_number_of_a_flag(nodata: int, tmp_path: Path) -> None:
+    fuel = np.array([[1, 1, nodata], [2, nodata, 2]])
+    zones = geotiff(tmp_path / "fuel.tif", fuel, nodata=nodata, dtype="int16")
+    model = made(tmp_path, "--zones", zones, "--missing-zone", 0, "--unburnable", 0)
+    assert [zone["name"] for zone in model["zones"]] == ["zone 0, never burns", "zone 1", "zone 2"]
+    assert model["zone_map"] == [[1, 1, 0], [2, 0, 2]]
+
+
+@pytest.mark.parametrize(
+    ("comes_from", "towards"),
+    [("N", 270), ("wsw", 22.5), ("north-west", 315), ("South South East", 112.5), ("250", 20)],
+)
+def test_a_wind_comes_from_a_point_of_the_compass(
+    comes_from: str, towards: float, tmp_path: Path
+) -> None:
+    dem = geotiff(tmp_path / "dem.tif", EASTWARD)
+    wind = ("--wind-speed=5", "--wind-from", comes_from)
+    other = ("--wind-speed=5", "--wind-towards", towards)
+    assert made(tmp_path, dem, *wind) == made(tmp_path, dem, *other)
+    assert bearing(comes_from) == (270 - towards) % 360
+
+
+def test_units_are_known_in_the_words_of_files() -> None:
+    words = {
+        "m": "m M metre metres Meter meters",
+        "ft": "ft foot Feet international_foot",
+        "us-ft": "us-ft US_survey_foot U.S.|survey|feet ftUS Foot_US US|Survey|Foot survey_foot",
+        "dm": "dm decimetres", "cm": "cm Centimeter", "mm": "mm", "km": "km kilometre",
+    }  # fmt: skip
+    for unit, spellings in words.items():
+        for spelling in spellings.split():
+            assert unit_named(spelling.replace("|", " ")) == unit, spelling
+    for word in ("", "1", "ms", "m s-1", "m2 s-2", "furlong", "s", "min", "K"):
+        assert unit_named(word) is None, word
+    assert side("--cell", "98.4 ft").metres == 98.4 * FOOT
+    assert side("--cell", "1e2us-ft") == (100 * SURVEY_FOOT, "us-ft")
+    for text in ("ft", "-3", "nan", "inf", "0", "3 4", "1e999"):
+        with pytest.raises(InvalidArgumentError, match="expected at least 0.001 metres, such as"):
+            side("--cell", text)
+    assert set(METRES) == set(words)
+
+
+def test_one_projection_in_other_words_is_the_same() -> None:
+    for code in (UTM, "EPSG:2263", "EPSG:4326", "EPSG:3857"):
+        crs = CRS(code)
+        texts = [crs.to_wkt(version) for version in ("WKT2_2019", "WKT1_GDAL", "WKT1_ESRI")]
+        assert all(is_same(texts[0], text) for text in texts)
+        assert is_same(texts[0], CRS(f"{code}+5703").to_wkt())
+        assert not is_same(texts[0], CRS("EPSG:32611").to_wkt()) and not is_same(texts[0], None)
+    assert is_same('"words" a 1', '"words" a 1') and not is_same('"words" a 1', '"words" a 2')
+
+
+def world(folder: Path, file: Path, cell: float) -> tuple[int, ...]:
+    """The shape of a recorded world of this fire with cells of so many metres."""
+    out = folder / "fire.npz"
+    flags = "--kind arrival --unit min --burning 2 --resample nearest --force --oblong".split()
+    main([str(file), *flags, "--step=10 min", f"--cell={cell}", "--out", str(out)])
+    with np.load(out) as sequences:
+        return sequences["states_000"].shape[1:]
+
+
+def test_cells_of_a_recorded_world_are_metres_on_the_ground(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fire = ARRIVAL.repeat(4, axis=0).repeat(4, axis=1)
+    for crs, side_, corner in (
+        ("EPSG:3857", 60, MERCATOR_60), ("EPSG:4326", 30 / DEGREE, (10, 0)), (UTM, 30, (5e5, 4e6)),
+        ("EPSG:2992", 30 / FOOT, OREGON),
+    ):  # fmt: skip
+        file = geotiff(tmp_path / "fire.tif", fire, crs=crs, corner=corner, cell=(side_, side_))
+        assert world(tmp_path, file, 60) == (6, 8), crs
+        assert "taken as metres" not in notes(capsys)
+    file = geotiff(tmp_path / "fire.tif", fire, crs=None, cell=(30, 30))
+    assert world(tmp_path, file, 60) == (6, 8)
+    assert "cells taken as metres, as nothing says their unit" in notes(capsys)
+
+
+def mapped(path: Path, unit: str, factor: float, corner: tuple[float, float], **mapping: Any):
+    """Heights on cells of 60 units of the map, whose coordinates are in some unit."""
+    x, y = (corner[0] + np.arange(5) * 60) / factor, (corner[1] - np.arange(4) * 60) / factor
+    x = Variable(x, "f8", ("x",), {"standard_name": "projection_x_coordinate", "units": unit})
+    y = Variable(y, "f8", ("y",), {"standard_name": "projection_y_coordinate", "units": unit})
+    z = Variable(EASTWARD, "f8", ("y", "x"), {"units": "m", "grid_mapping": "crs"})
+    return written(path, x=x, y=y, z=z, crs=Variable(0, "i4", (), mapping))
+
+
+def test_a_grid_mapping_says_how_large_cells_of_a_netcdf_file_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mercator = {"grid_mapping_name": "mercator", "standard_parallel": 0.0}
+    mercator |= {"longitude_of_projection_origin": 0.0}
+    feet = {"crs_wkt": CRS("EPSG:2263").to_wkt()}
+    for unit, factor, corner, mapping, size in (
+        ("m", 1.0, (1.6e6, 8.3625e6), mercator, 30.0),
+        ("km", 1e3, (1.6e6, 8.3625e6), mercator, 30.0),
+        ("m", 1.0, (3e5, 6e4), feet, 60.0),
+        ("US_survey_foot", 1.0, NEW_YORK, feet, 60 * SURVEY_FOOT),
+        ("", 1.0, NEW_YORK, feet, 60 * SURVEY_FOOT),
+    ):
+        file = mapped(tmp_path / "dem.nc", unit, factor, corner, **mapping)
+        made(tmp_path, file)
+        cells = re.search(r"cells of (\S+) x (\S+) metres on the ground", notes(capsys))
+        assert cells is not None
+        assert [float(one) for one in cells.groups()] == pytest.approx([size] * 2, rel=5e-3)
+    file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, crs_wkt=CRS("EPSG:4326").to_wkt())
+    words = "expected coordinates in degrees, as its grid mapping is, got metres"
+    assert words in refused(capsys, tmp_path, file)
+    file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, grid_mapping_name="mine")
+    words = "a projection that says their size, got mine; say --cell METRES"
+    assert words in refused(capsys, tmp_path, file)
+    made(tmp_path, file, "--cell=60")

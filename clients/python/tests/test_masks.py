@@ -1,0 +1,186 @@
+"""Action masks where trainers look: in infos, observations, wrappers, vectors and teams."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import land
+import numpy as np
+import pytest
+from environments import MOVES, SMALL, closed_later, make, make_vec, no_warnings, rollout
+from failures import fails, refuses
+from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics
+
+import emberwatch
+from emberwatch.wrappers import BeliefObservation
+
+#: Of a robot in row 0, under a grid's edge, and with a no-fly cell to its right.
+EXPECTED = [0, 1, 1, 0]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> dict[str, Any]:
+    """Keywords of worlds with no-fly cells, in which robots start at row 0, column 2."""
+    path = tmp_path / "model.toml"
+    path.write_text(land.model(no_fly=land.NO_FLY))
+    return {**SMALL, "model": path, "start": "0,2", "n_moves": 6}
+
+
+def is_mask(mask: Any, expected: Any = EXPECTED) -> bool:
+    """Whether it is as spaces of Gymnasium take it, and has these values."""
+    return mask.dtype == np.int8 and mask.tolist() == expected
+
+
+def of(*cells: tuple[int, int]) -> list[list[int]]:
+    """The masks of robots in these cells, by the loop over no-fly cells."""
+    return [[int(legal) for legal in land.legal_moves(cell, land.NO_FLY)] for cell in cells]
+
+
+def test_a_lone_robot_s_mask_is_in_infos_and_samples(world: dict[str, Any]) -> None:
+    env = make(MOVES, **world)
+    with fails("closed"):
+        env.unwrapped.action_masks()
+    observation, info = env.reset(seed=1000)
+    assert is_mask(info["action_mask"])
+    for _ in range(20):
+        mask = env.get_wrapper_attr("action_masks")()
+        assert is_mask(mask, info["action_mask"].tolist())
+        before = observation["robot"].tolist()
+        observation, *_, info = env.step(env.action_space.sample(info["action_mask"]))
+        assert observation["robot"].tolist() != before
+        (expected,) = of(tuple(observation["robot"].tolist()))
+        assert is_mask(info["action_mask"], expected)
+
+
+def test_masks_are_arrays_of_each_step(world: dict[str, Any]) -> None:
+    env = make(MOVES, **world)
+    _, info = env.reset(seed=1000)
+    info["action_mask"][:] = 5
+    *_, later = env.step(0)
+    assert is_mask(later["action_mask"]) and is_mask(env.unwrapped.action_masks())
+
+
+def test_a_robot_that_no_move_leads_on_may_choose_all() -> None:
+    start = make(MOVES, height=1, width=1, burn_in=0)
+    assert is_mask(start.reset(seed=1000)[1]["action_mask"], [1, 1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda env: FrameStackObservation(env, 2),
+        RecordEpisodeStatistics,
+        BeliefObservation,
+        lambda env: BeliefObservation(RecordEpisodeStatistics(env), keep=True),
+    ],
+)
+def test_masks_pass_wrappers(world: dict[str, Any], wrap: Any) -> None:
+    env = wrap(make(MOVES, **world))
+    assert is_mask(env.reset(seed=1000)[1]["action_mask"])
+    assert is_mask(env.get_wrapper_attr("action_masks")())
+
+
+def test_a_mask_in_the_observation_is_that_of_the_info(world: dict[str, Any]) -> None:
+    with no_warnings():
+        env = make(MOVES, observation=("robot", "action_mask"), **world)
+        assert env.observation_space["action_mask"] == gymnasium.spaces.Box(0, 1, (4,), np.int8)
+        for observation, *_, info in rollout(env, 20, seed=1000):
+            assert is_mask(observation["action_mask"], info["action_mask"].tolist())
+    stacked = FrameStackObservation(env, 3)
+    assert stacked.reset(seed=1000)[0]["action_mask"].tolist() == [EXPECTED] * 3
+
+
+def test_vectors_have_a_mask_for_each_robot(world: dict[str, Any]) -> None:
+    envs = make_vec(3, MOVES, observation=("robot", "action_mask"), **world)
+    _, infos = envs.reset(seed=1000)
+    assert is_mask(envs.unwrapped.action_masks(), [EXPECTED] * 3)
+    assert is_mask(infos["action_mask"], [EXPECTED] * 3) and infos["_action_mask"].all()
+    seen, *_, infos = envs.step(np.array([0, 1, 2]))
+    expected = of((0, 2), (1, 2), (0, 1))
+    assert is_mask(infos["action_mask"], expected) and is_mask(seen["action_mask"], expected)
+    for _ in range(20):
+        before = seen["robot"].tolist()
+        actions = envs.action_space.sample(tuple(infos["action_mask"]))
+        seen, *_, infos = envs.step(actions)
+        assert all(map(list.__ne__, seen["robot"].tolist(), before))
+
+
+def test_rows_that_a_reset_leaves_alone_have_no_mask(world: dict[str, Any]) -> None:
+    envs = make_vec(2, MOVES, autoreset_mode="Disabled", **world)
+    envs.reset(seed=1000)
+    _, infos = envs.reset(options={"reset_mask": np.array([False, True])})
+    assert is_mask(infos["action_mask"], [[0] * 4, EXPECTED])
+    assert infos["_action_mask"].tolist() == [False, True]
+
+
+@pytest.mark.parametrize("observation", ["local", ("local", "action_mask")])
+def test_teams_have_them_where_pettingzoo_looks(world: dict[str, Any], observation: Any) -> None:
+    env = closed_later(emberwatch.parallel_env(observation=observation, **world))
+    seen, infos = env.reset(seed=1000)
+    for step in range(10):
+        places = seen if observation != "local" else infos
+        masks = {agent: places[agent]["action_mask"] for agent in env.agents}
+        for agent, mask in env.action_masks().items():
+            assert is_mask(masks[agent], EXPECTED if step == 0 else mask.tolist())
+            assert env.observation_space(agent).contains(seen[agent])
+        actions = {agent: env.action_space(agent).sample(masks[agent]) for agent in env.agents}
+        before = env._worlds.seen(slice(0, 2))[1].tolist()
+        seen, *_, infos = env.step(actions)
+        assert all(map(list.__ne__, env._worlds.seen(slice(0, 2))[1].tolist(), before))
+
+
+def test_paths_have_no_mask(world: dict[str, Any]) -> None:
+    env = make(**world)
+    assert not hasattr(env.unwrapped, "action_masks")
+    assert "action_mask" not in env.reset(seed=1000)[1]
+    with refuses("observation: expected one or several of"):
+        make(observation=("frame", "action_mask"), **world)
+    team = closed_later(emberwatch.parallel_env(action="path", **world))
+    with refuses("action_masks: expected an environment of action='move'"):
+        team.action_masks()
+
+
+@pytest.mark.parametrize("kind", ["single", "dummy", "native"])
+def test_maskable_ppo_trains_and_chooses_only_moves_that_lead_on(
+    world: dict[str, Any], kind: str
+) -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+    from stable_baselines3.common.env_util import make_vec_env as dummies
+
+    from emberwatch.sb3 import make_vec_env
+
+    keywords = {**world, "observation": "robot"}
+    makers: dict[str, Any] = {
+        "single": lambda: make(MOVES, **keywords),
+        "dummy": lambda: dummies(MOVES, 2, env_kwargs=keywords, seed=1000),
+        "native": lambda: make_vec_env(MOVES, 2, **keywords),
+    }
+    env = closed_later(makers[kind]())
+    assert is_masking_supported(env)
+    agent = contrib.MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=4, device="cpu")
+    agent.learn(32)
+    seen = env.reset() if kind != "single" else env.reset(seed=1000)[0]
+    for _ in range(20):
+        masks = get_action_masks(env)
+        assert masks.dtype == np.int8
+        actions, _ = agent.predict(seen, action_masks=masks, deterministic=False)
+        assert all(masks.reshape(-1, 4)[range(actions.size), actions.reshape(-1)])
+        seen = env.step(actions if kind != "single" else int(actions))[0]
+
+
+@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using")
+@pytest.mark.parametrize("observation", ["local", ("local", "action_mask")])
+def test_torchrl_masks_the_actions_of_a_team(world: dict[str, Any], observation: Any) -> None:
+    pytest.importorskip("torchrl")
+    from torchrl.envs import PettingZooWrapper
+
+    team = closed_later(emberwatch.parallel_env(observation=observation, **world))
+    env = PettingZooWrapper(team, categorical_actions=True)
+    seen = env.reset()
+    assert seen["robot", "action_mask"].int().tolist() == [EXPECTED] * 2
+    for _ in range(10):
+        mask = seen["robot", "action_mask"]
+        chosen = env.rand_action(seen)["robot", "action"]
+        assert mask.gather(-1, chosen.unsqueeze(-1)).all()
+        seen = env.step(seen)["next"]
