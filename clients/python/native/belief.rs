@@ -2,11 +2,12 @@
 //! states of n worlds.
 
 use crate::detached::detached;
-use crate::errors::no_threads;
+use crate::errors::{check_memory, no_memory, no_threads};
 use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_protocol::limits::memory::with_capacity;
 use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
@@ -45,6 +46,9 @@ impl Transition {
     #[new]
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
+        // Two beliefs, and a third with margins in the work space.
+        let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
+        check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
         let work = Work {
             operator: transition::Transition::new(&parameters, shape),
@@ -93,6 +97,8 @@ impl Transition {
                 format!("{:?}", beliefs.dim()),
             ));
         }
+        let probe = with_capacity::<f64>("predicted beliefs", beliefs.len());
+        probe.map_err(|short| no_memory(py, &short))?;
         let mut out = Array4::zeros(beliefs.dim());
         detached(py, beliefs.len(), || {
             let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
@@ -216,6 +222,10 @@ pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    // Each thread counts states in a world of its own.
+    let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
+    let n_bytes = 2 * n_threads * of_thread;
+    check_memory(py, "the worlds of a first belief", n_bytes)?;
     let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
     let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {

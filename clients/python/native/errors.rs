@@ -2,7 +2,7 @@
 
 use emberwatch_protocol::channels::ChannelError;
 use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::limits::memory::NoMemory;
+use emberwatch_protocol::limits::memory::{self, NoMemory};
 use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_server::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
@@ -41,6 +41,15 @@ pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) 
 /// The error of memory that there is not.
 pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
     error(py, "NotEnoughMemoryError", (short.to_string(),))
+}
+
+/// Checks that there is memory for what arguments make large.
+pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyResult<()> {
+    // Reading the limits takes some 0.1 ms, and so much less is there or nothing is.
+    if n_bytes < 16 << 20 {
+        return Ok(());
+    }
+    memory::check(what, n_bytes as u64).map_err(|short| no_memory(py, &short))
 }
 
 /// The error of threads that the system does not start.

@@ -4,6 +4,7 @@ use super::cgroups::{self, Controller};
 use super::memory;
 use rustix::process::{Resource, getrlimit, getuid};
 use std::error::Error;
+use std::io::ErrorKind;
 use std::path::Path;
 use std::thread::{Builder, JoinHandle};
 
@@ -16,6 +17,10 @@ const CGROUP: Controller = Controller {
 
 /// Address space of a thread: its stack of 2 MiB, and what the C library keeps for it.
 const THREAD_BYTES: u64 = 4 << 20;
+
+/// Where the C library asks for a call that the container forbids, and does not fall back on another.
+const REFUSED: &str = "the seccomp profile of the container forbids `clone3`; allow it, or let it fail with ENOSYS (Docker \
+                       does since 20.10.10; --security-opt seccomp=PROFILE)";
 
 /// Threads that could not be started.
 #[derive(Debug, thiserror::Error)]
@@ -44,11 +49,15 @@ impl NoThreads {
     /// Looks for the limit on account of which `n_threads` threads could not be started.
     pub fn new(n_threads: usize, error: &(dyn Error + 'static)) -> Self {
         // A thread pool's error repeats that of the system.
-        let problem = error.source().unwrap_or(error).to_string();
+        let error = error.source().unwrap_or(error);
+        let kind = error.downcast_ref().map(std::io::Error::kind);
         Self {
             n_threads,
-            problem,
-            reason: reason(Path::new("/"), n_threads as u64),
+            problem: error.to_string(),
+            reason: match kind {
+                Some(ErrorKind::PermissionDenied) => REFUSED.into(),
+                _ => reason(Path::new("/"), n_threads as u64),
+            },
         }
     }
 }

@@ -9,6 +9,7 @@ use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 use std::fmt::Debug;
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixDatagram;
 
 /// Where iceoryx2 keeps shared memory: a folder that every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -110,8 +111,16 @@ pub fn limited_error<E: Debug>(
         has_few
             .then(|| no_descriptors(what, CLIENT_DESCRIPTORS))
             .or_else(|| check_room_for_ports(0).err())
+            .or_else(|| check_sockets().err())
             .unwrap_or(ChannelError::Ipc { what, problem })
     }
+}
+
+/// Checks that the system gives sockets, which wake other processes.
+fn check_sockets() -> Result<(), ChannelError> {
+    let socket = UnixDatagram::unbound();
+    let errno = socket.err().and_then(|error| Errno::from_io_error(&error));
+    errno.map_or(Ok(()), |errno| Err(call_error("socket (AF_UNIX)", errno)))
 }
 
 /// Checks that so many descriptors are free, before any of them is used: what iceoryx2 began and could not finish may stay

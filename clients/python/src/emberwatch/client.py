@@ -191,7 +191,8 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
 
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
-        EmberwatchError: With code `"embedded"` if there is too little memory.
+        NotEnoughMemoryError: If they would take more than the machine, a cgroup or a `ulimit` has.
+        EmberwatchError: With code `"threads"` if the system starts none.
     """
     # Nobody else waits for its robots.
     chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
