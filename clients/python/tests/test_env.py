@@ -442,17 +442,24 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ({"observation": "smoke"}, "got 'smoke'"),
         ({"observation": ["frame", "frame"]}, "observation"),
         ({"observation": ["frame", "visited"]}, "observation"),
-        ({"height": 0}, r"grid shape: expected .* in 1\.\.=4096, got 0 x 5"),
-        ({"width": 4097}, "got 7 x 4097"),
+        ({"height": 0}, "^height: expected 1 to 4096, got 0$"),
+        ({"height": -1}, "^height: expected 1 to 4096, got -1$"),
+        ({"height": 10**30}, "^height: expected 1 to 4096, got 1e"),
+        ({"width": 4097}, "^width: expected 1 to 4096, got 4097$"),
+        ({"sensor_radius": 9}, "^sensor_radius: expected -1 to 8, got 9$"),
+        (
+            {"states": "jacksboro"},
+            "^height: expected to be left out, as the states file decides it",
+        ),
         ({"n_moves": 2.5}, r"n_moves: expected int \| None, got 2.5"),
-        ({"n_moves": 5000}, "moves: expected 1 to 4096, got 5000"),
-        ({"burn_in": -1}, "invalid value '-1' for '--burn-in"),
+        ({"n_moves": 5000}, "^n_moves: expected 1 to 4096, got 5000$"),
+        ({"burn_in": -1}, "^burn_in: expected 0 to 1099511627776, got -1$"),
         ({"burn_in": 1.5}, "burn_in: .* got 1.5"),
         ({"height": "7"}, r"height: expected int \| None, got '7'"),
         ({"height": True}, "height: expected .* got True"),
         (
             {"start": "middle"},
-            "invalid value 'middle' .*: expected corner, centre, random or ROW,COL",
+            "^start: expected corner, centre, random or ROW,COL, got middle$",
         ),
         ({"start": "7,0"}, r"start: expected a cell on the 7 x 5 grid, got \(7, 0\)"),
         ({"truth": "no"}, "truth: expected bool, got 'no'"),
@@ -472,13 +479,27 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ),
         ({"name": MOVES, "observation": "path"}, "one or several of frame, .*, visited, move, got"),
         ({"name": MOVES, "observation": ["move", "move"]}, "observation"),
-        ({"name": MOVES, "n_moves": 0}, "moves: expected 1 to 4096, got 0"),
+        ({"name": MOVES, "n_moves": 0}, "^n_moves: expected 1 to 4096, got 0$"),
     ],
     ids=str,
 )
 def test_impossible_keywords_are_named_by_make(keywords: dict[str, Any], message: str) -> None:
-    with refuses(message):
+    with refuses(message) as raised:
         make(**keywords)
+    assert "--" not in str(raised.value) and "flag" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "robots", "message"),
+    [
+        (1025, 1, "^num_envs: expected 1 to 1024, got 1025$"),
+        (5120, 5, "^num_envs: expected 1 to 4096, got 5120$"),
+        (65, 65, "^robots: expected 1 to 64, got 65$"),
+    ],
+)
+def test_too_many_robots_are_named_by_make_vec(n_envs: int, robots: int, message: str) -> None:
+    with refuses(message):
+        make_vec(n_envs, robots=robots)
 
 
 def test_an_unknown_render_mode_is_named() -> None:

@@ -1,0 +1,99 @@
+"""Files in TOML as editors on Windows save them: with a byte order mark, or in UTF-16."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import LIVELY, RECORDED, SMALL, WILDFIRE, closed_later
+from failures import refuses
+
+import emberwatch
+from emberwatch.benchmark import evaluate
+from emberwatch.model import Model
+from emberwatch.tasks import Task
+
+TASK = """name = "mine"
+model = "wildfire-small"
+height = 16
+width = 16
+moves = 8
+burn_in = 10
+max_steps = 2
+test_seeds = { start = 0, end = 2 }
+# é
+"""
+
+
+def up(seen: Any) -> Any:
+    return np.zeros(len(seen), np.int64)
+
+
+def of_states(file: Path) -> Any:
+    """Worlds of the recorded states that the file describes."""
+    np.savez(file.with_suffix(".npz"), fire=np.zeros((3, 4, 4), np.uint8))
+    return closed_later(gymnasium.make(WILDFIRE, states=file.with_suffix(".npz"), n_moves=4))
+
+
+#: What reads a file, and the file's text in UTF-8.
+READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "task": (Task.named, TASK),
+    "environment of a task": (
+        lambda file: closed_later(gymnasium.make(WILDFIRE, task=file)).reset(seed=1000),
+        TASK,
+    ),
+    "evaluation of a task": (
+        lambda file: evaluate(up, name="up", task=file, observation="frame", progress=None),
+        TASK,
+    ),
+    "model": (Model.named, Path(LIVELY).read_text("utf-8")),
+    "environment of a model": (
+        lambda file: closed_later(gymnasium.make(WILDFIRE, **{**SMALL, "model": file})).reset(),
+        Path(LIVELY).read_text("utf-8"),
+    ),
+    "states": (of_states, RECORDED.read_text("utf-8")),
+    "embedded worlds": (
+        lambda file: emberwatch.embed(**{**SMALL_SETTINGS, "model": file}).close(),
+        Path(LIVELY).read_text("utf-8"),
+    ),
+}
+
+SMALL_SETTINGS: dict[str, Any] = {"height": 7, "width": 5, "moves": 4, "burn_in": 5}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_byte_order_mark_is_skipped(kind: str, tmp_path: Path) -> None:
+    read, text = READERS[kind]
+    plain, marked = tmp_path / "plain.toml", tmp_path / "marked.toml"
+    plain.write_text(text, "utf-8")
+    marked.write_text(text.replace("\n", "\r\n"), "utf-8-sig")
+    expected, got = read(plain), read(marked)
+    if isinstance(expected, Task | Model):
+        assert expected == got
+    if isinstance(expected, Model):
+        assert not got.toml.startswith("\ufeff")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+@pytest.mark.parametrize("kind", READERS)
+def test_wide_characters_are_refused_by_name(kind: str, encoding: str, tmp_path: Path) -> None:
+    read, text = READERS[kind]
+    file = tmp_path / "wide.toml"
+    file.write_text(text, encoding)
+    with refuses(r"wide\.toml: expected text in UTF-8, got UTF-16 or UTF-32: save the file as UTF"):
+        read(file)
+
+
+def test_other_bytes_are_named_by_their_line(tmp_path: Path) -> None:
+    file = tmp_path / "latin.toml"
+    file.write_text(TASK, "latin-1")
+    with refuses("task .*latin.toml: expected text in UTF-8, got other bytes in line 9: save the"):
+        Task.named(file)
+
+
+def test_texts_with_a_mark_are_read_as_well() -> None:
+    text = Path(LIVELY).read_text("utf-8")
+    assert Model.from_toml("\ufeff" + text) == Model.from_toml(text)
+    assert Task.from_toml("\ufeff" + TASK) == Task.from_toml(TASK)
