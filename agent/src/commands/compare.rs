@@ -16,6 +16,7 @@ use emberwatch_agent::benchmark::report::{
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnDashboard;
 use emberwatch_agent::config::{AgentConfig, AgentFlags};
+use emberwatch_agent::file::{Readers, replace_file};
 use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::policy::{Choice, EstimatorKind, Policy};
 use emberwatch_belief::merit::RECENT_STEPS;
@@ -317,7 +318,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     }
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
-    std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
+    replace_file(&path, settings.as_bytes(), Readers::Any)
 }
 
 /// Each option, the rule and the learned choice, on the belief of the decisions that were learned.
