@@ -299,6 +299,9 @@ impl ServerConfig {
                 let problem = format!("{problem}: expected one, or {}", names.join(", "));
                 file_error("model file", path, problem)
             }
+            ModelError::File { path: of, problem } if Path::new(&of) == path => {
+                file_error("model file", path, problem)
+            }
             other => file_error("model file", path, other),
         })
     }

@@ -6,7 +6,6 @@ Each in a process of its own; what needs root or a kind of cgroup is skipped whe
 import errno
 import os
 import platform
-import signal
 import subprocess
 import sys
 import time
@@ -30,7 +29,8 @@ def tell(call):
     except emberwatch.EmberwatchError as error: print(type(error).__name__, error.code, error)
 def refuse(number, errno):  # a seccomp filter: this system call fails, all others pass
     libc = ctypes.CDLL(None)
-    lines = ((0x20, 0, 0, 0), (0x15, 0, 1, number), (6, 0, 0, 0x50000 | errno), (6, 0, 0, 0x7FFF0000))
+    call, deny, allow = (0x15, 0, 1, number), (6, 0, 0, 0x50000 | errno), (6, 0, 0, 0x7FFF0000)
+    lines = ((0x20, 0, 0, 0), call, deny, allow)
     code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
     program = ctypes.create_string_buffer(struct.pack("@HP", len(lines), ctypes.addressof(code)))
     assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, program, 0, 0) == 0
