@@ -83,7 +83,7 @@ impl ServeDecisionsCommand {
         };
         ensure!(
             !kind.is_learned() || learned.belief(kind).is_some(),
-            "--estimator {}: expected --checkpoint FILE of such a belief",
+            "estimator {}: expected a checkpoint of such a belief",
             kind.label()
         );
         Ok(kind)

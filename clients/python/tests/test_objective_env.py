@@ -110,8 +110,8 @@ def test_a_checkpoint_brings_its_filter(tmp_path: Path) -> None:
     decide(spatial)
     known = make(checkpoint=checkpoint, estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
-    with fails("program", match="expected --checkpoint FILE of such a belief"):
-        make(estimator="learned_own_filter").reset()
+    with fails("program", match="estimator learned_own_filter: expected a checkpoint of such a"):
+        make(checkpoint=checkpoint, estimator="learned_own_filter").reset()
     with fails("program", match="no file"):
         make(checkpoint=tmp_path / "no file").reset()
 
@@ -211,6 +211,10 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
 @pytest.mark.parametrize(
     ("keywords", "words"),
     [
+        (
+            {"estimator": "neural_belief"},
+            "checkpoint: expected the file that a training has saved, for estimator='neural",
+        ),
         ({"estimator": "truth"}, "expected one of None, known_model, .*, got 'truth'"),
         ({"prior": "none"}, "expected one of simulated, initial, uniform"),
         ({"agent": "other"}, "expected one of own, running"),

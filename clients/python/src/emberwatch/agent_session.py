@@ -73,6 +73,11 @@ class AgentSession(Session):
         if arguments["agent"] == "running" and arguments["checkpoint"] is not None:
             given = repr(arguments["checkpoint"])
             raise invalid("checkpoint", "none, as the agent runs already", given)
+        estimator, checkpoint = arguments["estimator"], arguments["checkpoint"]
+        is_learned = estimator is not None and estimator.startswith(("learned", "neural"))
+        if is_learned and checkpoint is None and arguments["agent"] == "own":
+            expected = f"the file that a training has saved, for estimator={estimator!r}"
+            raise invalid("checkpoint", expected, None)
         if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
             raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
