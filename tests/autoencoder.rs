@@ -224,7 +224,7 @@ fn episodes_shorter_than_a_window_are_refused() {
         &format!("{flags} --steps 2").replace("--steps 9 ", ""),
     );
     few.check_says(
-        "WARN nothing was learned in 2 world steps: an update learns from a window of 4 frames",
+        "nothing was learned in 2 world steps: an update learns from a window of 4 frames",
     );
 }
 

@@ -91,7 +91,7 @@ fn a_training_that_made_no_update_says_why() {
     ] {
         place.set(settings);
         let ended = place.train(out, &format!("{WORLDS} {flags}"));
-        ended.check_says(&format!("WARN {none} {cause}"));
+        ended.check_says(&format!("{none} {cause}"));
     }
     place.set(SETTINGS);
     let ended = place.train("learned", &format!("{WORLDS} --steps 60"));

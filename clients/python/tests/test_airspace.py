@@ -231,8 +231,8 @@ def test_a_radius_may_be_given_beside_a_model() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sensor_radius": 9}, "invalid value '9' for '--sensor-radius"),
-        ({"sensor_radius": -1}, "invalid value '-1' for '--sensor-radius"),
+        ({"sensor_radius": 9}, "sensor_radius: .* got 9"),
+        ({"sensor_radius": -1}, "sensor_radius: .* got -1"),
         ({"sensor_radius": 1.5}, "sensor_radius: .* got 1.5"),
         ({"sensor_radius": "1"}, "sensor_radius: .* got '1'"),
     ],
