@@ -103,8 +103,9 @@ impl Entry {
         for (what, text) in [("by", by), ("code", code)].into_iter().chain(estimators) {
             ensure!(
                 is_plain(text),
-                "{what}: expected 1 to 200 letters, digits, spaces and {PUNCTUATION}, or an address that begins \
-                 with https://, got {text:?}"
+                "{what}: expected 1 to 200 letters, digits, spaces and {}, or an address that begins with \
+                 https://, got {text:?}",
+                PUNCTUATION.trim_start()
             );
         }
         ensure!(
