@@ -23,7 +23,7 @@ from emberwatch.arguments import as_integer, as_seed, told
 from emberwatch.benchmark.digest import digest
 from emberwatch.benchmark.policies import Actor, Policy, statistics
 from emberwatch.benchmark.report import Progress
-from emberwatch.benchmark.row_file import Mark, RowFile
+from emberwatch.benchmark.row_file import Kind, Mark, RowFile
 from emberwatch.benchmark.rows import Row
 from emberwatch.benchmark.tally import Tally
 from emberwatch.client import Client
@@ -297,7 +297,8 @@ def _kept(
         common["steps"],
         common["recent_steps"],
     )
-    found = file.find(common["policy"], mark)
+    kind = Kind(*(common[name] for name in Kind._fields))
+    found = file.find(kind, mark)
     if found.elsewhere:
         warnings.warn(
             f"{file.path} has rows of {', '.join(found.elsewhere)} on other worlds, or of an older "

@@ -38,6 +38,20 @@ class Mark(NamedTuple):
         return cls(row.worlds_fingerprint, row.policy_fingerprint, row.steps, row.recent_steps)
 
 
+class Kind(NamedTuple):
+    """A policy with its estimator and team: one group of rows in a table."""
+
+    policy: str
+    estimator: str
+    robots: int
+    team: str
+
+    @classmethod
+    def of(cls, row: Row) -> Self:
+        """Returns the kind of a row."""
+        return cls(row.policy, row.estimator, row.robots, row.team)
+
+
 @dataclass(frozen=True, slots=True)
 class Found:
     """What a file has of a policy."""
@@ -69,7 +83,7 @@ class RowFile:
         # Links are followed, as a renamed file would replace the link.
         self.path: Final = Path(os.path.realpath(utf8("csv", path)))
         self._is_cache: Final = is_cache
-        self._policy = ""
+        self._kind: Kind | None = None
         self._mark: Mark | None = None
         #: Marks of rows of the policy that its new ones replace.
         self._stale: set[Mark] = set()
@@ -102,22 +116,22 @@ class RowFile:
         with self._problems():
             self._remove_empty()
 
-    def find(self, policy: str, mark: Mark) -> Found:
+    def find(self, kind: Kind, mark: Mark) -> Found:
         """Looks for rows of a policy, which `add` will add to.
 
         Raises:
             InvalidArgumentError: If the file is no cache, and has rows of other worlds, or of the
                 policy for other numbers of steps.
         """
-        self._policy, self._mark = policy, mark
-        own = [row for row in self._rows if row.policy == policy]
+        self._kind, self._mark = kind, mark
+        own = [row for row in self._rows if self._is_own(row)]
         if not self._is_cache:
             self._check_worlds(self._rows)
             self._check_steps(own, mark)
         kept = {row.world_seed: row for row in own if Mark.of(row) == mark}
         stale = tuple(row for row in own if Mark.of(row) != mark)
         self._stale = {Mark.of(row) for row in stale}
-        others = [row for row in self._rows if row.policy != policy and self._is_cache]
+        others = [row for row in self._rows if not self._is_own(row) and self._is_cache]
         elsewhere = {row.policy for row in others if not self._is_of_worlds(row)}
         return Found(kept, stale, tuple(sorted(elsewhere)))
 
@@ -135,7 +149,7 @@ class RowFile:
             others = [
                 row
                 for row in present
-                if row.policy != self._policy
+                if not self._is_own(row)
                 or (Mark.of(row) == self._mark and row.world_seed not in seeds)
             ]
             merged = sorted(
@@ -165,6 +179,9 @@ class RowFile:
             self._temporary.unlink(missing_ok=True)
             raise
 
+    def _is_own(self, row: Row) -> bool:
+        return Kind.of(row) == self._kind
+
     def _is_of_worlds(self, row: Row) -> bool:
         return self._mark is not None and row.worlds_fingerprint == self._mark.worlds_fingerprint
 
@@ -178,9 +195,10 @@ class RowFile:
                 f"{names}: another model, grid, start, sensor or burn-in, or other moves or "
                 "robots; choose another file"
             )
-        if any(row.policy == self._policy and not row.worlds_fingerprint for row in rows):
+        old = [row.policy for row in rows if self._is_own(row) and not row.worlds_fingerprint]
+        if old:
             raise InvalidArgumentError(
-                f"csv: {self.path} has rows of {self._policy!r} without a fingerprint of their "
+                f"csv: {self.path} has rows of {old[0]!r} without a fingerprint of their "
                 "worlds, as older releases wrote them: choose another file or name"
             )
 
@@ -190,16 +208,16 @@ class RowFile:
                 got, expected = getattr(row, what), getattr(mark, what)
                 if got != expected:
                     raise InvalidArgumentError(
-                        f"csv: {self.path} has {what} {got} of {self._policy!r} on world "
+                        f"csv: {self.path} has {what} {got} of {row.policy!r} on world "
                         f"{row.world_seed}, expected {expected}: choose another file or name"
                     )
 
     def _check_meanwhile(self, present: Sequence[Row], rows: Sequence[Row]) -> None:
         """Refuses to mix new rows with what other processes have written since `find`."""
-        own = {Mark.of(row) for row in present if row.policy == self._policy}
+        own = {Mark.of(row) for row in present if self._is_own(row)}
         if self._mark is not None and own - self._stale - {self._mark}:
             raise InvalidArgumentError(
-                f"csv: another process has written rows of {self._policy!r} to {self.path}, of "
+                f"csv: another process has written rows of {rows[0].policy!r} to {self.path}, of "
                 "another policy or other settings: choose another file or name"
             )
         if self._is_cache:
