@@ -55,8 +55,11 @@ impl Backend {
 }
 
 /// Worlds in this process, of these settings of `config/server.toml`, as JSON.
-pub fn embedded(py: Python<'_>, settings: &str) -> PyResult<Embedded> {
+pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
     let checked = checked(py, settings)?;
+    if warns {
+        warn_of_starts(py, &checked)?;
+    }
     check_embeddable(py, &checked.config)?;
     let worlds = py.detach(|| Embedded::new(checked));
     worlds.map_err(|error| match error.downcast_ref() {
@@ -71,7 +74,9 @@ pub fn embedded(py: Python<'_>, settings: &str) -> PyResult<Embedded> {
 /// All settings that a server with these would have; JSON from JSON.
 #[pyfunction]
 pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
-    let settings = checked(py, settings)?.config;
+    let checked = checked(py, settings)?;
+    warn_of_starts(py, &checked)?;
+    let settings = checked.config;
     Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
 }
 
@@ -96,11 +101,13 @@ fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
     let checked = py.detach(wait);
     let checked =
         checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?;
-    let checked = checked.map_err(|problem| refused(py, &problem.to_string()))?;
-    for closed_in in &checked.reach.closed_in {
-        warn(py, closed_in)?;
-    }
-    Ok(checked)
+    checked.map_err(|problem| refused(py, &problem.to_string()))
+}
+
+/// Warns of robots that begin where no-fly cells close them in.
+fn warn_of_starts(py: Python<'_>, checked: &Checked) -> PyResult<()> {
+    let mut starts = checked.reach.closed_in.iter();
+    starts.try_for_each(|closed_in| warn(py, closed_in))
 }
 
 /// Refuses settings that only a server can have.

@@ -40,11 +40,12 @@ impl Server {
         Ok(Self::of(instance, Backend::Server(Box::new(wire))))
     }
 
-    /// Worlds in this process, of these settings of `config/server.toml`, as JSON.
+    /// Worlds in this process, of these settings of `config/server.toml`, as JSON. `warns`: of starts that no-fly cells
+    /// close in.
     #[staticmethod]
     #[pyo3(name = "embedded")]
-    fn new_embedded(py: Python<'_>, settings: &str) -> PyResult<Self> {
-        let worlds = Backend::Embedded(Box::new(embedded(py, settings)?));
+    fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
+        let worlds = Backend::Embedded(Box::new(embedded(py, settings, warns)?));
         Ok(Self::of(INSTANCE, worlds))
     }
 

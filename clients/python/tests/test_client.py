@@ -338,7 +338,7 @@ def test_more_worlds_than_the_server_has_are_refused_with_the_flag_for_more() ->
         lambda: table.exchange(first_robot=2, n_robots=2, step=1, bytes=12),
     ):
         assert refused(ask, "no_such_robot", 3).startswith(robots)
-    with refuses("world: .* with --worlds N for more.*0 to 7"):
+    with refuses("world: .*got 0 to 7; start the server with --worlds N for more"):
         gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=8, instance=table.server.instance)
     worlds = f"no such world: the server has worlds 0 to 2; {more}"
     assert refused(lambda: table.lease.reset([1], worlds=[9]), "no_such_world", 3) == worlds

@@ -63,8 +63,11 @@ class Server:
         """Opens it; `client` names this program in the server's log."""
 
     @staticmethod
-    def embedded(settings: str) -> Server:
-        """Worlds in this process, of these settings of `config/server.toml`, as JSON."""
+    def embedded(settings: str, warns: bool) -> Server:
+        """Worlds in this process, of these settings of `config/server.toml`, as JSON.
+
+        `warns`: of starts that no-fly cells close in.
+        """
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
         """The hidden states of embedded worlds, as the fields of `Truth`; refused of a server's."""

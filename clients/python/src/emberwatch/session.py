@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.client import Client, connect, embed
+from emberwatch.client import Client, connect, embed_settings
 from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
@@ -278,7 +278,8 @@ class Session:
     def launch(self, seed: int) -> Client:
         """Begins worlds of its own, with this seed for world 0; `close` ends them."""
         if self.settings.is_embedded:
-            return embed(seed=seed, **self.settings.of_server(self.n_worlds))
+            chosen = {"seed": seed, **self.settings.of_server(self.n_worlds)}
+            return embed_settings(chosen, warns=False)
         instance = unused_instance()
         flags = [f"--instance={instance}", f"--seed={seed}"]
         flags += self.settings.server_flags(self.n_worlds)

@@ -293,8 +293,8 @@ def running_spec(
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
-        has = f"worlds within 0 to {info.n_worlds - 1} (start the server with --worlds N for more)"
-        raise invalid("world", has, f"{first} to {last}")
+        got = f"{first} to {last}; start the server with --worlds N for more"
+        raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", got)
     if settings.truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
     model = None if info.model is None else Model.from_toml(info.model)
