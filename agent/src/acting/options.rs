@@ -1,5 +1,5 @@
-//! The beliefs about worlds of one robot each and all options there, for a learner that says what each path is for.
-//! Pure: the caller flies.
+//! Beliefs about worlds of one robot each, and the plan of every option, for a learner that chooses among the options.
+//! Pure: the caller flies the paths.
 
 use crate::acting::registry::{self, Task};
 use crate::config::AgentConfig;
@@ -13,7 +13,7 @@ use emberwatch_protocol::agent_belief::Intent;
 use emberwatch_protocol::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
 
-/// What plans options are planned by.
+/// The planner settings of all options.
 pub struct Crew {
     model: Model,
     shape: Shape,
@@ -23,28 +23,28 @@ pub struct Crew {
     policy: Policy,
 }
 
-/// A belief about one world, and all options there.
+/// The belief about one world, and the plans of all options in it.
 pub struct Planned {
     agent: Agent,
     /// In the order of [`emberwatch_belief::planning::OPTIONS`].
     proposals: Vec<Proposal>,
-    /// Time that they took.
+    /// Planning time.
     planning: Duration,
 }
 
-/// What a world shows after a step or a reset.
+/// The observation of a world after a step or a reset.
 #[derive(Debug, Clone)]
 pub struct Shown {
     pub frame: Frame,
-    /// What the last path paid; `None` before the first.
+    /// Reward of the last path; `None` before the first.
     pub reward: Option<f64>,
 }
 
 impl Crew {
-    /// `estimator`: what keeps the beliefs; `None`: what was learned, or else the known model's filter.
+    /// `estimator`: keeps the beliefs. `None`: the checkpoint's estimator, or the known model's filter without one.
     ///
     /// # Errors
-    /// If the estimator was not learned, or was in worlds of another form; words begin with `checkpoint`.
+    /// If the checkpoint lacks the estimator, or comes from worlds of another form. The message begins with `checkpoint`.
     pub fn new(
         estimator: Option<EstimatorKind>,
         learned: Learned,
@@ -92,7 +92,7 @@ impl Crew {
         self.n_moves
     }
 
-    /// A belief before the first frame; `prior`: the filter's, where it knows the model.
+    /// Creates a belief before the first frame. `prior`: the first belief of filters that know the model.
     pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<Planned> {
         let task = Task {
             model: &self.model,
@@ -111,7 +111,7 @@ impl Crew {
 }
 
 impl Planned {
-    /// Takes in what the world shows; the belief is then the posterior.
+    /// Corrects the belief with a frame: it is the posterior afterwards.
     pub fn see(&mut self, shown: &Shown) -> Result<()> {
         self.agent.correct(&shown.frame, None)?;
         if let Some(reward) = shown.reward {
@@ -131,12 +131,12 @@ impl Planned {
         self.planning = start.elapsed();
     }
 
-    /// What the last plans promise and fly, in the order of `OPTIONS`; nothing before the first.
+    /// Features and paths of the last plans, in the order of `OPTIONS`; empty before the first plan.
     pub fn proposals(&self) -> &[Proposal] {
         &self.proposals
     }
 
-    /// The option that was flown, for those who watch.
+    /// The last flown option, for observers.
     pub fn intent(&mut self, flown: Option<usize>) -> Intent {
         if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
             self.agent
@@ -149,7 +149,7 @@ impl Planned {
         &self.agent
     }
 
-    /// Goes on from the belief that another left, as [`Agent::take_over`].
+    /// Continues from the belief that another agent left, like [`Agent::take_over`].
     pub fn take_over(&mut self, kind: &str, bytes: &[u8]) -> bool {
         self.agent.handover_kind().is_some_and(|own| own == kind) && self.agent.take_over(bytes)
     }

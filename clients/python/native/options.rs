@@ -1,4 +1,4 @@
-//! Options: the beliefs about worlds of one robot each, and all plans there that a learner chooses among.
+//! Options: beliefs about worlds of one robot each, and the plans among which a learner chooses.
 
 use crate::airspace::Given;
 use crate::belief::first_belief;
@@ -34,13 +34,13 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-/// Bytes of a world's result and its robot's.
+/// Bytes of a world's result and of its robot's result.
 const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
-/// What plans promise, and their paths.
+/// Features and paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
 
-/// The names of the options, and those of the numbers that describe the plan of each.
+/// Names of the options, and names of the features that describe each plan.
 #[pyfunction]
 pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     (
@@ -68,10 +68,10 @@ struct Text {
     toml: String,
 }
 
-/// The beliefs about many worlds, and what can be flown next in each.
+/// Beliefs about many worlds, and the plans of all options in each.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Options {
-    /// What keeps the beliefs.
+    /// Name of the estimator that keeps the beliefs.
     #[pyo3(get)]
     estimator: String,
     /// How the first belief is made, once it is needed.
@@ -84,19 +84,19 @@ struct State {
     crew: Crew,
     /// `None` before a world's first episode.
     worlds: Vec<Option<Planned>>,
-    /// Of its own, as those of a global pool do not survive a fork.
+    /// A thread pool for this object alone: threads of a global pool do not survive a fork.
     threads: Option<ThreadPool>,
     watched: Option<Watched>,
 }
 
-/// Where beliefs are shown to those who watch.
+/// The channel on which beliefs are published to observers.
 struct Watched {
     instance: Instance,
     first_world: u32,
     feed: Option<Feed>,
 }
 
-/// What one world shows, and what of it is to be done.
+/// The observation of one world, and what to do with it.
 struct Task<'a> {
     index: usize,
     planned: &'a mut Planned,
@@ -109,7 +109,7 @@ struct Task<'a> {
     is_shown: bool,
 }
 
-/// What is shown of a world: the belief after its frame.
+/// The published state of a world: the belief after its frame.
 struct Outlook {
     index: usize,
     world: WorldResult,
@@ -195,7 +195,7 @@ impl Options {
         begun?.map_err(|error| raise(py, &error))
     }
 
-    /// Goes on in a world with the belief that another left for the present step; whether it fits.
+    /// Continues in a world with the belief that another agent left for the present step. Returns whether it fits.
     fn take_over(&self, py: Python<'_>, world: usize, kind: &str, data: &[u8]) -> PyResult<bool> {
         self.state.with(py, |state| {
             let planned = state.worlds.get_mut(world).and_then(Option::as_mut);
@@ -203,7 +203,7 @@ impl Options {
         })
     }
 
-    /// Kind and bytes of the belief about a world, for the next who flies there.
+    /// Kind and bytes of the belief about a world, for the next client.
     fn left(&self, py: Python<'_>, world: usize) -> PyResult<Option<(String, Vec<u8>)>> {
         self.state.with(py, |state| {
             let agent = state.worlds.get(world)?.as_ref()?.agent();
@@ -211,7 +211,7 @@ impl Options {
         })
     }
 
-    /// Takes in an earlier step of some worlds: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
+    /// Updates beliefs with an earlier step of some worlds: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
     fn see(
         &self,
         py: Python<'_>,
@@ -226,7 +226,7 @@ impl Options {
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Takes in the present step of some worlds, unless it is in the belief already, and plans all options there.
+    /// Updates beliefs with the present step of some worlds, unless they include it already, and plans all options.
     /// Features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds; `flown`: which
     /// options brought them there.
     fn plan<'py>(
@@ -269,7 +269,7 @@ impl State {
         Ok(())
     }
 
-    /// Takes in frames, and plans.
+    /// Updates beliefs with frames, and plans.
     fn update(
         &mut self,
         worlds: &[usize],
@@ -320,7 +320,7 @@ impl State {
         Ok(())
     }
 
-    /// What the last plans of all worlds promise, and their paths.
+    /// Features and paths of the last plans of all worlds.
     fn plans(&self) -> (Array3<f32>, Array3<u8>) {
         let dim = (self.worlds.len(), OPTIONS.len());
         let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
@@ -339,7 +339,7 @@ impl State {
         (features, paths)
     }
 
-    /// Which of so many worlds are to be shown now.
+    /// Selects the worlds to publish now.
     fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
         let begun = self.worlds.iter().flatten().next();
         let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
@@ -423,7 +423,7 @@ fn in_parallel<T: Send, U: Send>(
     }
 }
 
-/// The model that filters know, or what is known of the worlds in its place.
+/// The model that filters know, or a stand-in where the worlds' model is hidden.
 fn model(py: Python<'_>, spec: &Spec<'_>, estimator: EstimatorKind) -> PyResult<Model> {
     if let Some(model) = &spec.model {
         return model_of(&model.toml);

@@ -178,7 +178,7 @@ def suite(
     """
     for keyword in ("task", "seeds", "steps", "csv"):
         if keyword in keywords:
-            raise InvalidArgumentError(f"{keyword}: expected none, as suite sets it")
+            raise InvalidArgumentError(f"{keyword}: expected to be left out, as suite sets it")
     if worlds is not None and (as_integer(worlds) or 0) < 1:
         raise invalid("worlds", "at least 1", told(worlds))
     by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
@@ -413,7 +413,7 @@ def _check(
             raise invalid(what, "at least 1", repr(number))
     for what in _SET:
         if what in keywords:
-            raise InvalidArgumentError(f"{what}: expected none, as evaluate sets it")
+            raise InvalidArgumentError(f"{what}: expected to be left out, as evaluate sets it")
     if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("seeds", "some, such as range(8)", repr(seeds))
     chosen = [as_seed(seed) for seed in seeds]
