@@ -477,7 +477,10 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
             {"name": MOVES, "reward": "cell"},
             "reward: expected one of 'share', 'team', 'marginal', 'move', got 'cell'",
         ),
-        ({"name": MOVES, "observation": "path"}, "one or several of frame, .*, visited, move, got"),
+        (
+            {"name": MOVES, "observation": "path"},
+            "one or several of frame, .*, visited, move, action_mask, got",
+        ),
         ({"name": MOVES, "observation": ["move", "move"]}, "observation"),
         ({"name": MOVES, "n_moves": 0}, "^n_moves: expected 1 to 4096, got 0$"),
     ],

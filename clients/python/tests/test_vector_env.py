@@ -368,8 +368,8 @@ def test_wrong_moves_are_named_and_not_flown(action: Any, message: str) -> None:
     [
         ({"max_episode_steps": 0}, "max_episode_steps: expected at least 1 or None, got 0"),
         ({"autoreset_mode": "sometimes"}, "sometimes"),
-        ({"n_worlds": 0}, "worlds: expected 1 to 1024, got 0"),
-        ({"n_worlds": 1025}, "worlds: .* got 1025"),
+        ({"n_worlds": 0}, "num_envs: expected 1 to 1024, got 0"),
+        ({"n_worlds": 1025}, "num_envs: .* got 1025"),
         ({"n_worlds": 129, "truth": True}, "truth: expected at most 128 worlds, got 129"),
         ({"observation": "smoke"}, "observation: .* got 'smoke'"),
         ({"world": 2}, "expected instance=..., .* got world 2"),
