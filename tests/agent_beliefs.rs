@@ -6,7 +6,6 @@ use emberwatch_protocol::observer::Observer;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, PATIENCE, Program, Server, eventually};
-use tests::learner::start_at;
 
 /// Reads until one is as wanted.
 fn until(
@@ -142,29 +141,5 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
         assert_eq!(intent.belief_from, "learned_filter");
         assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
         assert_eq!(intent.objective, "random moves");
-    }
-}
-
-#[test]
-fn an_agent_shows_what_it_believes_of_the_worlds_that_are_decided_for() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
-    let observer = Observer::agents(&server.instance).expect("observe");
-    let (agent, learner) = start_at(&server.instance, 1, "--worlds 2");
-    for (objectives, expected) in [
-        ([Some(0), Some(3)], vec![(1, "exploit"), (2, "entropy")]),
-        ([None, Some(4)], vec![(2, "coverage")]),
-    ] {
-        let mut shown = BTreeSet::new();
-        let are_shown = eventually(PATIENCE, || {
-            learner.decide_all(&objectives);
-            while let Some(AgentBelief { header, intent, .. }) = next(&observer, Duration::ZERO) {
-                assert_eq!(header.pid, agent.pid());
-                assert_eq!(intent.belief_from, "known_model");
-                shown.insert((header.world, intent.objective));
-            }
-            let is_shown = |&(world, aim): &(u32, &str)| shown.contains(&(world, aim.to_owned()));
-            expected.iter().all(is_shown)
-        });
-        assert!(are_shown, "{shown:?}");
     }
 }

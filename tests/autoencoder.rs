@@ -57,6 +57,8 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
         |out: &str, seed: u64| place.learn(out, &format!("{WORLD} --steps 30 --agent-seed {seed}"));
     let [a, b, c] = [("a", 5), ("b", 5), ("c", 6)].map(|(out, seed)| train(out, seed));
     assert_eq!(a, b);
+    let [one, same] = ["a", "b"].map(|out| std::fs::read(place.checkpoint(out)).expect("a file"));
+    assert!(one == same, "checkpoints of the same training differ");
     assert_ne!(a, c);
     for column in [LOSS, DQN_LOSS] {
         let losses: Vec<f64> = a
@@ -199,6 +201,31 @@ fn episodes_that_end_are_begun_again() {
     let rows = place.learn("out", &format!("{instance} --steps 3 --resume"));
     assert_eq!(rows.len(), 33);
     assert_eq!(server.status().worlds[0].info.step, 3);
+}
+
+#[test]
+fn episodes_shorter_than_a_window_are_refused() {
+    let place = place(SETTINGS);
+    for (max_steps, n_frames) in [(1, 2), (2, 3)] {
+        let server = Server::start(&format!(
+            "{WORLD} --coverage client --max-steps {max_steps}"
+        ));
+        let words = place.words("out", &format!("--instance {}", server.instance.name()));
+        let expected =
+            format!("autoencoder.window: expected at most the {n_frames} frames | got 4");
+        check(AGENT, &words, &expected);
+    }
+    let server = Server::start(&format!("{WORLD} --coverage client --max-steps 3"));
+    let flags = format!("--instance {} --steps 9", server.instance.name());
+    let rows = place.learn("out", &flags);
+    assert!(!rows[8][LOSS].is_empty(), "a window is a whole episode");
+    let few = place.train(
+        "few",
+        &format!("{flags} --steps 2").replace("--steps 9 ", ""),
+    );
+    few.check_says(
+        "nothing was learned in 2 world steps: an update learns from a window of 4 frames",
+    );
 }
 
 #[test]

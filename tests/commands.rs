@@ -2,7 +2,6 @@
 
 use emberwatch_agent::policy;
 use emberwatch_protocol::Model;
-use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, Program, SERVER, SMALL, Server, new_instance, run};
 
@@ -46,7 +45,7 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --check --worlds 0 => worlds: expected 1 to 1024, got 0
 --bogus => --bogus
 dance => dance
---worlds 1024 --height 4096 --width 4096 => shared memory: expected | MiB free | fewer worlds
+--worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got
 status --instance nobody => no server on instance "nobody"
 status --instance a/b => instance name | "a/b"
 stop --instance nobody => no server on instance "nobody"
@@ -81,20 +80,6 @@ run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
 run --instance nobody --policy ash => policy: expected one of random_walk | beam_STATE | got "ash"
 run --instance nobody --policy beam_ash --wait 0 => no server on instance "nobody"
 run --instance nobody --policy beam_ash --model wildfire => policy: expected one of | got "beam_ash"
-serve-decisions --instance nobody --wait 0 => no server on instance "nobody"
-serve-decisions --instance a/b => instance name | "a/b"
-serve-decisions --world x => --world | 'x'
-serve-decisions --worlds 0 => --worlds | 1..=1024
-serve-decisions --estimator truth => --estimator | known_model, spatial_filter, learned_filter
-serve-decisions --estimator learned_filter => --estimator learned_filter: expected --checkpoint FILE
-serve-decisions --checkpoint no.safetensors => no.safetensors | No such file
-serve-decisions --model no.toml => model file no.toml | No such file
-serve-decisions --config no.toml => config file no.toml | No such file
-serve-decisions --preset paper --config config/agent.toml => expected no file beside --preset paper
-serve-decisions --beam-width 10001 => beam_width: expected 1 to 10000, got 10001
-serve-decisions --exit-with 0 => --exit-with 0: expected a running process
-serve-decisions --exit-with 4194305 => --exit-with 4194305: expected a running process
-serve-decisions --policy beam_fire => --policy
 prior => --model | --height | --width | --burn-in | --out
 prior --model ash --height 4 --width 4 --burn-in 1 --out o => model file ash: No such file
 prior --model wildfire --height 4 --width 4 --burn-in 1 --out / => --out: expected a file, got /
@@ -123,7 +108,10 @@ compare --instance nobody --policies coverage,ash => policy: expected one of ran
 compare --instance nobody --baseline ash => --baseline | expected one of | got "ash"
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
-compare TINY --csv / => --csv: expected a file, got the folder /
+compare TINY --csv / => --csv: write /: expected a regular file, got a folder
+compare TINY --csv /dev/null => --csv: write /dev/null: expected a regular file
+compare TINY --csv /proc/rows.csv => --csv: /proc/rows.csv: create /proc: expected a folder that can be written to
+compare TINY --figures /proc => create /proc: expected a folder that can be written to
 compare TINY --figures /proc/no => create /proc/no
 "#;
 
@@ -273,7 +261,6 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
     for (command, done) in [
         ("run --steps 3", "done"),
         (&*train, "done"),
-        ("serve-decisions", "serving decisions"),
         (
             "compare --policies coverage --baseline coverage --seeds 0..1 --steps 1",
             "",
@@ -285,9 +272,6 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
         agent.wait_for_words("waiting for it");
         let _server = Server::start_on(&instance, &format!("{SMALL} --worlds 2 --publish-truth"));
         agent.wait_for_words(done);
-        if command == "serve-decisions" {
-            agent.signal(Signal::TERM);
-        }
         let ended = agent.ends(0);
         let told = ended.stderr.matches("waiting for it").count();
         assert_eq!(told, 1, "{command}: {}", ended.stderr);
@@ -296,13 +280,11 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
 
 #[test]
 fn an_agent_that_waits_can_be_stopped() {
-    for command in ["run", "serve-decisions"] {
-        let instance = new_instance();
-        let flags = format!("{command} --wait 1e18 --instance {}", instance.name());
-        let agent = Program::start(AGENT, &flags);
-        agent.wait_for_words("waiting for it");
-        agent.finish();
-    }
+    let instance = new_instance();
+    let flags = format!("run --wait 1e18 --instance {}", instance.name());
+    let agent = Program::start(AGENT, &flags);
+    agent.wait_for_words("waiting for it");
+    agent.finish();
 }
 
 #[test]

@@ -1,12 +1,14 @@
 //! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
 
-use crate::commands::agent;
+use crate::commands::{TINY, agent, check};
+use emberwatch_agent::benchmark::report::RunsFile;
 use emberwatch_protocol::{Dynamics, Model, Shape};
 use emberwatch_server::world::{Source, World};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 use tempfile::TempDir;
-use tests::harness::{Program, Server, repository};
+use tests::harness::{AGENT, Program, Server, repository};
 
 /// What is compared; the worlds come on top.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
@@ -17,7 +19,8 @@ const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
                       mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
                       steps_to_detection,burning_cells_at_detection,recent_steps,\
-                      burning_seen_share,front_distance,grid_seen_share,log_likelihood";
+                      burning_seen_share,front_distance,grid_seen_share,log_likelihood,\
+                      worlds_fingerprint,policy_fingerprint";
 
 /// The rows of a CSV file without the time that plans took; its header is checked.
 fn rows(path: &Path) -> Vec<Vec<String>> {
@@ -26,7 +29,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 21, "{line}");
+        assert_eq!(fields.len(), 23, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields
@@ -69,6 +72,22 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     }
     let settings = std::fs::read_to_string(figures.join("agent.toml")).expect("the settings");
     assert!(settings.contains("beam_width = 4"), "{settings}");
+}
+
+#[test]
+fn a_csv_file_that_another_process_writes_is_refused_before_the_work() {
+    let folder = TempDir::new().expect("a folder");
+    let csv = folder.path().join("out.csv");
+    let held = RunsFile::lock(&csv, Duration::ZERO).expect("locked");
+    let compare = format!("compare {TINY} --csv {}", csv.display());
+    check(
+        AGENT,
+        &compare,
+        "--csv: write | out.csv: another process is writing it",
+    );
+    drop(held);
+    agent(&compare);
+    assert_eq!(rows(&csv).len(), 1);
 }
 
 #[test]

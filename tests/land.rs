@@ -10,7 +10,7 @@ use emberwatch_protocol::{Cell, Model, Move, UNOBSERVED};
 use std::collections::BTreeMap;
 use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::{AGENT, PATIENCE, Paths, SERVER, Server, reset};
+use tests::harness::{AGENT, PATIENCE, Paths, SERVER, Server, reset, run};
 
 const N_MOVES: usize = 6;
 
@@ -270,6 +270,36 @@ fn a_server_refuses_a_land_that_cannot_be() {
     );
     with("\"missing.npy\"");
     check(&land, "missing.npy");
+}
+
+#[test]
+fn the_share_of_cells_that_no_fly_cells_close_off_is_logged() {
+    let folder = TempDir::new().expect("a folder");
+    let path = folder.path().join("pocket.toml");
+    let row = |row: usize| match row {
+        1 => [1, 0, 0, 1, 0],
+        0 | 2 => [1, 1, 1, 1, 0],
+        _ => [0; 5],
+    };
+    let rows: Vec<[u8; 5]> = (0..5).map(row).collect();
+    let text = include_str!("../config/models/wildfire.toml");
+    std::fs::write(&path, format!("no_fly = {rows:?}\n{text}")).expect("a model");
+    let flags = format!(
+        "--model {} --height 5 --width 5 --burn-in 0",
+        path.display()
+    );
+    let share = "no-fly cells close off 2 of 15 free cells (13.33 %)";
+    let checked = |start: &str| run(SERVER, &format!("--check {flags} --start {start}")).check(0);
+    let random = checked("random");
+    random.check_says(share).check_prints("start = \"random\"");
+    assert!(!random.stderr.contains("WARN"), "{}", random.stderr);
+    let closed_in = checked("1,2");
+    closed_in.check_says(share);
+    closed_in.check_says(
+        "start: no-fly cells close in (1, 2): robots that start there reach 2 of 15 free cells",
+    );
+    let server = Server::start(&format!("{flags} --start random"));
+    server.program.wait_for_words(share);
 }
 
 #[test]

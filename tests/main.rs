@@ -12,8 +12,6 @@ mod commands;
 mod compare;
 mod compliance;
 mod crash;
-mod decision_ends;
-mod decisions;
 mod determinism;
 mod episodes;
 mod files;

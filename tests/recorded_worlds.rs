@@ -337,8 +337,6 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     refuse(ladder, no_model);
     let words = "--steps: expected at most 23, as the shortest episode has, got 24";
     refuse("compare --seeds 0..1 --steps 24", words);
-    let words = "has recorded worlds, without a model: expected --model FILE";
-    refuse("serve-decisions", words);
 }
 
 #[test]

@@ -1,9 +1,10 @@
 //! `emberwatch-agent suite` and `leaderboard`: results that go on, one score, a page of entries.
 
 use crate::commands::{agent, check, check_table};
+use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::AGENT;
+use tests::harness::{AGENT, LIMIT, Program, program_path, repository};
 
 const TASK: &str = "name = \"tiny\"
 model = \"wildfire-small\"
@@ -42,6 +43,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
         "a learned policy needs a checkpoint: {all}"
     );
     assert!(rows.lines().all(|row| all.contains(row)));
+    more.check_says("3 rows of coverage kept");
     assert!(
         all.lines()
             .filter(|row| row.starts_with("beam"))
@@ -91,8 +93,219 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
     check(
         AGENT,
         &board,
-        "entry coverage: expected the worlds and steps of task tiny",
+        "entry coverage, task tiny: policy \"coverage\" on world 0: steps: expected 40, got 41",
     );
+}
+
+#[test]
+fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let [task, out, others] =
+        ["tiny.toml", "out", "others.csv"].map(|name| path(name).display().to_string());
+    std::fs::write(&task, TASK).expect("write");
+    let suite = format!("suite --tasks {task} --out {out} --policies coverage");
+    agent(&suite);
+    // Rows that Python wrote on the same worlds.
+    let rows = read(&path("out/tiny.csv"));
+    let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
+    let python: Vec<String> = of_coverage
+        .map(|row| row.replace("coverage", "python"))
+        .collect();
+    let header = rows.lines().next().expect("a header");
+    std::fs::write(&others, format!("{header}\n{}\n", python.join("\n"))).expect("write");
+    std::fs::write(
+        path("out/tiny.csv"),
+        format!("{rows}{}\n", python.join("\n")),
+    )
+    .expect("write");
+    let same = agent(&suite).check(0);
+    same.check_says("3 rows of coverage kept");
+    same.check_prints("| python ");
+    let compare = format!(
+        "compare --task {task} --policies random_walk --baseline random_walk --add {others}"
+    );
+    agent(&compare).check_prints("| python ");
+    let entries = path("entries");
+    std::fs::create_dir(&entries).expect("a folder");
+    std::fs::write(path("page.md"), PAGE).expect("write");
+    let board = |policy: &str| {
+        let [entries, page] = ["entries", "page.md"].map(|name| path(name).display().to_string());
+        let about = "--by us --code here --commit abcdef0";
+        format!(
+            "leaderboard --entries {entries} --page {page} --add {out} --policy {policy} {about}"
+        )
+    };
+    for policy in ["random_walk", "oracle_ahead", "python"] {
+        agent(&board(policy));
+    }
+    let page = read(&path("page.md"));
+    for (from, to, what) in [
+        ("burn_in = 300", "burn_in = 50", "worlds_fingerprint"),
+        ("moves = 5", "moves = 20", "moves: expected 20, got 5"),
+        (
+            "max_steps",
+            "robots = 4\nmax_steps",
+            "robots: expected 4, got 1",
+        ),
+        (
+            "max_steps",
+            "sensor_radius = 1\nmax_steps",
+            "worlds_fingerprint",
+        ),
+        (
+            "max_steps",
+            "start = \"random\"\nmax_steps",
+            "worlds_fingerprint",
+        ),
+        (
+            "max_steps = 40",
+            "max_steps = 41",
+            "steps: expected 41, got 40",
+        ),
+    ] {
+        std::fs::write(&task, TASK.replacen(from, to, 1)).expect("write");
+        let changed = agent(&suite);
+        changed.check_says("3 rows of coverage are run again");
+        changed.check_says(&format!(
+            "python is left out: policy \"python\" on world 0: {what}"
+        ));
+        assert!(!changed.stdout.contains("python"), "{}", changed.stdout);
+        let rows = read(&path("out/tiny.csv"));
+        assert!(python.iter().all(|row| rows.contains(row)), "none are lost");
+        check(
+            AGENT,
+            &compare,
+            &format!("--add: policy \"python\" on world 0: {what}"),
+        );
+        let refused = Program::start(AGENT, &board("coverage")).wait(LIMIT);
+        assert_ne!(refused.code, Some(0));
+        refused.check_says("entry coverage, task tiny");
+        assert!(!entries.join("coverage.csv").exists());
+        assert_eq!(read(&path("page.md")), page);
+    }
+}
+
+#[test]
+fn two_suites_that_fill_one_folder_at_once_lose_no_rows() {
+    let folder = TempDir::new().expect("a folder");
+    let [task, out] = ["tiny.toml", "out"].map(|name| folder.path().join(name));
+    std::fs::write(&task, TASK).expect("write");
+    let both = ["coverage", "beam_exploit"].map(|policy| {
+        let (task, out) = (task.display(), out.display());
+        let suite = format!("suite --tasks {task} --out {out} --policies {policy}");
+        Program::start(AGENT, &suite)
+    });
+    both.into_iter().for_each(|suite| {
+        suite.wait(LIMIT).check(0);
+    });
+    let runs = read_runs(&out.join("tiny.csv")).expect("rows");
+    for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
+        let n_rows = runs.iter().filter(|run| run.policy == policy).count();
+        assert_eq!(n_rows, 3, "{policy}");
+    }
+}
+
+/// A copy of this repository's leaderboard in a folder.
+struct Board(TempDir);
+
+impl Board {
+    fn new() -> Self {
+        let folder = TempDir::new().expect("a folder");
+        let docs = repository().join("docs");
+        for name in ["random_walk", "oracle_ahead", "coverage"] {
+            let name = format!("{name}.csv");
+            let copied = std::fs::copy(
+                docs.join("leaderboard").join(&name),
+                folder.path().join(&name),
+            );
+            copied.expect("copied");
+        }
+        std::fs::write(folder.path().join("page.md"), PAGE).expect("write");
+        Self(folder)
+    }
+
+    fn command(&self) -> String {
+        let folder = self.0.path().display();
+        format!("leaderboard --entries {folder} --page {folder}/page.md")
+    }
+
+    /// Checks that a changed entry is refused with these words, and leaves the page as it was.
+    fn check(&self, change: impl Fn(&str) -> String, words: &str) {
+        let path = self.0.path().join("coverage.csv");
+        let entry = read(&path);
+        let changed = change(&entry);
+        assert_ne!(changed, entry, "{words}");
+        std::fs::write(&path, changed).expect("write");
+        check(AGENT, &self.command(), &format!("coverage | {words}"));
+        assert_eq!(read(&self.0.path().join("page.md")), PAGE);
+        std::fs::write(&path, entry).expect("write");
+    }
+}
+
+#[test]
+fn html_and_markdown_in_an_entry_are_refused_by_their_column() {
+    let board = Board::new();
+    let replace = |from: &'static str, to: &'static str| move |entry: &str| entry.replace(from, to);
+    let by = ",Emberwatch,";
+    board.check(
+        replace(by, ",<svg onload=alert(2)>,"),
+        "by: expected 1 to 200 letters",
+    );
+    board.check(replace(by, ",[us](javascript:alert(1)),"), "by: expected");
+    board.check(
+        replace(by, ",![us](https://example.org/us.png),"),
+        "by: expected",
+    );
+    board.check(
+        replace("agent/src/policy/named.rs", "`code`"),
+        "code: expected",
+    );
+    board.check(
+        replace("agent/src/policy/named.rs", "javascript:alert(1)"),
+        "code: expected",
+    );
+    board.check(replace(",none,", ",<b>none</b>,"), "estimator: expected");
+    board.check(
+        replace(",small,", ",<img src=x>,"),
+        "task: expected 1 to 64 letters",
+    );
+    board.check(replace("be807c7", "<i>be807c7"), "commit: expected 7 to 40");
+    let about = "--policy mine --by <svg> --code here --commit abcdef0";
+    let out = board.0.path().join("out");
+    std::fs::create_dir(&out).expect("a folder");
+    let rows = read(&repository().join("docs/learning/rows.csv"));
+    let first = rows.lines().nth(1).and_then(|row| row.split(',').next());
+    let rows = rows.replace(&format!("{},", first.expect("a policy")), "mine,");
+    std::fs::write(out.join("small.csv"), rows).expect("write");
+    let add = format!("{} --add {} {about}", board.command(), out.display());
+    check(AGENT, &add, "by: expected 1 to 200 letters | got \"<svg>\"");
+}
+
+#[test]
+fn an_entry_without_the_worlds_fingerprint_is_refused() {
+    let board = Board::new();
+    let without = |entry: &str| {
+        let cut = |row: &str| row.rsplit_once(',').map(|(row, _)| row.to_owned());
+        entry.lines().filter_map(cut).collect::<Vec<_>>().join("\n")
+    };
+    board.check(without, "worlds_fingerprint | got none");
+    agent(&board.command()).check_prints("| coverage ");
+}
+
+#[test]
+fn a_page_that_does_not_fit_on_the_disk_is_named() {
+    let board = Board::new();
+    // A limit of file sizes stands for a full disk.
+    let script = format!(
+        "trap '' XFSZ; ulimit -f 1; exec {} {}",
+        program_path(AGENT).display(),
+        board.command()
+    );
+    let ended = Program::start_at(Path::new("/bin/sh"), &["-c", &script]).wait(LIMIT);
+    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    ended.check_says("page.md: File too large");
+    assert_eq!(read(&board.0.path().join("page.md")), PAGE);
 }
 
 /// Rewards of a policy's rows.

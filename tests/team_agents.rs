@@ -85,8 +85,6 @@ fn what_a_server_of_several_robots_cannot_give_is_refused_by_name() {
     check("run --robot 4", &format!("{robots} 4..5"));
     check("run --robots 2..6 --team", &format!("{robots} 2..6"));
     check("run --world 1", "no such world");
-    let robots = "expected a server with --robots 1, got 4";
-    check("serve-decisions", robots);
     let robots = "expected the running server's 4, got 2";
     check("compare --robots 2", robots);
 }

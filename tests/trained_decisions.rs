@@ -165,6 +165,32 @@ fn decisions_on_a_known_model_go_on_with_it() {
 }
 
 #[test]
+fn episodes_no_longer_than_the_returns_teach() {
+    let place = place();
+    for episode_steps in [1, 4, 5] {
+        let steps = format!("episode_steps = {episode_steps}");
+        place.set(&SETTINGS.replace("episode_steps = 9", &steps));
+        let outs = ["a", "b"].map(|name| {
+            let out = format!("{name}{episode_steps}");
+            place.train(
+                &out,
+                &format!("{WORLDS} --estimator known_model --steps 40"),
+            );
+            out
+        });
+        let (_, loss) = last(&place, &outs[0]);
+        assert!(loss.is_finite(), "{loss}");
+        // Each step of an episode that is over, and of the others those whose return is complete.
+        let n_over = 20 / episode_steps * episode_steps;
+        let n_open = (20_usize % episode_steps).saturating_sub(4);
+        let n = saved(&place, &outs[0]).dqn.transitions.len();
+        assert_eq!(n, 2 * (n_over + n_open), "{episode_steps}");
+        let [one, same] = outs.map(|out| std::fs::read(place.checkpoint(&out)).expect("a file"));
+        assert!(one == same, "checkpoints of the same training differ");
+    }
+}
+
+#[test]
 fn a_filter_that_was_given_is_the_estimator_s() {
     let place = place();
     place.train("own", &format!("{WORLDS} --learner own_filter --steps 40"));

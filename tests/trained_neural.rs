@@ -29,6 +29,10 @@ fn place() -> Place {
 fn a_neural_belief_is_learned_resumed_and_acted_on() {
     let place = place();
     let rows = place.learn("out", &format!("{WORLDS} --steps 40"));
+    place.train("same", &format!("{WORLDS} --steps 40"));
+    let [one, same] =
+        ["out", "same"].map(|out| std::fs::read(place.checkpoint(out)).expect("a file"));
+    assert!(one == same, "checkpoints of the same training differ");
     let losses: Vec<f64> = rows.iter().filter_map(|row| row[2].parse().ok()).collect();
     assert_eq!(losses.len(), 20);
     assert!((losses[0] - 3_f64.ln()).abs() < 1e-3, "all alike at first");

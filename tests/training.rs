@@ -50,6 +50,9 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
     for (out, seed) in [("a", 5), ("b", 5), ("c", 6)] {
         place.train(out, &format!("{WORLDS} --steps 120 --agent-seed {seed}"));
     }
+    let [a, b, c] = ["a", "b", "c"].map(|out| bytes(&place.checkpoint(out)));
+    assert!(a == b, "checkpoints of the same training differ");
+    assert!(a != c);
     let [a, b, c] = ["a", "b", "c"].map(|out| place.rows(out));
     assert_eq!(a, b);
     assert_ne!(a, c);
@@ -59,6 +62,44 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
         "{losses:?}"
     );
     assert_eq!(a.last().map(|row| &*row[1]), Some("120"));
+}
+
+#[test]
+fn a_training_that_made_no_update_says_why() {
+    let place = place();
+    let none = "nothing was learned in";
+    let learner = format!("{SETTINGS}[decisions]\nbatch = 9\nupdates_per_step = 1.0\n");
+    for (out, settings, flags, cause) in [
+        (
+            "filter",
+            SETTINGS,
+            "--steps 6",
+            "6 world steps: an update needs 4 blocks of frames (learning.streams), and there were 2",
+        ),
+        (
+            "decisions",
+            &learner,
+            "--learner decisions --estimator known_model --steps 14",
+            "14 world steps: an update learns from 9 transitions, and the steps gave 6",
+        ),
+        (
+            "neural",
+            SETTINGS,
+            "--learner neural --steps 30",
+            "30 world steps: too few for an update at neural.updates_per_step = 0.03125",
+        ),
+    ] {
+        place.set(settings);
+        let ended = place.train(out, &format!("{WORLDS} {flags}"));
+        ended.check_says(&format!("{none} {cause}"));
+    }
+    place.set(SETTINGS);
+    let ended = place.train("learned", &format!("{WORLDS} --steps 60"));
+    assert!(!ended.stderr.contains(none), "{}", ended.stderr);
+    let ended = place.train("learned", &format!("{WORLDS} --steps 4 --resume --freeze"));
+    assert!(!ended.stderr.contains(none), "{}", ended.stderr);
+    let ended = place.train("learned", &format!("{WORLDS} --steps 4 --resume"));
+    ended.check_says(none);
 }
 
 #[test]
@@ -341,7 +382,14 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
         let name = server.instance.name();
         place.words("out", &format!("--instance {name} {flags}"))
     };
-    check(AGENT, &words("--worlds 2"), "no such robot");
+    let more = "no such world: the server has worlds 0 to 0; start it with --worlds N for more";
+    for flags in [
+        "--worlds 2",
+        "--worlds 1 --world 1",
+        "--worlds 1 --world 4294967294",
+    ] {
+        check(AGENT, &words(flags), more);
+    }
     let _held = server.acquire(0..1);
     check(AGENT, &words("--worlds 1"), "pid");
     place.set("[learning]\nkernel = [2, 3]\n");

@@ -1,7 +1,6 @@
 //! The subcommands: flags in, library calls, files and tables out.
 
 mod compare;
-mod decisions;
 mod evaluate;
 mod leaderboard;
 mod prior;
@@ -12,7 +11,6 @@ mod train;
 mod worlds;
 
 pub use compare::CompareCommand;
-pub use decisions::ServeDecisionsCommand;
 pub use evaluate::EvaluateCommand;
 pub use leaderboard::LeaderboardCommand;
 pub use prior::PriorCommand;

@@ -4,7 +4,7 @@
 //!
 //! - `commands` (of the program): flags in, words out
 //! - [`benchmark`] -- policies on the same worlds, scored
-//! - [`acting`] -- one world of a running server, for a policy or for a learner outside
+//! - [`acting`] -- one world of a running server, and plans for a learner outside
 //! - [`learning`] -- models that are learned while acting, and their checkpoints
 //! - [`rollout`] -- an agent, and the one step that all of these take
 //! - [`client`] -- the ends of the wire

@@ -1,10 +1,11 @@
-//! `emberwatch-agent`: acts on a server's world, for itself or for a learner outside, or
-//! compares ways to act.
+//! `emberwatch-agent`: acts on a server's world, or compares ways to act.
 
 mod commands;
 
 use clap::{Parser, Subcommand};
 use emberwatch_network::{Allocator, set_up_process};
+use emberwatch_protocol::limits::threads::NoThreads;
+use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;
 
 #[global_allocator]
@@ -23,8 +24,6 @@ enum Command {
     /// Act on one world of a running server
     #[command(after_long_help = commands::policies())]
     Run(commands::RunCommand),
-    /// Take decisions for one world from a learner outside, and do the rest
-    ServeDecisions(commands::ServeDecisionsCommand),
     /// Write a filter's first belief to a file
     Prior(commands::PriorCommand),
     /// Compare policies on the same worlds: table, CSV and figures
@@ -44,9 +43,13 @@ enum Command {
 fn main() -> ExitCode {
     set_up_process();
     emberwatch_protocol::program::start_logging();
-    let result = match &Cli::parse().command {
+    let command = Cli::parse().command;
+    if let Err(error) = start_threads() {
+        tracing::error!("{error}");
+        return ExitCode::FAILURE;
+    }
+    let result = match &command {
         Command::Run(command) => command.run(),
-        Command::ServeDecisions(command) => command.run(),
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
         Command::Suite(command) => command.run(),
@@ -61,4 +64,11 @@ fn main() -> ExitCode {
             commands::exit_code(&error)
         }
     }
+}
+
+/// Starts the threads that all commands share: they would start at their first work, where a failure is a panic.
+fn start_threads() -> Result<(), NoThreads> {
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let started = ThreadPoolBuilder::new().build_global();
+    started.map_err(|error| NoThreads::new(n_threads, &error))
 }

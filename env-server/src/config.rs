@@ -2,7 +2,7 @@
 
 use crate::bounds::BOUNDS;
 use crate::states_file::{StatesError, StatesFile};
-use crate::world::{Recorded, check_start};
+use crate::world::{Reach, Recorded};
 use emberwatch_protocol::channels::{ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_TEAM_CELLS};
 use emberwatch_protocol::control::CoverageRule;
 use emberwatch_protocol::grid::ShapeError;
@@ -63,6 +63,8 @@ pub struct Checked {
     /// That of recorded worlds has no changes.
     pub model: Model,
     pub shape: Shape,
+    /// What no-fly cells leave to the robots.
+    pub reach: Reach,
     pub recorded: Option<CheckedStates>,
 }
 
@@ -182,13 +184,14 @@ impl ServerConfig {
             expected,
             got,
         };
-        check_start(self.start, &airspace, self.robots as usize).map_err(wrong)?;
+        let reach = Reach::of(self.start, &airspace, self.robots as usize).map_err(wrong)?;
         Ok(Checked {
             config: self,
             instance,
             task,
             model,
             shape,
+            reach,
             recorded,
         })
     }
@@ -294,6 +297,9 @@ impl ServerConfig {
             ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
                 let names: Vec<&str> = Model::built_in_names().collect();
                 let problem = format!("{problem}: expected one, or {}", names.join(", "));
+                file_error("model file", path, problem)
+            }
+            ModelError::File { path: of, problem } if Path::new(&of) == path => {
                 file_error("model file", path, problem)
             }
             other => file_error("model file", path, other),

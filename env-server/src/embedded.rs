@@ -6,15 +6,17 @@
 mod tests;
 
 use crate::config::Checked;
+use crate::limits::{check_memory, n_threads, start};
 use crate::server::Rate;
 use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
 use crate::simulator::{Simulator, Stepped};
 use crate::snapshot::Job;
 use crate::world::{Episode, Rules};
-use anyhow::{Context, Result, ensure};
+use anyhow::Result;
 use emberwatch_protocol::connection::{ConnectionError, check_status};
 use emberwatch_protocol::control::{Reply, ServerInfo};
 use emberwatch_protocol::interrupt::check_interrupt;
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::message::{Status, StepReply, StepRequest, VERSION};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::ops::Range;
@@ -28,9 +30,6 @@ pub const INSTANCE: &str = "(embedded)";
 
 /// Jobs on files that may wait, each with its bytes.
 const MAX_FILES: usize = 16;
-
-/// Bytes of a cell, and of what a robot knows of it, in a world and its beginning.
-const CELL_BYTES: u64 = 4;
 
 /// How often a wait looks whether it is interrupted.
 const INTERVAL: Duration = Duration::from_millis(5);
@@ -49,8 +48,6 @@ pub struct Embedded {
     file_thread: ThreadPool,
     n_files: Arc<AtomicUsize>,
     publishes_truth: bool,
-    /// Those of the last answer: the next is mostly as long.
-    n_bytes: usize,
     client: ClientId,
     started: Instant,
     rate: Rate,
@@ -64,31 +61,26 @@ impl Embedded {
     /// If the model does not fit the grid, there is too little memory, or no threads can be started.
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
-        let n_threads = match config.threads {
-            0 => std::thread::available_parallelism().map_or(1, usize::from),
-            n_threads => n_threads,
-        };
-        let n_threads = n_threads.min(config.worlds as usize);
-        let of_cell = u64::from(config.worlds) * (CELL_BYTES + u64::from(config.robots));
-        check_memory(of_cell.saturating_mul(checked.shape.n_cells() as u64))?;
+        let n_threads = n_threads(config).min(config.worlds as usize);
         let publishes_truth = config.publish_truth;
         let mut n_leases = 0;
         let next_token = move || {
             n_leases += 1;
             n_leases
         };
-        let steps = threads(n_threads)?;
+        let (steps, reset_threads) = (threads(n_threads)?, threads(n_threads)?);
+        let file_thread = threads(1)?;
+        check_memory(&checked, n_threads)?;
         let (simulator, jobs) = Simulator::new(checked, steps, Box::new(next_token))?;
         let now = Instant::now();
         let embedded = Self {
             rules: Arc::new(simulator.spec().rules.clone()),
             simulator,
             resets: channel(),
-            reset_threads: threads(n_threads)?,
-            file_thread: threads(1)?,
+            reset_threads,
+            file_thread,
             n_files: Arc::default(),
             publishes_truth,
-            n_bytes: 0,
             client: ClientId {
                 node: 0,
                 pid: std::process::id(),
@@ -167,7 +159,7 @@ impl Embedded {
             version: VERSION,
             ..request
         };
-        let mut payload = Vec::with_capacity(self.n_bytes);
+        let mut payload = Vec::new();
         let stepped = self
             .simulator
             .step(now, self.client, &request, body, &mut payload);
@@ -175,7 +167,6 @@ impl Embedded {
             unreachable!("invariant: the only client names all robots that it holds in a world");
         };
         check_status("step", reply.status, reply.detail, None)?;
-        self.n_bytes = payload.len();
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         Ok((reply, payload))
     }
@@ -200,7 +191,6 @@ impl Embedded {
     fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
-                who: "server",
                 instance: INSTANCE.into(),
             });
         }
@@ -308,27 +298,7 @@ pub fn wait_for<T>(
     }
 }
 
-fn threads(n_threads: usize) -> Result<ThreadPool> {
-    // A panic ends the job, not the process.
-    let threads = ThreadPoolBuilder::new().panic_handler(|_| ());
-    threads
-        .num_threads(n_threads)
-        .build()
-        .with_context(|| format!("start {n_threads} threads"))
-}
-
-/// Refuses worlds that would not fit in memory.
-fn check_memory(needed: u64) -> Result<()> {
-    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
-    let mut lines = text.lines();
-    let line = lines.find_map(|line| line.strip_prefix("MemAvailable:"));
-    let free = line.and_then(|line| line.trim().strip_suffix(" kB")?.parse::<u64>().ok());
-    let free = free.map_or(u64::MAX, |free| free << 10);
-    ensure!(
-        needed < free,
-        "memory: expected {} MiB for the worlds, got {} MiB that are free",
-        needed >> 20,
-        free >> 20
-    );
-    Ok(())
+/// Starts threads whose jobs may panic: that ends the job, not the process.
+fn threads(n_threads: usize) -> Result<ThreadPool, NoThreads> {
+    start(ThreadPoolBuilder::new().panic_handler(|_| ()), n_threads)
 }

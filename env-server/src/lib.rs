@@ -11,6 +11,7 @@ pub mod config;
 pub mod embedded;
 pub mod flags;
 pub mod given;
+pub mod limits;
 pub mod recording;
 pub mod server;
 pub mod simulator;

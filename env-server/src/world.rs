@@ -10,12 +10,14 @@ mod robot;
 mod rules;
 mod saved;
 mod sensor;
+mod starts;
 
 pub use episode::Episode;
 pub use flown::Flown;
 pub use hidden::{Source, World};
-pub use history::{PastRobot, PastStep};
+pub use history::{LEAST_ROOM, PastRobot, PastStep, bytes_of_history};
 pub use recorded::Recorded;
-pub use robot::Robot;
-pub use rules::{Rules, check_start};
+pub use robot::{Robot, bytes_of_robot};
+pub use rules::{Rules, most_seen};
 pub use saved::{InvalidWorld, SavedRobot, SavedWorld};
+pub use starts::{ClosedIn, Reach};

@@ -3,13 +3,14 @@
 //!
 //! A [`Client`] flies robots; `examples/random_robot.rs` is a whole program. Below it, a [`Connection`] takes the
 //! requests in [`control`] and [`message`]. An [`observer`] reads what a server publishes, a [`recording`] what a file
-//! holds of that. A [`responder`] serves decisions of its own. [`channels`] and [`failed_connections`] are for those
-//! who serve worlds. A [`task`] is a world with a name.
+//! holds of that. A [`responder`], [`channels`] and [`failed_connections`] are for those who serve worlds. A [`task`] is
+//! a world with a name. [`limits`] refuses more memory and threads than the system has.
 //!
 //! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
 //! flies one path with each robot and moves the world once; a *frame* holds the observations of a step; a *lease* is the
 //! right to fly robots.
 
+pub mod limits;
 pub mod model;
 pub mod program;
 pub mod task;
@@ -24,10 +25,9 @@ pub use model::transition::{self, Transition};
 pub use model::{Airspace, Model, randomness, vectors};
 pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
-pub use wire::decider::Decider;
 pub use wire::{
-    agent_belief, channels, cleanup, control, decisions, failed_connections, interrupt, message,
-    observer, payload, recording, responder, shared_memory, turn, wait,
+    agent_belief, channels, cleanup, control, failed_connections, interrupt, message, observer,
+    payload, recording, responder, shared_memory, turn, wait,
 };
 
 #[cfg(doctest)]

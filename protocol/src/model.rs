@@ -12,6 +12,7 @@ pub mod file;
 pub mod frame;
 pub mod grid;
 mod parameters;
+mod parts;
 pub mod path;
 pub mod randomness;
 pub mod transition;
@@ -25,3 +26,4 @@ pub use file::{
     ObservationEntry, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
 };
 pub use parameters::Model;
+pub use parts::Parts;

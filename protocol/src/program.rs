@@ -1,6 +1,7 @@
 //! What every program does when it starts: log to standard error, read settings and models, stop on signals or
 //! when another process ends.
 
+use crate::limits::threads::spawn;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
@@ -13,7 +14,7 @@ use std::time::{Duration, Instant};
 use tracing_subscriber::EnvFilter;
 
 /// The name that `agent` uses.
-pub use crate::wire::process::{NotRunning, WatchedProcess, node_pid, pid_namespace};
+pub use crate::wire::process::{NotWatched, WatchedProcess, node_pid, pid_namespace};
 
 /// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
@@ -84,9 +85,7 @@ pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
             }
         }
     };
-    std::thread::Builder::new()
-        .name("signals".into())
-        .spawn(wait)?;
+    spawn("signals", wait).map_err(std::io::Error::other)?;
     Ok(stop)
 }
 

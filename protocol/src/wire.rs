@@ -1,7 +1,7 @@
 //! The wire: what travels between processes, and how.
 //!
-//! [`message`], [`payload`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
-//! [`connection`], [`client`] and [`decider`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
+//! [`message`], [`payload`] and [`control`] are the messages; [`channels`] the services that carry them;
+//! [`connection`] and [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
 //! [`node`], [`turn`] and [`cleanup`] create and remove channels, [`shared_memory`] gives them memory; [`wait`] is the
 //! bounded wait. [`recording`] keeps samples in a file.
 
@@ -13,8 +13,6 @@ pub mod client;
 mod codes;
 pub mod connection;
 pub mod control;
-pub mod decider;
-pub mod decisions;
 mod directory;
 mod error;
 mod exchange;

@@ -6,7 +6,6 @@ pub mod attacker;
 pub mod fuzz;
 pub mod harness;
 pub mod kills;
-pub mod learner;
 pub mod meter;
 pub mod mirror;
 mod programs;

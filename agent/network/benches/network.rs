@@ -102,6 +102,7 @@ fn dqn(c: &mut Criterion) {
             action: (row % 4) as usize,
             reward: number(row * 100 + 50),
             next: vector(row * 100 + 20),
+            discount: 0.99,
         });
     }
     c.bench_function("dqn: update (torch: 0.65 ms)", |b| {

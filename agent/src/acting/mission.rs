@@ -121,20 +121,6 @@ impl Mission {
     }
 }
 
-/// What a server says of itself, and its model, or the one given; checks that it has the worlds. Who needs no model gets
-/// the states of recorded worlds as one.
-pub fn prepare(
-    instance: &Instance,
-    worlds: &Range<u32>,
-    model: Option<&Model>,
-    needs_model: bool,
-) -> Result<(ServerInfo, Model)> {
-    let info = info_of(instance, worlds)?;
-    let recorded = recorded_states(&info)?.filter(|_| model.is_none() && !needs_model);
-    let model = recorded.map_or_else(|| model_of(instance, &info, model), Ok)?;
-    Ok((info, model))
-}
-
 /// What a server says of itself, if it has the worlds.
 pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
     let info = connect(instance)?.info().clone();

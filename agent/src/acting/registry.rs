@@ -178,7 +178,8 @@ pub fn needs_model(policy: &Policy) -> String {
     )
 }
 
-fn world_form(model: &Model) -> WorldForm<'_> {
+/// What a world must have in common with that of a belief that was learned.
+pub fn world_form(model: &Model) -> WorldForm<'_> {
     WorldForm {
         n_observations: model.n_observations(),
         n_matrices: model.n_rings(),

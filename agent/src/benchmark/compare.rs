@@ -20,6 +20,7 @@ use emberwatch_protocol::Model;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::path::Flight;
+use sha2::{Digest, Sha256};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -131,8 +132,9 @@ pub fn compare(
                 let both = [results.snapshot, worlds[0].snapshot.take()];
                 results.snapshot = both.into_iter().flatten().max_by_key(Snapshot::rank);
             }
+            let fingerprint = comparison.policy_fingerprint(&contestant.policy, arena.model());
             let runs = worlds.into_iter();
-            let runs = runs.map(|world| contestant.policy_run(world, arena.info()));
+            let runs = runs.map(|world| contestant.policy_run(world, arena.info(), &fingerprint));
             results.runs.extend(runs);
         }
     }
@@ -148,6 +150,16 @@ impl Comparison {
             _ => self.policies.len(),
         };
         self.teams.iter().map(n_policies).sum()
+    }
+
+    /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, besides its name and the worlds.
+    pub fn policy_fingerprint(&self, policy: &Policy, model: &Model) -> String {
+        let learned = policy.needs_checkpoint().then_some(&self.learned.digests);
+        let model = toml::to_string(model.file()).expect("invariant: model files serialise");
+        let config = toml::to_string(&self.config).expect("invariant: settings serialise");
+        let version = env!("CARGO_PKG_VERSION");
+        let hash = Sha256::digest(format!("{version}\n{model}\n{config}\n{learned:?}"));
+        hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
     /// Each policy with each team, but the oracle once.
@@ -351,7 +363,7 @@ fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
 }
 
 impl Contestant {
-    fn policy_run(&self, world: World, info: &ServerInfo) -> PolicyRun {
+    fn policy_run(&self, world: World, info: &ServerInfo, fingerprint: &str) -> PolicyRun {
         let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
         let steps = tally.rewards.len() as u64;
         let brier = tally.brier;
@@ -381,6 +393,8 @@ impl Contestant {
             front_distance: merit.front_distance,
             grid_seen_share: Some(merit.grid_seen_share),
             log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
+            worlds_fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
+            policy_fingerprint: fingerprint.into(),
             is_added: false,
             rewards: tally.rewards,
         }

@@ -3,16 +3,16 @@
 //! Everything here turns finished [`PolicyRun`]s into text or a file; nothing here runs a policy.
 //! Read [`statistics`] first, then [`table`] and [`figures`]. [`training`] turns metrics into curves.
 
-pub mod added;
 mod columns;
+pub mod common_worlds;
 pub mod events;
 pub mod figures;
-pub mod kept;
 pub mod leaderboard;
 mod merit;
 mod number;
 mod policy_run;
 mod rewards;
+pub mod runs_file;
 pub mod statistics;
 pub mod suite;
 pub mod table;
@@ -21,5 +21,6 @@ pub mod training;
 
 pub use self::events::write_events;
 pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot, draw_teams, save};
-pub use self::policy_run::{ALONE, PolicyRun, write_csv};
+pub use self::policy_run::{ALONE, PolicyRun};
+pub use self::runs_file::RunsFile;
 pub use self::table::render_table;

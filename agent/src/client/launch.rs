@@ -3,6 +3,7 @@
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::Connection;
+use emberwatch_protocol::limits::threads::spawn;
 use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher;
 use std::io::{BufRead, BufReader};
@@ -126,7 +127,8 @@ impl OwnProgram {
     fn first_line(&mut self, timeout: Duration) -> String {
         let (tell, told) = std::sync::mpsc::channel();
         if let Some(out) = self.0.stdout.take() {
-            std::thread::spawn(move || {
+            // Without the thread there is no line.
+            let _ = spawn("first line", move || {
                 let mut line = String::new();
                 let _ = BufReader::new(out).read_line(&mut line);
                 let _ = tell.send(line);

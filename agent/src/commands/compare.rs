@@ -1,26 +1,29 @@
 //! `compare`: the benchmark.
 
-use super::shared::{make_folder, make_folder_of, write};
+use super::shared::{lock_csv, make_folder, write};
 use super::worlds::WorldFlags;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use emberwatch_agent::acting::registry::needs_checkpoint;
 use emberwatch_agent::benchmark::arena::Arena;
 use emberwatch_agent::benchmark::compare::{Comparison, Results, compare};
-use emberwatch_agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
+use emberwatch_agent::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
+use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::benchmark::report::{
-    PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
-    render_table, write_csv, write_events,
+    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
+    figures::FIRE_CELLS_PER_STEP, render_table, write_events,
 };
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnDashboard;
 use emberwatch_agent::config::{AgentConfig, AgentFlags};
+use emberwatch_agent::file::{Readers, replace_file};
 use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::policy::{Choice, EstimatorKind, Policy};
 use emberwatch_belief::merit::RECENT_STEPS;
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::MAX_ROBOTS;
+use emberwatch_protocol::control::ServerInfo;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -86,7 +89,7 @@ impl CompareCommand {
     pub fn run(&self) -> Result<()> {
         self.check_names()?;
         let config = self.settings.effective()?;
-        self.make_places()?;
+        let csv = self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
         let numbers: Vec<Option<u32>> = match self.robots.as_slice() {
@@ -116,7 +119,7 @@ impl CompareCommand {
                 config: config.clone(),
                 learned: learned.clone(),
             };
-            check_added(&added, &comparison, arena.info().n_moves)?;
+            self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
@@ -125,17 +128,23 @@ impl CompareCommand {
             baseline.clone_into(&mut report.baseline);
             report.add(axis_label(arena.model()), results);
         }
-        self.tell(&report, added, &config)
+        self.tell(&report, added, &config, csv)
     }
 
-    fn tell(&self, report: &Report, added: Vec<PolicyRun>, config: &AgentConfig) -> Result<()> {
-        let fits = check_worlds(&added, &report.runs);
+    fn tell(
+        &self,
+        report: &Report,
+        added: Vec<PolicyRun>,
+        config: &AgentConfig,
+        csv: Option<RunsFile>,
+    ) -> Result<()> {
+        let fits = check_fire(&added, &report.runs);
         // What was measured is kept in any case.
         let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
         write(&render_table(&all, &report.baseline))?;
-        if let Some(path) = &self.csv {
-            write_csv(path, &all)?;
+        if let Some(csv) = csv {
+            csv.replace(&all)?;
         }
         fits?;
         if let Some(directory) = &self.tensorboard {
@@ -148,26 +157,48 @@ impl CompareCommand {
     }
 
     fn read_added(&self) -> Result<Vec<PolicyRun>> {
-        let read = |path: &PathBuf| {
-            let expected = "expected a CSV file of `compare --csv` or emberwatch.benchmark";
-            read_csv(path).with_context(|| format!("--add: {}: {expected}", path.display()))
-        };
-        let files = self.add.iter().map(read);
-        Ok(files.collect::<Result<Vec<_>>>()?.concat())
-    }
-
-    /// Makes the folders of the files to come: better to fail before a long comparison than after.
-    fn make_places(&self) -> Result<()> {
-        if let Some(path) = &self.csv {
+        let mut added = Vec::new();
+        for path in &self.add {
+            let runs = read_runs(path).context("--add")?;
             ensure!(
-                !path.is_dir(),
-                "--csv: expected a file, got the folder {}",
+                !runs.is_empty(),
+                "--add: {}: expected rows, got none",
                 path.display()
             );
-            make_folder_of(path)?;
+            added.extend(runs);
         }
+        added.iter_mut().for_each(|run| run.is_added = true);
+        Ok(added)
+    }
+
+    /// Checks the rows of `--add` before a comparison runs; rows of another number of robots belong to another one.
+    fn check_added(
+        &self,
+        added: &[PolicyRun],
+        comparison: &Comparison,
+        info: &ServerInfo,
+    ) -> Result<()> {
+        let robots = info.n_robots;
+        let is_here = |run: &&PolicyRun| run.robots == robots || !self.robots.contains(&run.robots);
+        let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
+        let policies = comparison.policies.iter();
+        let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
+        let worlds = CommonWorlds {
+            fingerprint: info.worlds_fingerprint.clone(),
+            seeds: comparison.seeds.clone().collect(),
+            steps: comparison.steps,
+            moves: Some(info.n_moves),
+            robots: Some(robots),
+            recent_steps: Some(comparison.recent_steps),
+        };
+        check_added(&added, &policies, &worlds).context("--add")
+    }
+
+    /// Locks the CSV file and makes the folders of the files to come.
+    fn make_places(&self) -> Result<Option<RunsFile>> {
         let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
-        folders.into_iter().flatten().try_for_each(make_folder)
+        folders.into_iter().flatten().try_for_each(make_folder)?;
+        lock_csv(self.csv.as_deref())
     }
 
     /// The policies on an arena's worlds; of the ladder those that need no model, if there is none.
@@ -272,13 +303,6 @@ impl Report {
     }
 }
 
-fn check_added(added: &[PolicyRun], comparison: &Comparison, n_moves: usize) -> Result<()> {
-    let policies = comparison.policies.iter();
-    let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
-    let steps = (comparison.steps, comparison.recent_steps);
-    check_settings(added, &policies, &comparison.seeds, steps, n_moves).context("--add")
-}
-
 fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
     let label = &*report.axis_label;
     for kind in ["png", "svg"] {
@@ -294,7 +318,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     }
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
-    std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
+    replace_file(&path, settings.as_bytes(), Readers::Any)
 }
 
 /// Each option, the rule and the learned choice, on the belief of the decisions that were learned.

@@ -1,14 +1,14 @@
 //! `evaluate`: what a checkpoint is worth beside the known model, with its parameters fixed.
 
 use super::compare::run_comparison;
-use super::shared::{make_folder_of, write};
+use super::shared::{lock_csv, write};
 use super::worlds::WorldFlags;
 use anyhow::{Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::Arena;
 use emberwatch_agent::benchmark::compare::Comparison;
 use emberwatch_agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
-use emberwatch_agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
+use emberwatch_agent::benchmark::report::{RunsFile, render_table, statistics::Estimate};
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::config::{AgentConfig, AgentFlags};
 use emberwatch_agent::learning::learned::Learned;
@@ -56,9 +56,7 @@ pub struct EvaluateCommand {
 impl EvaluateCommand {
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
-        if let Some(path) = &self.csv {
-            make_folder_of(path)?;
-        }
+        let csv = lock_csv(self.csv.as_deref())?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
         let n_robots = self.worlds.task().map_or(1, |task| task.robots);
@@ -86,12 +84,18 @@ impl EvaluateCommand {
             write(&predictions(guide, &policies, &scores, n_matrices))?;
         }
         if !self.predictions_only {
-            self.policies(arena, config, learned)?;
+            self.policies(arena, config, learned, csv)?;
         }
         Ok(())
     }
 
-    fn policies(&self, arena: &mut Arena, config: AgentConfig, learned: Learned) -> Result<()> {
+    fn policies(
+        &self,
+        arena: &mut Arena,
+        config: AgentConfig,
+        learned: Learned,
+        csv: Option<RunsFile>,
+    ) -> Result<()> {
         let named = |name| Policy::named(name, arena.model());
         let mut policies = POLICIES
             .into_iter()
@@ -109,10 +113,7 @@ impl EvaluateCommand {
         };
         let results = run_comparison(arena, &comparison)?;
         write(&render_table(&results.runs, BASELINE))?;
-        if let Some(path) = &self.csv {
-            write_csv(path, &results.runs)?;
-        }
-        Ok(())
+        csv.map_or(Ok(()), |csv| csv.replace(&results.runs))
     }
 }
 

@@ -3,13 +3,12 @@
 use super::shared::write;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::report::added::read_csv;
 use emberwatch_agent::benchmark::report::leaderboard::{
     About, Entry, check_entries, draw_leaderboard, read_entries, render_page,
 };
+use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::benchmark::report::suite::TaskRuns;
 use emberwatch_agent::file::{Readers, replace_file};
-use emberwatch_protocol::task::is_file_name;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -77,31 +76,6 @@ impl LeaderboardCommand {
             commit: text(&self.commit),
             training_seconds: self.training_seconds,
         };
-        ensure!(
-            (0.0..1e12).contains(&about.training_seconds),
-            "--training-seconds: expected 0 or more, got {}",
-            about.training_seconds
-        );
-        let is_hash = |text: &str| {
-            (7..=40).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_hexdigit())
-        };
-        ensure!(
-            is_hash(&about.commit),
-            "--commit: expected 7 to 40 hexadecimal digits, got {:?}",
-            about.commit
-        );
-        for (flag, text) in [
-            ("--policy", &about.policy),
-            ("--by", &about.by),
-            ("--code", &about.code),
-        ] {
-            let is_plain =
-                !text.contains(['|', '\n']) && (flag != "--policy" || is_file_name(text));
-            ensure!(
-                is_plain,
-                "{flag}: expected plain words on one line, and no path, got {text:?}"
-            );
-        }
         let files =
             std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
         let files = files
@@ -125,6 +99,7 @@ impl LeaderboardCommand {
         );
         let path = self.entries.join(format!("{}.csv", about.policy));
         let entry = Entry { about, tasks };
+        entry.check()?;
         let mut entries = read_entries(&self.entries)?;
         entries.retain(|other| other.about.policy != entry.about.policy);
         entries.push(entry.clone());
@@ -136,7 +111,7 @@ impl LeaderboardCommand {
 /// A policy's runs in a task's file.
 fn task(path: &Path, policy: &str) -> Result<TaskRuns> {
     let name = path.file_stem().unwrap_or_default().display().to_string();
-    let mut runs = read_csv(path).with_context(|| path.display().to_string())?;
+    let mut runs = read_runs(path)?;
     runs.retain(|run| run.policy == policy);
     Ok(TaskRuns { task: name, runs })
 }

@@ -2,7 +2,9 @@
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use emberwatch_agent::benchmark::report::RunsFile;
 use emberwatch_agent::client::info::wait_for_server;
+use emberwatch_agent::file::check_replaceable;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::task::Task;
@@ -83,9 +85,22 @@ pub fn make_folder_of(path: &Path) -> Result<()> {
     parent.map_or(Ok(()), make_folder)
 }
 
+/// Makes a folder of files to come, and checks that it can be written to.
 pub fn make_folder(path: &Path) -> Result<()> {
-    let expected = "expected a folder, or a path where one can be made";
-    std::fs::create_dir_all(path).with_context(|| format!("create {}: {expected}", path.display()))
+    let expected = "expected a folder that can be written to, or a path where one can be made";
+    std::fs::create_dir_all(path)
+        .map_err(Into::into)
+        .and_then(|()| check_replaceable(&path.join("file")))
+        .with_context(|| format!("create {}: {expected}", path.display()))
+}
+
+/// Locks the file of `--csv` until it is written, and makes its folder: better to fail before hours of work than after.
+pub fn lock_csv(path: Option<&Path>) -> Result<Option<RunsFile>> {
+    let lock = |path: &Path| {
+        make_folder_of(path).with_context(|| path.display().to_string())?;
+        RunsFile::lock(path, Duration::ZERO)
+    };
+    path.map(lock).transpose().context("--csv")
 }
 
 pub fn write(text: &str) -> Result<()> {

@@ -1,13 +1,14 @@
 //! `suite`: policies on the test worlds of all tasks, and one score.
 
 use super::compare::run_comparison;
-use super::shared::{make_folder, model_of, write};
+use super::shared::{make_folder, write};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
 use emberwatch_agent::benchmark::compare::Comparison;
-use emberwatch_agent::benchmark::report::kept::Kept;
+use emberwatch_agent::benchmark::report::common_worlds::CommonWorlds;
 use emberwatch_agent::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
+use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile};
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnServer;
 use emberwatch_agent::config::{AgentConfig, AgentFlags};
@@ -15,10 +16,16 @@ use emberwatch_agent::learning::learned::Learned;
 use emberwatch_agent::learning::train::CHECKPOINT;
 use emberwatch_agent::policy::Policy;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_network::Device;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::PathBuf;
+use std::time::Duration;
+
+/// How long to wait for another process that writes results.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Run policies on the test worlds of tasks, and give each one score.
 #[derive(Args)]
@@ -36,8 +43,8 @@ pub struct SuiteCommand {
     /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// A folder for results, a CSV file a task; what it has already is not run again, unless its checkpoint
-    /// or the settings have changed
+    /// A folder for results, a CSV file a task; rows that it has are kept, unless the checkpoint, the settings or
+    /// the task's worlds have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Worlds of each task, the first of its test seeds [default: all]
@@ -79,10 +86,10 @@ impl SuiteCommand {
         });
         let plans = plans.collect::<Result<Vec<_>>>()?;
         make_folder(&self.out)?;
-        let runs = plans.into_iter().map(|plan| {
-            let name = plan.task.name.clone();
-            self.carry_out(plan, &config)
-                .with_context(|| of_task(&name))
+        plans.iter().try_for_each(|plan| plan.read().map(|_| ()))?;
+        let runs = plans.iter().map(|plan| {
+            let runs = self.carry_out(plan);
+            runs.with_context(|| of_task(&plan.task.name))
         });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
     }
@@ -97,101 +104,105 @@ impl SuiteCommand {
         Ok(tasks.collect::<Result<_, _>>()?)
     }
 
-    /// What there is of a task, and what is missing; all names are checked before anything runs.
+    /// What is to be done on a task; all names and files are checked before anything runs.
     fn plan(&self, task: Task, config: &AgentConfig) -> Result<Plan> {
-        let (learned, checkpoint) = self.learned(&task)?;
+        let learned = self.learned(&task)?;
         let seeds = self.seeds(&task);
-        let model = self.model(&task, &seeds)?;
-        let kept = Kept::read(&self.out, &task.name)?;
-        let names = [FLOOR, CEILING]
-            .into_iter()
-            .chain(self.policies.iter().map(|name| &**name));
-        let policies = names.map(|name| Policy::named(name, &model));
-        let mark = |policy: &Policy| {
-            let of_checkpoint = checkpoint.filter(|_| policy.needs_checkpoint());
-            fingerprint(&task, &model, config, of_checkpoint)
+        let (arena, _server) = self.open(&task, &seeds, 1)?;
+        let info = arena.info();
+        let longest = info.shortest_episode().unwrap_or(u64::MAX);
+        ensure!(
+            task.max_steps <= longest,
+            "max_steps: expected at most {longest}, as the shortest episode has, got {}",
+            task.max_steps
+        );
+        let fingerprint = info.worlds_fingerprint.clone();
+        let fingerprint = fingerprint
+            .context("expected a server that identifies its worlds: use the one of this release")?;
+        let worlds = CommonWorlds {
+            fingerprint: Some(fingerprint),
+            seeds: seeds.clone().collect(),
+            steps: task.max_steps,
+            moves: Some(info.n_moves),
+            robots: Some(info.n_robots),
+            recent_steps: None,
         };
-        let policies = policies.collect::<Result<Vec<_>>>()?;
-        let is_asked = |name: &str| policies.iter().any(|policy| policy.name == name);
-        let mut stale = Vec::new();
-        for name in kept.marked().filter(|name| !is_asked(name)) {
-            let is_same = kept.has_mark(name, &mark(&Policy::named(name, &model)?)?);
-            if !is_same {
-                let task = &task.name;
-                tracing::warn!(
-                    "task {task}: {name} is left out: it was run with other settings or another checkpoint"
-                );
-                stale.push(name.to_owned());
-            }
-        }
-        let mut missing: Vec<(Policy, String)> = Vec::new();
-        for policy in policies {
-            if missing.iter().any(|(other, _)| *other == policy) {
-                continue;
-            }
-            let mark = mark(&policy)?;
-            if !can_run(&policy, &task, &learned) {
-                let (task, policy) = (&task.name, &policy.name);
-                tracing::warn!(
-                    "task {task}: {policy} is not run: it needs a model or --checkpoints"
-                );
-            } else if !kept.has(&policy.name, &mark, &seeds, task.max_steps) {
-                missing.push((policy, mark));
-            }
-        }
+        let team = if task.robots > 1 {
+            Team::Shared
+        } else {
+            Team::Alone
+        };
+        let policies = self.policies(&task, arena.model(), &learned)?;
         Ok(Plan {
+            comparison: Comparison {
+                policies,
+                teams: vec![team],
+                seeds,
+                steps: task.max_steps,
+                recent_steps: RECENT_STEPS,
+                config: config.clone(),
+                learned,
+            },
+            file: self.out.join(format!("{}.csv", task.name)),
+            model: arena.model().clone(),
             task,
-            learned,
-            seeds,
-            kept,
-            missing,
-            stale,
+            worlds,
         })
     }
 
-    /// All runs of a task; those that are missing are made and added to its file, policy by policy.
-    fn carry_out(&self, plan: Plan, config: &AgentConfig) -> Result<TaskRuns> {
-        let Plan {
-            task,
-            learned,
-            seeds,
-            mut kept,
-            missing,
-            stale,
-        } = plan;
-        if !missing.is_empty() {
-            let (mut arena, _server) = self.open(&task, &seeds)?;
-            let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
-            ensure!(
-                task.max_steps <= longest,
-                "max_steps: expected at most {longest}, as the shortest episode has, got {}",
-                task.max_steps
-            );
-            let team = if task.robots > 1 {
-                Team::Shared
-            } else {
-                Team::Alone
-            };
-            for (policy, mark) in missing {
-                let name = policy.name.clone();
-                let comparison = Comparison {
-                    policies: vec![policy],
-                    teams: vec![team],
-                    seeds: seeds.clone(),
-                    steps: task.max_steps,
-                    recent_steps: RECENT_STEPS,
-                    config: config.clone(),
-                    learned: learned.clone(),
-                };
-                let results = run_comparison(&mut arena, &comparison)?;
-                kept.replace(name, mark, results.runs)?;
+    /// The policies that can run on a task; warns of the others.
+    fn policies(&self, task: &Task, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
+        let names = [FLOOR, CEILING].into_iter();
+        let mut policies: Vec<Policy> = Vec::new();
+        for name in names.chain(self.policies.iter().map(|name| &**name)) {
+            let policy = Policy::named(name, model)?;
+            let can_run =
+                learned.suits(&policy) && !(task.is_recorded() && policy.estimator.knows_model());
+            if !can_run {
+                let task = &task.name;
+                tracing::warn!("task {task}: {name} is not run: it needs a model or --checkpoints");
+            } else if !policies.contains(&policy) {
+                policies.push(policy);
             }
         }
-        kept.runs
-            .retain(|run| seeds.contains(&run.world_seed) && !stale.contains(&run.policy));
+        Ok(policies)
+    }
+
+    /// Runs the policies whose runs are missing or outdated, one by one; returns all runs that count.
+    fn carry_out(&self, plan: &Plan) -> Result<TaskRuns> {
+        let (task, comparison) = (&plan.task.name, &plan.comparison);
+        let kept = plan.read()?;
+        let mut missing = Vec::new();
+        for policy in &comparison.policies {
+            let name = &policy.name;
+            let n_rows = kept.iter().filter(|run| run.policy == *name).count();
+            match plan.check(name, &kept) {
+                Ok(()) => tracing::info!("task {task}: {n_rows} rows of {name} kept"),
+                Err(reason) => {
+                    if n_rows > 0 {
+                        tracing::warn!(
+                            "task {task}: {n_rows} rows of {name} are run again: {reason:#}"
+                        );
+                    }
+                    missing.push(policy.clone());
+                }
+            }
+        }
+        if !missing.is_empty() {
+            let n_worlds = comparison.seeds.end - comparison.seeds.start;
+            let (mut arena, _server) = self.open(&plan.task, &comparison.seeds, n_worlds as u32)?;
+            for policy in missing {
+                let comparison = Comparison {
+                    policies: vec![policy],
+                    ..comparison.clone()
+                };
+                let runs = run_comparison(&mut arena, &comparison)?.runs;
+                plan.replace(runs)?;
+            }
+        }
         Ok(TaskRuns {
-            task: task.name,
-            runs: kept.runs,
+            task: task.clone(),
+            runs: plan.valid_runs()?,
         })
     }
 
@@ -203,35 +214,22 @@ impl SuiteCommand {
                 .map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
     }
 
-    /// What was learned of a task, and the checksum of its file.
-    fn learned(&self, task: &Task) -> Result<(Learned, Option<u32>)> {
+    /// What was learned of a task.
+    fn learned(&self, task: &Task) -> Result<Learned> {
         let Some(folder) = &self.checkpoints else {
-            return Ok((Learned::default(), None));
+            return Ok(Learned::default());
         };
         let place = folder.join(&task.name).join(CHECKPOINT);
         if !place.exists() {
             tracing::warn!("no {}: no learned policy for this task", place.display());
-            return Ok((Learned::default(), None));
+            return Ok(Learned::default());
         }
-        let of_file = || format!("checkpoint {}", place.display());
-        let bytes = std::fs::read(&place).with_context(of_file)?;
-        let learned = Learned::from_bytes(&bytes).with_context(of_file)?;
-        Ok((learned, Some(crc32fast::hash(&bytes))))
-    }
-
-    /// What states are called; of recorded worlds their server tells.
-    fn model(&self, task: &Task, seeds: &Range<u64>) -> Result<Model> {
-        if !task.is_recorded() {
-            return model_of(task);
-        }
-        let (arena, _server) = self.open(task, seeds)?;
-        Ok(arena.model().clone())
+        Learned::read([&*place], &Device::Cpu)
     }
 
     /// A server with a task's worlds, which stops when it is dropped.
-    fn open(&self, task: &Task, seeds: &Range<u64>) -> Result<(Arena, OwnServer)> {
-        let n_seeds = (seeds.end - seeds.start) as u32;
-        let worlds = n_seeds.min(MAX_BATCH).to_string();
+    fn open(&self, task: &Task, seeds: &Range<u64>, n_worlds: u32) -> Result<(Arena, OwnServer)> {
+        let worlds = n_worlds.min(MAX_BATCH).to_string();
         let seed = seeds.start.to_string();
         let flags = [
             "--task",
@@ -245,43 +243,66 @@ impl SuiteCommand {
             "--publish-truth",
         ];
         let server = OwnServer::start(self.server.clone(), &flags.map(String::from))?;
-        Ok((Arena::open(server.instance(), n_seeds, false)?, server))
+        Ok((Arena::open(server.instance(), n_worlds, false)?, server))
     }
 }
 
 /// What is to be done on a task.
 struct Plan {
     task: Task,
-    learned: Learned,
-    seeds: Range<u64>,
-    kept: Kept,
-    /// Policies to run, each with its fingerprint.
-    missing: Vec<(Policy, String)>,
-    /// Policies that were run before, with other settings or another checkpoint.
-    stale: Vec<String>,
+    file: PathBuf,
+    worlds: CommonWorlds,
+    model: Model,
+    comparison: Comparison,
 }
 
-/// Whether a policy has what it needs on a task.
-fn can_run(policy: &Policy, task: &Task, learned: &Learned) -> bool {
-    learned.suits(policy) && !(task.is_recorded() && policy.estimator.knows_model())
-}
+impl Plan {
+    fn lock(&self) -> Result<RunsFile> {
+        RunsFile::lock(&self.file, PATIENCE)
+    }
 
-/// A checksum of all that the runs of a policy depend on, beside its name, seeds and steps.
-fn fingerprint(
-    task: &Task,
-    model: &Model,
-    config: &AgentConfig,
-    checkpoint: Option<u32>,
-) -> Result<String> {
-    // The name of a built-in task and the path of its file are one.
-    let task = Task {
-        source: String::new(),
-        ..task.clone()
-    };
-    let (model, config) = (toml::to_string(model.file())?, toml::to_string(config)?);
-    let version = env!("CARGO_PKG_VERSION");
-    // Built-in states are no file.
-    let states = std::fs::read(&task.states).map_or(0, |bytes| crc32fast::hash(&bytes));
-    let text = format!("{version}\n{task:?}\n{states}\n{model}\n{config}\n{checkpoint:?}");
-    Ok(format!("{:08x}", crc32fast::hash(text.as_bytes())))
+    fn read(&self) -> Result<Vec<PolicyRun>> {
+        self.lock()?.read()
+    }
+
+    /// Reads all runs that count; warns of the policies whose runs do not.
+    fn valid_runs(&self) -> Result<Vec<PolicyRun>> {
+        let mut runs = self.read()?;
+        let policies: BTreeSet<String> = runs.iter().map(|run| run.policy.clone()).collect();
+        for policy in policies {
+            if let Err(reason) = self.check(&policy, &runs) {
+                let task = &self.task.name;
+                tracing::warn!("task {task}: {policy} is left out: {reason:#}");
+                runs.retain(|run| run.policy != policy);
+            }
+        }
+        runs.retain(|run| self.comparison.seeds.contains(&run.world_seed));
+        Ok(runs)
+    }
+
+    /// Checks that a policy's runs are of the task's worlds, and those of a built-in policy of what it is now.
+    fn check(&self, policy: &str, runs: &[PolicyRun]) -> Result<()> {
+        let seeds = &self.comparison.seeds;
+        let is_own = |run: &&PolicyRun| run.policy == policy && seeds.contains(&run.world_seed);
+        let runs: Vec<&PolicyRun> = runs.iter().filter(is_own).collect();
+        self.worlds.check(policy, &runs)?;
+        let Ok(policy) = Policy::named(policy, &self.model) else {
+            return Ok(());
+        };
+        let fingerprint = self.comparison.policy_fingerprint(&policy, &self.model);
+        ensure!(
+            runs.iter().all(|run| run.policy_fingerprint == fingerprint),
+            "it was run with other settings or another checkpoint"
+        );
+        Ok(())
+    }
+
+    /// Replaces the rows of the policy that was run; rows that others have written meanwhile stay.
+    fn replace(&self, runs: Vec<PolicyRun>) -> Result<()> {
+        let file = self.lock()?;
+        let mut all = file.read()?;
+        all.retain(|run| run.policy != runs[0].policy);
+        all.extend(runs);
+        file.replace(&all)
+    }
 }

@@ -1,8 +1,9 @@
 //! What a learner keeps between runs, in one safetensors file: weights and the optimiser's moments as tensors by
 //! name, everything else as one value that bincode encodes, the tensor of bytes `state`.
 //!
-//! Written beside the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
-//! which learner and which format it is of, and a digest tells damage that keeps its form.
+//! Written next to the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
+//! which learner and which format it is of, and a digest tells damage that keeps its form. Equal contents are equal bytes,
+//! so trainings can be compared by a hash of their checkpoints.
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
@@ -27,9 +28,6 @@ const KIND: &str = "emberwatch.kind";
 const FORMAT: &str = "emberwatch.format";
 const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
-
-/// Changes with what any state holds.
-const VERSION: &str = "4";
 
 /// The tensor of bytes.
 const STATE: &str = "state";
@@ -142,7 +140,7 @@ impl Contents {
     }
 
     /// Against damage, not malice.
-    fn digest(&self) -> String {
+    pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
             digest.update(format!("{name} {shape:?} ").as_bytes());
@@ -228,14 +226,34 @@ pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>> {
     let views = views.collect::<Result<Vec<_>, _>>().map_err(damaged)?;
     let texts = [
         (KIND, kind),
-        (FORMAT, VERSION),
+        (FORMAT, version(kind)),
         (DIGEST, &contents.digest()),
         (SETTINGS, &contents.settings),
     ];
     let texts = texts.map(|(name, text)| (name.into(), text.into()));
-    let bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    let mut bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    sort_header(&mut bytes);
     check_size(bytes.len() as u64)?;
     Ok(bytes)
+}
+
+/// The format of a kind's state. Transitions of a DQN have had their own discounts since format 5.
+fn version(kind: &str) -> &'static str {
+    match kind {
+        "autoencoder" | "decisions" => "5",
+        _ => "4",
+    }
+}
+
+/// Sorts the header by name: safetensors writes its texts in the random order of a hash map. The length stays the same.
+fn sort_header(file: &mut [u8]) {
+    type Header = BTreeMap<String, BTreeMap<String, serde_json::Value>>;
+    const WRITTEN: &str = "invariant: safetensors wrote a header of its length";
+    let (length, rest) = file.split_first_chunk_mut().expect(WRITTEN);
+    let header = &mut rest[..u64::from_le_bytes(*length) as usize];
+    let sorted: Header = serde_json::from_slice(header).expect(WRITTEN);
+    let sorted = serde_json::to_vec(&sorted).expect(WRITTEN);
+    header[..sorted.len()].copy_from_slice(&sorted);
 }
 
 /// The checkpoint of one of some kinds that bytes are, and which.
@@ -251,7 +269,7 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
         bail!("expected a checkpoint of {kinds}, got one of {got}");
     };
     let got = texts.remove(FORMAT).unwrap_or_else(|| "none".into());
-    check(got == VERSION, FORMAT, VERSION, got)?;
+    check(got == version(kind), FORMAT, version(kind), got)?;
     let mut contents = Contents::new([], &());
     contents.settings = texts.remove(SETTINGS).unwrap_or_default();
     for (name, view) in file.iter() {
@@ -357,7 +375,26 @@ mod tests {
         let mode = path.metadata().expect("the file").permissions().mode();
         assert_eq!(mode & 0o777, 0o600);
         let files = std::fs::read_dir(folder.path()).expect("the folder");
-        assert_eq!(files.count(), 1, "nothing left beside it");
+        assert_eq!(files.count(), 1, "nothing left next to it");
+    }
+
+    #[test]
+    fn equal_contents_are_equal_bytes() {
+        let mut other = contents();
+        let kernel = other.tensors.remove("kernel").expect("a tensor");
+        other
+            .tensors
+            .insert("bias \"\u{e9}\n".into(), kernel.clone());
+        other.tensors.insert("kernel".into(), kernel);
+        for contents in [contents(), other] {
+            let first = encode("tests", &contents).expect("small");
+            let (_, read) = decode(&["tests"], &first).expect("whole");
+            assert_eq!(read, contents);
+            // Each map has its own order: of 24, ten in a row would hardly be the same.
+            for _ in 0..10 {
+                assert!(encode("tests", &contents).expect("small") == first);
+            }
+        }
     }
 
     #[test]

@@ -37,6 +37,8 @@ pub struct Learned {
     pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `learned_policy` and others on the belief that they were learned on.
     pub decisions: Option<LearnedDecisions>,
+    /// Of each checkpoint, in the order read.
+    pub digests: Vec<String>,
 }
 
 impl Learned {
@@ -74,6 +76,7 @@ impl Learned {
             }
         };
         ensure!(!twice, "expected one checkpoint of {kind}, got two");
+        self.digests.push(contents.digest());
         Ok(())
     }
 
@@ -117,6 +120,20 @@ impl Learned {
         };
         let filter = filter.clone().map(Box::new);
         filter.map(LearnedBelief::Filter)
+    }
+
+    /// What options are planned on unless it is said: what decisions were learned on, or else the belief that was learned;
+    /// without one the known model's.
+    pub fn estimator(&self) -> EstimatorKind {
+        let decided = self.decisions.as_ref().map(|decisions| decisions.estimator);
+        let learned = [
+            EstimatorKind::LEARNED,
+            EstimatorKind::learned(true),
+            EstimatorKind::Neural,
+        ];
+        let mut learned = learned.into_iter();
+        let found = learned.find(|&kind| self.belief(kind).is_some());
+        decided.or(found).unwrap_or(EstimatorKind::KNOWN)
     }
 
     /// The policies that act on it: those of beliefs, of the autoencoder, and of decisions.

@@ -67,6 +67,7 @@ pub fn train(
             bail!("{problem:#}; what was learned is lost: {also:#}");
         }
     }
+    training_loop.warn_of_no_update(spec);
     training_loop.client.release()?;
     if let Some(feed) = training_loop.feed {
         feed.end();
@@ -81,6 +82,8 @@ struct TrainingLoop {
     events: Events,
     feed: Option<Feed>,
     summary: TrainSummary,
+    /// Updates before this run, of the runs that it resumes.
+    n_before: u64,
     saved: Instant,
     told: Told,
 }
@@ -131,6 +134,7 @@ impl TrainingLoop {
         let now = Instant::now();
         Ok(Self {
             client,
+            n_before: learner.n_updates(),
             learner,
             metrics,
             events,
@@ -217,6 +221,15 @@ impl TrainingLoop {
         }
         self.metrics.flush()?;
         self.events.flush()
+    }
+
+    /// Warns of a run that was to learn and did not.
+    fn warn_of_no_update(&self, spec: &TrainingSpec) {
+        let steps = self.summary.steps;
+        if !spec.freeze && steps > 0 && self.learner.n_updates() == self.n_before {
+            let cause = self.learner.lacks(steps);
+            tracing::warn!("nothing was learned in {steps} world steps: {cause}");
+        }
     }
 
     fn report(&mut self, tick: &Tick, all_steps: u64) {

@@ -44,16 +44,9 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         moves: 64,
         robots: 1,
         team: "alone".into(),
-        mean_repeated: 0.0,
-        steps_to_detection: None,
-        burning_cells_at_detection: None,
-        recent_steps: None,
-        burning_seen_share: None,
-        front_distance: None,
-        grid_seen_share: None,
-        log_likelihood: None,
-        is_added: false,
-        rewards: Vec::new(),
+        worlds_fingerprint: "884869f24f9fd933".into(),
+        policy_fingerprint: "0df41e66fd442aca".into(),
+        ..PolicyRun::default()
     }
 }
 

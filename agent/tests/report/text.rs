@@ -1,7 +1,9 @@
 use super::synthetic::{ladder, run, teams};
-use emberwatch_agent::benchmark::report::added::{check_settings, read_csv};
+use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::benchmark::report::suite::{TaskRuns, render_suite};
-use emberwatch_agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
+use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile, render_table, write_events};
+use std::path::Path;
+use std::time::Duration;
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {
@@ -16,6 +18,10 @@ fn three_policies() -> Vec<PolicyRun> {
         }
     }
     runs
+}
+
+fn write_csv(path: &Path, runs: &[PolicyRun]) -> anyhow::Result<()> {
+    RunsFile::lock(path, Duration::ZERO)?.replace(runs)
 }
 
 /// The cells of the first row of the table that starts with a policy.
@@ -106,7 +112,7 @@ fn rows_of_files_without_teams_are_of_a_robot_alone() {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("runs.csv");
     write_csv(&path, &teams(1)).expect("written");
-    let read = |path| read_csv(path).expect("rows");
+    let read = |path| read_runs(path).expect("rows");
     let crews: Vec<_> = read(&path)
         .into_iter()
         .map(|run| (run.robots, run.team))
@@ -121,8 +127,8 @@ fn rows_of_files_without_teams_are_of_a_robot_alone() {
     );
     let text = std::fs::read_to_string(&path).expect("readable");
     let without = |line: &str| {
-        // Without team and figures of merit.
-        line.rsplitn(10, ',')
+        // Without team, figures of merit and fingerprints.
+        line.rsplitn(12, ',')
             .last()
             .map(String::from)
             .expect("a row")
@@ -135,7 +141,6 @@ fn rows_of_files_without_teams_are_of_a_robot_alone() {
         (1, 1, "alone")
     );
     assert_eq!(runs[0].mean_repeated, 0.0);
-    check_settings(&runs, &["other"], &(0..1), (4, 10), 64).expect("the same worlds");
 }
 
 #[test]
@@ -295,7 +300,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
          mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
          steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
-         grid_seen_share,log_likelihood\n"
+         grid_seen_share,log_likelihood,worlds_fingerprint,policy_fingerprint\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();

@@ -1,11 +1,11 @@
 // The time series: three lines and the strip of objectives above one common axis.
 
-import { drawLine, drawStrip, frameOf, roomFor } from "/plot.js";
-import { make, swatch, write } from "/elements.js";
-import { objectiveColor } from "/palette.js";
-import { across } from "/scale.js";
-import { cellsOf } from "/wire.js";
-import { chartSentence, short, stateNames, targetName, text, whole } from "/words.js";
+import { drawLine, drawStrip, frameOf, roomFor } from "./plot.js";
+import { make, swatch, write } from "./elements.js";
+import { objectiveColor } from "./palette.js";
+import { across } from "./scale.js";
+import { cellsOf } from "./wire.js";
+import { chartSentence, short, stateNames, targetName, text, whole } from "./words.js";
 
 const LINES = [
   { id: "reward", array: "series_reward", now: "reward", title: () => "reward", unit: (target) => `${target} cells found in a step` },

@@ -1,8 +1,8 @@
 // What can be pressed: pause, scrub, world, theme, and a recording's player; and the keys for them.
 
-import { write } from "/elements.js";
-import { MOST_WORLDS } from "/view.js";
-import { whole } from "/words.js";
+import { write } from "./elements.js";
+import { MOST_WORLDS } from "./view.js";
+import { whole } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 

@@ -1,6 +1,6 @@
 // Elements made from script.
 
-import { channels } from "/palette.js";
+import { channels } from "./palette.js";
 
 /** An element with a class, data attributes and text. */
 export function make(tag, name = "", dataset = {}, text = "") {

@@ -1,8 +1,8 @@
 // What the page says in words: state, note, facts, and what is missing.
 
-import { write } from "/elements.js";
-import { createRobots } from "/robots.js";
-import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from "/words.js";
+import { write } from "./elements.js";
+import { createRobots } from "./robots.js";
+import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 

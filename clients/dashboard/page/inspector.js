@@ -1,9 +1,9 @@
 // One cell in numbers: the one pointed at, else the one that the first robot is on.
 
-import { make, swatch } from "/elements.js";
-import { NEVER, rampColor } from "/palette.js";
-import { cellsOf, hasLand, shapeOf } from "/wire.js";
-import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "/words.js";
+import { make, swatch } from "./elements.js";
+import { NEVER, rampColor } from "./palette.js";
+import { cellsOf, hasLand, shapeOf } from "./wire.js";
+import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "./words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
 const QUIET_MILLIS = 400;

@@ -2,8 +2,8 @@
 // are many, hatches over no-fly cells; and the line around what was seen. Each line is dark beside light, so that one of
 // the two is seen on any cell.
 
-import { NEVER } from "/palette.js";
-import { cellsOf, hasLand, shapeOf } from "/wire.js";
+import { NEVER } from "./palette.js";
+import { cellsOf, hasLand, shapeOf } from "./wire.js";
 
 /** Most zones with lines around them and names in the legend. */
 export const MOST_ZONES = 8;

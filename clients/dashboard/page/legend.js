@@ -1,9 +1,9 @@
 // What colours and marks mean.
 
-import { make, swatch } from "/elements.js";
-import { MOST_ZONES } from "/land.js";
-import { rampStops } from "/palette.js";
-import { beliefNames, observationNames, stateNames } from "/words.js";
+import { make, swatch } from "./elements.js";
+import { MOST_ZONES } from "./land.js";
+import { rampStops } from "./palette.js";
+import { beliefNames, observationNames, stateNames } from "./words.js";
 
 // More names than this would leave no room for what they explain.
 const MOST_NAMES = 16;

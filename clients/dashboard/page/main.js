@@ -1,18 +1,18 @@
 // Wires the page: pictures come in, are drawn, and the next is asked for. Reading order: wire.js,
 // socket.js, view.js, then what draws: panels.js, charts.js, facts.js, controls.js.
 
-import { createCharts } from "/charts.js";
-import { createControls } from "/controls.js";
-import { createFacts, titleOf } from "/facts.js";
-import { createInspector } from "/inspector.js";
-import { createLayout } from "/layout.js";
-import { createLegend } from "/legend.js";
-import * as colours from "/palette.js";
-import { createPanels } from "/panels.js";
-import { createPointer } from "/pointer.js";
-import { connect } from "/socket.js";
-import { askOf, createView, themeOf } from "/view.js";
-import { shapeOf } from "/wire.js";
+import { createCharts } from "./charts.js";
+import { createControls } from "./controls.js";
+import { createFacts, titleOf } from "./facts.js";
+import { createInspector } from "./inspector.js";
+import { createLayout } from "./layout.js";
+import { createLegend } from "./legend.js";
+import * as colours from "./palette.js";
+import { createPanels } from "./panels.js";
+import { createPointer } from "./pointer.js";
+import { connect } from "./socket.js";
+import { askOf, createView, themeOf } from "./view.js";
+import { shapeOf } from "./wire.js";
 
 // Descriptions and title change at a pace that can be followed.
 const DESCRIBE_MILLIS = 2000;

@@ -2,11 +2,11 @@
 // Marks are dark with a light counterpart, so that they stand out from every colour of every theme. In a team the
 // light one has the robot's colour.
 
-import { prepare } from "/elements.js";
-import { drawFootprint, drawLand } from "/land.js";
-import { robotColor } from "/palette.js";
-import { shapeOf } from "/wire.js";
-import { isTeam } from "/words.js";
+import { prepare } from "./elements.js";
+import { drawFootprint, drawLand } from "./land.js";
+import { robotColor } from "./palette.js";
+import { shapeOf } from "./wire.js";
+import { isTeam } from "./words.js";
 
 const DARK = "#141414";
 const LIGHT = "#ffffff";

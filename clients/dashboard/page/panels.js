@@ -1,10 +1,10 @@
 // The grids: one canvas with a pixel per cell for each, a second one above it for marks.
 
-import { make, write } from "/elements.js";
-import { drawMarks } from "/overlay.js";
-import { NEVER } from "/palette.js";
-import { beliefAge, beliefNames, panelSentence, seenSince, stateNames } from "/words.js";
-import { cellsOf, hasLand, shapeOf } from "/wire.js";
+import { make, write } from "./elements.js";
+import { drawMarks } from "./overlay.js";
+import { NEVER } from "./palette.js";
+import { beliefAge, beliefNames, panelSentence, seenSince, stateNames } from "./words.js";
+import { cellsOf, hasLand, shapeOf } from "./wire.js";
 
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },

@@ -1,8 +1,8 @@
 // Draws a chart's canvas: grid, line or strip, cursor. Colours come from the style sheet.
 
-import { prepare } from "/elements.js";
-import { NEVER } from "/palette.js";
-import { extent, tickText, ticks } from "/scale.js";
+import { prepare } from "./elements.js";
+import { NEVER } from "./palette.js";
+import { extent, tickText, ticks } from "./scale.js";
 
 // Sizes in the canvas's font size. Room left of the plots for the ticks' text, and what is kept free beside a text.
 const LEFT = 3.1;

@@ -1,8 +1,8 @@
 // The robots of a team: their colours, and a line in words for each.
 
-import { make, write } from "/elements.js";
-import { robotColor } from "/palette.js";
-import { isTeam, short } from "/words.js";
+import { make, write } from "./elements.js";
+import { robotColor } from "./palette.js";
+import { isTeam, short } from "./words.js";
 
 const DID = { flew: "flew", hovered: "hovered", late: "late", new: "not flown yet" };
 

@@ -1,7 +1,7 @@
 // The connection to the dashboard. The page pulls: it asks, gets exactly one picture, draws it in the
 // browser's own time, and asks again. So a slow or hidden page gets fewer pictures and nothing queues.
 
-import { decode } from "/wire.js";
+import { decode } from "./wire.js";
 
 const RETRY_MILLIS = 1000;
 // The dashboard answers within half a second; a connection that is silent for longer is dead.
@@ -23,7 +23,10 @@ export function connect({ ask, show, superseded, up, failed }) {
   let watchdog = 0;
 
   function open() {
-    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
+    // Next to the page: a proxy may serve it below a path, and with TLS.
+    const address = new URL("socket", location.href);
+    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+    socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { asked = 0; isStale = false; up(true); send(); };
     socket.onmessage = (event) => receive(event.data);

@@ -1,6 +1,6 @@
 // Numbers and names as people read them, and the sentences that stand in for pictures.
 
-import { cellsOf } from "/wire.js";
+import { cellsOf } from "./wire.js";
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const UNKNOWN = "–";

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use clap::Parser;
 use emberwatch_dashboard::scene::{Scene, Stage};
-use emberwatch_dashboard::{player, server, watcher};
+use emberwatch_dashboard::{access, player, server, watcher};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::{WatchedProcess, start_logging, stop_on_signals};
 use std::io::Write;
@@ -22,6 +22,9 @@ const TICK: Duration = Duration::from_millis(50);
 /// How much it gives way to others, of 19: on a busy machine a simulator that wakes up goes first.
 const NICENESS: i32 = 5;
 
+/// What `--listen` needs.
+const LISTEN: &str = "expected an address of this machine and a free port, which port 0 finds";
+
 /// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
 #[derive(Parser)]
 #[command(name = "emberwatch-dashboard", version)]
@@ -35,8 +38,9 @@ struct Cli {
     /// Where browsers reach the page; port 0 takes a free one. Whoever reaches it sees everything
     #[arg(long, default_value = "127.0.0.1:8600", value_name = "ADDRESS:PORT")]
     listen: SocketAddr,
-    /// A host name that browsers may call this machine by, beside its addresses; may be given for each
-    #[arg(long, value_name = "HOST")]
+    /// A host name that browsers may call this machine by, in addition to its addresses, such as that of a proxy with
+    /// TLS; may be given for each
+    #[arg(long, value_name = "HOST", value_parser = access::host_name)]
     name: Vec<String>,
     /// Open the page in the default browser
     #[arg(long)]
@@ -68,12 +72,7 @@ fn run(cli: &Cli) -> Result<()> {
         .build()
         .context("start the web server")?;
     let bound = runtime.block_on(TcpListener::bind(cli.listen));
-    let listener = bound.with_context(|| {
-        format!(
-            "--listen: expected a free port, got {}; 0 takes any",
-            cli.listen
-        )
-    })?;
+    let listener = bound.with_context(|| format!("--listen {}: {LISTEN}", cli.listen))?;
     let address = listener.local_addr().context("the page's address")?;
     let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;

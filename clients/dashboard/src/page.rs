@@ -43,3 +43,18 @@ pub const ASSETS: [Asset; 23] = assets![
     "/wire.js" "wire.js" "text/javascript",
     "/words.js" "words.js" "text/javascript",
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A proxy may serve the page below a path, where `/main.js` is another's.
+    #[test]
+    fn files_name_each_other_relative_to_the_page() {
+        for Asset { path, text, .. } in ASSETS {
+            for absolute in ["=\"/", "from \"/", "import(\"/", "url(/", "location.host"] {
+                assert!(!text.contains(absolute), "{path}: {absolute}");
+            }
+        }
+    }
+}

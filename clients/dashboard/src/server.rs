@@ -1,9 +1,9 @@
 //! The web server: the page, and one WebSocket for each browser that looks.
 //!
-//! A browser asks for each picture, so it is never sent more than it draws. Pages of other sites get nothing:
-//! the `Host` must be an address of this machine (else a name that somebody else controls could point here), and
-//! the `Origin` of a WebSocket must be this very server.
+//! A browser asks for each picture, so it is never sent more than it draws. Pages of other sites get nothing
+//! ([`access`]).
 
+use crate::access;
 use crate::page::ASSETS;
 use crate::picture::{Ask, picture};
 use crate::scene::{Scene, Stage};
@@ -11,15 +11,13 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Request, State};
+use axum::http::StatusCode;
 use axum::http::header::{
-    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, ORIGIN, REFERRER_POLICY,
-    X_CONTENT_TYPE_OPTIONS,
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
 };
-use axum::http::{HeaderMap, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::net::TcpListener;
@@ -59,7 +57,7 @@ struct Service {
     places: Arc<Semaphore>,
 }
 
-/// Serves for ever. `names` are host names besides addresses and `localhost` that browsers may call this
+/// Serves forever. `names` are host names, in addition to addresses and `localhost`, that browsers may call this
 /// server by.
 ///
 /// # Errors
@@ -96,39 +94,13 @@ pub async fn serve(
 
 /// Refuses requests that come from pages of other sites.
 async fn only_own_pages(State(service): State<Service>, request: Request, next: Next) -> Response {
-    match check(request.headers(), &service.names) {
+    match access::check(request.headers(), &service.names) {
         Ok(()) => next.run(request).await,
         Err(problem) => {
             tracing::warn!("{problem}");
             (StatusCode::FORBIDDEN, problem).into_response()
         }
     }
-}
-
-fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
-    let text = |name| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
-    let host = text(HOST).unwrap_or("");
-    if !is_own(host, names) {
-        return Err(format!(
-            "Host: expected an address, localhost or a name given with --name, got {host:?}"
-        ));
-    }
-    match text(ORIGIN) {
-        Some(origin) if origin != format!("http://{host}") => Err(format!(
-            "Origin: expected \"http://{host}\", got {origin:?}"
-        )),
-        _ => Ok(()),
-    }
-}
-
-/// Whether a host, with its port or without, is no name that others could point here.
-fn is_own(host: &str, names: &[String]) -> bool {
-    let name = match host.rsplit_once(':') {
-        Some((name, port)) if port.bytes().all(|digit| digit.is_ascii_digit()) => name,
-        _ => host,
-    };
-    let address = name.trim_start_matches('[').trim_end_matches(']');
-    name == "localhost" || address.parse::<IpAddr>().is_ok() || names.iter().any(|own| own == name)
 }
 
 async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Response {
@@ -222,33 +194,4 @@ fn order(stage: &Stage, ask: &Ask) {
         }
         player.playing = ask.playing.unwrap_or(player.playing);
     });
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use axum::http::HeaderValue;
-
-    #[test]
-    fn only_own_pages_are_answered() {
-        let names = ["lab.example".to_owned()];
-        let refused = |host: &'static str, origin: Option<&'static str>| {
-            let mut headers = HeaderMap::new();
-            headers.insert(HOST, HeaderValue::from_static(host));
-            if let Some(origin) = origin {
-                headers.insert(ORIGIN, HeaderValue::from_static(origin));
-            }
-            check(&headers, &names).is_err()
-        };
-        assert!(!refused("127.0.0.1:8600", None));
-        assert!(!refused("127.0.0.1:8600", Some("http://127.0.0.1:8600")));
-        assert!(!refused("[::1]:8600", Some("http://[::1]:8600")));
-        assert!(!refused("localhost", Some("http://localhost")));
-        assert!(!refused("lab.example:80", None));
-        assert!(refused("evil.example:8600", None));
-        assert!(refused("127.0.0.1:8600", Some("http://evil.example")));
-        assert!(refused("127.0.0.1:8600", Some("http://127.0.0.1:8601")));
-        assert!(refused("127.0.0.1:8600", Some("null")));
-        assert!(refused("", None));
-    }
 }

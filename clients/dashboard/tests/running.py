@@ -122,10 +122,17 @@ class Programs:
         settings = {"instance": instance, "out": out, "steps": steps}
         return self._keep(Program(self._path("server"), ["record", "--truth", *flags(settings)]))
 
-    def dashboard(self, instance: str = "", *, recording: Path | None = None, port: int = 0):
-        """A dashboard of an instance, or of a recording."""
+    def dashboard(
+        self,
+        instance: str = "",
+        *,
+        recording: Path | None = None,
+        port: int = 0,
+        name: str | None = None,
+    ):
+        """A dashboard of an instance, or of a recording. `name`: what else browsers may call it."""
         source = {"recording": recording} if recording else {"instance": instance}
-        arguments = flags(source | {"exit_with": os.getpid()})
+        arguments = flags(source | {"exit_with": os.getpid(), "name": name})
         return self._keep(Dashboard(self._path("dashboard"), arguments, port))
 
     def _path(self, name: str) -> Path:

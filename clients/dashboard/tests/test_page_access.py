@@ -1,22 +1,22 @@
 """Who may connect, and who can use the page: other sites, screen readers, keys, small screens."""
 
 import base64
-import http.client
 import os
 from contextlib import closing
+from http.client import HTTPConnection, HTTPResponse
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from running import PATIENCE
+from running import PATIENCE, Dashboard
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 3, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 720}}
 
 
-def answer(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
+def answer(connection: HTTPConnection, path: str, **headers: str) -> HTTPResponse:
     """The answer to a request with exactly these headers."""
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
+    with closing(connection):
         connection.putrequest("GET", path, skip_host=True)
         for name, value in headers.items():
             connection.putheader(name.replace("_", "-"), value)
@@ -25,30 +25,56 @@ def answer(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
             return response
 
 
-def handshake(port: int, **headers: str) -> int:
+def handshake(connection: HTTPConnection, path: str, **headers: str) -> int:
     """The status that a WebSocket's handshake is answered with."""
     key = base64.b64encode(os.urandom(16)).decode()
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
-    return answer(port, "/socket", Sec_WebSocket_Key=key, **upgrade, **headers).status
+    return answer(connection, path, Sec_WebSocket_Key=key, **upgrade, **headers).status
+
+
+def connect(dashboard: Dashboard) -> HTTPConnection:
+    """A connection to a dashboard."""
+    return HTTPConnection("127.0.0.1", dashboard.port, timeout=PATIENCE)
 
 
 def test_other_sites_are_refused(programs):
-    port = programs.dashboard("page-alone").port
-    own = f"127.0.0.1:{port}"
-    assert answer(port, "/", Host=own).status == 200
-    assert answer(port, "/", Host=f"localhost:{port}").status == 200
-    assert answer(port, "/", Host="evil.example").status == 403
-    assert answer(port, "/", Host=f"evil.example:{port}").status == 403
-    assert handshake(port, Host=own, Origin=f"http://{own}") == 101
-    assert handshake(port, Host=own) == 101
-    assert handshake(port, Host=own, Origin="http://evil.example") == 403
-    assert handshake(port, Host=own, Origin="null") == 403
-    assert handshake(port, Host="evil.example", Origin="http://evil.example") == 403
-    assert handshake(port, Host=own, Origin=f"http://127.0.0.1:{port + 1}") == 403
+    dashboard = programs.dashboard("page-alone", name="fire.example")
+    own = f"127.0.0.1:{dashboard.port}"
+
+    def page(host: str) -> int:
+        return answer(connect(dashboard), "/", Host=host).status
+
+    assert [page(own), page(f"localhost:{dashboard.port}"), page("fire.example")] == [200] * 3
+    assert [page("evil.example"), page(f"evil.example:{dashboard.port}")] == [403] * 2
+
+    def socket(host: str, **origin: str) -> int:
+        return handshake(connect(dashboard), "/socket", Host=host, **origin)
+
+    assert socket(own) == 101
+    for host, origin in [
+        (own, f"http://{own}"),
+        (own, f"https://{own}"),
+        ("fire.example", "https://fire.example"),
+        ("fire.example:443", "https://fire.example"),
+        ("FIRE.example", "https://fire.example"),
+        ("[::1]:443", "https://[::1]"),
+    ]:
+        assert socket(host, Origin=origin) == 101, (host, origin)
+    for host, origin in [
+        (own, "http://evil.example"),
+        (own, "null"),
+        (own, f"http://127.0.0.1:{dashboard.port + 1}"),
+        (own, f"https://127.0.0.1:{dashboard.port + 1}"),
+        ("fire.example", "https://evil.example"),
+        ("evil.example", "http://evil.example"),
+        ("evil.example", "https://evil.example"),
+    ]:
+        assert socket(host, Origin=origin) == 403, (host, origin)
 
 
 def test_the_page_says_what_it_may_load(programs):
-    reply = answer(port := programs.dashboard("page-alone").port, "/", Host=f"127.0.0.1:{port}")
+    dashboard = programs.dashboard("page-alone")
+    reply = answer(connect(dashboard), "/", Host=f"127.0.0.1:{dashboard.port}")
     policy = reply.headers["Content-Security-Policy"]
     assert "default-src 'self'" in policy
     assert "unsafe" not in policy

@@ -93,7 +93,7 @@ def moves(world: dict[str, Any], instances: list[str], n_worlds: int) -> dict[st
 
 
 def decisions(world: dict[str, Any], instance: str, n_worlds: int) -> dict[str, Any]:
-    """Environments whose steps are decisions, each single one with an agent of its own."""
+    """Environments whose steps are decisions; the single ones share a server."""
     there = {"instance": instance, "prior": "initial", "max_episode_steps": NO_END}
     single = [partial(gymnasium.make, OBJECTIVE, world=n, **there) for n in range(n_worlds)]
     native = gymnasium.make_vec(OBJECTIVE, n_worlds, prior="initial", **world)

@@ -1,16 +1,19 @@
 //! Where robots may fly and what they see, as Python's `Airspace` says it.
 
 use crate::refusal::invalid;
-use emberwatch_protocol::model::Pays;
+use emberwatch_protocol::model::{
+    CellMap, DescribedState, Description, ObservationEntry, Pays, RingEntry, SensorEntry,
+};
 use emberwatch_protocol::{Airspace, Shape};
 use numpy::PyReadonlyArray2;
 use pyo3::prelude::*;
 use std::sync::Arc;
 
-/// The attributes of Python's `Airspace` that paths depend on: what differs from ring to ring does not.
+/// The attributes of Python's `Airspace`.
 #[derive(FromPyObject)]
 pub struct Given<'py> {
     radius: usize,
+    n_rings: usize,
     pays: String,
     no_fly: Option<PyReadonlyArray2<'py, bool>>,
 }
@@ -24,11 +27,57 @@ impl Given<'_> {
             let (expected, got) = (format!("shape {:?}", shape.dim()), format!("{dim:?}"));
             return Err(invalid(py, "airspace: no_fly", expected, got));
         }
-        let pays = match &*self.pays {
+        let no_fly = no_fly.map(Arc::new);
+        // Paths do not depend on what differs from ring to ring.
+        Ok(Airspace::new(shape, no_fly, self.radius, 1, self.pays()))
+    }
+
+    /// All that is known of worlds whose model is hidden: that so many values are seen, each taken for a state.
+    pub fn seen(&self, n_observations: usize) -> Description {
+        let n_values = n_observations / self.n_rings.max(1);
+        let shown = |value: usize| {
+            (0..n_values)
+                .map(|other| f64::from(other == value))
+                .collect()
+        };
+        let color = String::from("#000000");
+        let rows = self.no_fly.as_ref().map(|map| {
+            let rows = map.as_array();
+            let rows = rows.outer_iter();
+            rows.map(|row| row.iter().map(|&flag| u8::from(flag)).collect())
+                .collect()
+        });
+        let state = |value| DescribedState {
+            name: format!("state-{value}"),
+            color: color.clone(),
+            reward: 0.0,
+            observed_as: shown(value),
+        };
+        let observation = |value| ObservationEntry {
+            name: format!("value-{value}"),
+            color: color.clone(),
+        };
+        let ring = |_| RingEntry {
+            observed_as: (0..n_values).map(shown).collect(),
+        };
+        Description {
+            name: "hidden".into(),
+            step: "unknown".into(),
+            no_fly: rows.map(CellMap::Rows),
+            sensor: Some(SensorEntry {
+                radius: self.radius,
+                pays: self.pays(),
+                rings: (1..self.n_rings).map(ring).collect(),
+            }),
+            states: (0..n_values).map(state).collect(),
+            observations: (0..n_values).map(observation).collect(),
+        }
+    }
+
+    fn pays(&self) -> Pays {
+        match &*self.pays {
             "seen" => Pays::Seen,
             _ => Pays::Visited,
-        };
-        let no_fly = no_fly.map(Arc::new);
-        Ok(Airspace::new(shape, no_fly, self.radius, 1, pays))
+        }
     }
 }

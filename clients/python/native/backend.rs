@@ -1,12 +1,14 @@
 //! What answers requests: a server, or worlds in this process.
 
-use crate::errors::raise;
+use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::message::{StepReply, StepRequest};
 use emberwatch_server::config::{Checked, ServerConfig};
 use emberwatch_server::embedded::{Embedded, wait_for};
+use emberwatch_server::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::sync::mpsc::channel;
@@ -53,18 +55,35 @@ impl Backend {
 }
 
 /// Worlds in this process, of these settings of `config/server.toml`, as JSON.
-pub fn embedded(py: Python<'_>, settings: &str) -> PyResult<Embedded> {
+pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
     let checked = checked(py, settings)?;
+    if warns {
+        warn_of_starts(py, &checked)?;
+    }
     check_embeddable(py, &checked.config)?;
     let worlds = py.detach(|| Embedded::new(checked));
-    worlds.map_err(|error| failed(py, &format!("{error:#}"), "embedded"))
+    worlds.map_err(|error| match error.downcast_ref() {
+        Some(short) => no_memory(py, short),
+        None => match error.downcast_ref() {
+            Some(short) => no_threads(py, short),
+            None => failed(py, &format!("{error:#}"), "embedded"),
+        },
+    })
 }
 
 /// All settings that a server with these would have; JSON from JSON.
 #[pyfunction]
 pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
-    let settings = checked(py, settings)?.config;
+    let checked = checked(py, settings)?;
+    warn_of_starts(py, &checked)?;
+    let settings = checked.config;
     Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
+}
+
+/// Identifies the worlds of these settings, which are not simulated.
+#[pyfunction]
+pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
+    Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
 /// Reads files on a thread of its own: one may be a pipe.
@@ -76,12 +95,19 @@ fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
         let settings = ServerConfig::default().with(&given);
         settings.and_then(ServerConfig::check)
     };
-    std::thread::spawn(move || drop(sender.send(read())));
+    let reader = spawn("settings", move || drop(sender.send(read())));
+    reader.map_err(|short| no_threads(py, &short))?;
     let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
     let checked = py.detach(wait);
     let checked =
         checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?;
     checked.map_err(|problem| refused(py, &problem.to_string()))
+}
+
+/// Warns of robots that begin where no-fly cells close them in.
+fn warn_of_starts(py: Python<'_>, checked: &Checked) -> PyResult<()> {
+    let mut starts = checked.reach.closed_in.iter();
+    starts.try_for_each(|closed_in| warn(py, closed_in))
 }
 
 /// Refuses settings that only a server can have.

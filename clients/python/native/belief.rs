@@ -2,10 +2,13 @@
 //! states of n worlds.
 
 use crate::detached::detached;
+use crate::errors::{check_memory, no_memory, no_threads};
 use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_protocol::limits::memory::with_capacity;
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::model::{Model, ModelError};
 use emberwatch_protocol::{Shape, UNOBSERVED, transition};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
@@ -13,6 +16,7 @@ use numpy::{
     IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
 };
 use pyo3::prelude::*;
+use rayon::ThreadPoolBuilder;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, TryLockError};
 use std::time::Duration;
@@ -42,6 +46,9 @@ impl Transition {
     #[new]
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
+        // Two beliefs, and a third with margins in the work space.
+        let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
+        check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
         let work = Work {
             operator: transition::Transition::new(&parameters, shape),
@@ -90,6 +97,8 @@ impl Transition {
                 format!("{:?}", beliefs.dim()),
             ));
         }
+        let probe = with_capacity::<f64>("predicted beliefs", beliefs.len());
+        probe.map_err(|short| no_memory(py, &short))?;
         let mut out = Array4::zeros(beliefs.dim());
         detached(py, beliefs.len(), || {
             let worlds = beliefs.axis_iter(Axis(1)).zip(out.axis_iter_mut(Axis(1)));
@@ -191,27 +200,38 @@ pub fn simulated_prior<'py>(
     let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
     let n_worlds = Prior::N_WORLDS;
     let prior = Prior::Simulated { n_worlds, burn_in };
-    let kept = KeptBelief::new(prior, &model, shape, 0);
-    let belief = match kept.as_ref().and_then(KeptBelief::read) {
-        Some(belief) => belief,
-        None => {
-            let belief = simulated(py, prior, &model, shape)?;
-            // Else it is simulated again.
-            let _ = kept.map(|kept| kept.write(&belief));
-            belief
-        }
-    };
+    let belief = first_belief(py, prior, &model, shape)?;
     Ok(belief.probabilities().to_pyarray(py))
+}
+
+/// The belief before the first frame; one that was simulated is kept for later.
+pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let is_simulated = matches!(prior, Prior::Simulated { .. });
+    let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
+    let kept = kept.flatten();
+    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
+        return Ok(belief);
+    }
+    let belief = simulated(py, prior, model, shape)?;
+    // Else it is simulated again.
+    let _ = kept.map(|kept| kept.write(&belief));
+    Ok(belief)
 }
 
 /// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
-    let pool = rayon::ThreadPoolBuilder::new().build();
-    let pool = pool.map_err(|error| failed(py, &format!("start threads: {error}"), "program"))?;
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    // Each thread counts states in a world of its own.
+    let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
+    let n_bytes = 2 * n_threads * of_thread;
+    check_memory(py, "the worlds of a first belief", n_bytes)?;
+    let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {
         let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
-        let worker = scope.spawn(work);
+        let worker = std::thread::Builder::new().spawn_scoped(scope, work);
+        let worker = worker.map_err(|error| no_threads(py, &NoThreads::new(1, &error)))?;
         while !worker.is_finished() {
             py.detach(|| std::thread::sleep(LOOK));
             if let Err(interrupt) = py.check_signals() {

@@ -1,11 +1,10 @@
-//! Connections: to a server or to embedded worlds, and to an agent that serves decisions.
+//! Connections, to a server or to embedded worlds.
 
 use crate::backend::{Backend, embedded};
 use crate::errors::{raise, raise_of_channel};
 use crate::owned::Owned;
 use crate::refusal::invalid;
 use crate::samples::{Truth, truth_of};
-use emberwatch_protocol::Decider;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
@@ -31,15 +30,6 @@ pub struct Server {
     pub n_moves: usize,
 }
 
-/// A connection to an agent that serves decisions.
-#[pyclass(frozen, module = "emberwatch._native")]
-pub struct Agent {
-    wire: Owned<Decider>,
-    /// What the agent said of itself, as JSON.
-    #[pyo3(get)]
-    info: String,
-}
-
 #[pymethods]
 impl Server {
     #[new]
@@ -50,11 +40,12 @@ impl Server {
         Ok(Self::of(instance, Backend::Server(Box::new(wire))))
     }
 
-    /// Worlds in this process, of these settings of `config/server.toml`, as JSON.
+    /// Worlds in this process, of these settings of `config/server.toml`, as JSON. `warns`: of starts that no-fly cells
+    /// close in.
     #[staticmethod]
     #[pyo3(name = "embedded")]
-    fn new_embedded(py: Python<'_>, settings: &str) -> PyResult<Self> {
-        let worlds = Backend::Embedded(Box::new(embedded(py, settings)?));
+    fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
+        let worlds = Backend::Embedded(Box::new(embedded(py, settings, warns)?));
         Ok(Self::of(INSTANCE, worlds))
     }
 
@@ -141,38 +132,6 @@ impl Server {
 /// A world's present, without the interpreter.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
     (world, *episode.result(), episode.states().to_owned())
-}
-
-#[pymethods]
-impl Agent {
-    #[new]
-    fn new(
-        py: Python<'_>,
-        instance: &str,
-        world: u32,
-        client: &str,
-        seconds: f64,
-    ) -> PyResult<Self> {
-        let name = checked(py, instance)?;
-        let wire = py.detach(|| Decider::open(&name, world, client, duration(seconds)));
-        let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
-        Ok(Self {
-            info: serde_json::to_string(wire.info()).expect("invariant: replies serialise"),
-            wire: Owned::new(instance, wire),
-        })
-    }
-
-    /// Sends JSON text, `what` in errors; returns that of the answer.
-    fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
-        let answer = self
-            .wire
-            .with(py, |wire| wire.ask(text, duration(seconds)))?;
-        decoded(answer).map_err(|error| raise(py, error, what, seconds))
-    }
-
-    fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.wire.close(py)
-    }
 }
 
 /// What Python gets of an answer.

@@ -2,11 +2,15 @@
 
 use emberwatch_protocol::channels::ChannelError;
 use emberwatch_protocol::connection::ConnectionError;
+use emberwatch_protocol::limits::memory::{self, NoMemory};
+use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_server::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
-use pyo3::exceptions::PyKeyboardInterrupt;
+use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
 use pyo3::prelude::*;
 use std::cell::RefCell;
+use std::ffi::CString;
+use std::fmt::Display;
 
 thread_local! {
     /// What a signal's handler raised during a wait of this thread.
@@ -34,10 +38,36 @@ pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) 
     made.map_or_else(|error| error, PyErr::from_value)
 }
 
+/// The error of memory that there is not.
+pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
+    error(py, "NotEnoughMemoryError", (short.to_string(),))
+}
+
+/// Checks that there is memory for what arguments make large.
+pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyResult<()> {
+    // Reading the limits takes some 0.1 ms, and so much less is there or nothing is.
+    if n_bytes < 16 << 20 {
+        return Ok(());
+    }
+    memory::check(what, n_bytes as u64).map_err(|short| no_memory(py, &short))
+}
+
+/// The error of threads that the system does not start.
+pub fn no_threads(py: Python<'_>, short: &NoThreads) -> PyErr {
+    error(py, "EmberwatchError", (short.to_string(), "threads"))
+}
+
+/// Warns the caller of this package's function.
+pub fn warn(py: Python<'_>, words: impl Display) -> PyResult<()> {
+    let words = CString::new(words.to_string())?;
+    PyErr::warn(py, &py.get_type::<PyUserWarning>(), &words, 1)
+}
+
 /// The error of a request, `what`, that was waited for so many seconds.
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
+        ConnectionError::Memory(short) => no_memory(py, &short),
         ConnectionError::ServerGone { instance, .. } if instance == INSTANCE => {
             let text = "these worlds were ended by shutdown: make others";
             error(py, "ServerGoneError", (text,))
@@ -46,8 +76,8 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
             let text = format!("{what} did not end within {seconds:?} s");
             error(py, "RequestTimeoutError", (text,))
         }
-        ConnectionError::ServerGone { who, instance } => {
-            let text = format!("the {who} on instance '{instance}' is gone");
+        ConnectionError::ServerGone { instance } => {
+            let text = format!("the server on instance '{instance}' is gone");
             error(py, "ServerGoneError", (text,))
         }
         ConnectionError::Timeout { instance, .. } => {
@@ -80,7 +110,6 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
             let text = format!("no server on instance '{instance}': {remedy}");
             error(py, "NoServerError", (text,))
         }
-        ChannelError::NoAgent { .. } => error(py, "NoServerError", (text,)),
         ChannelError::OtherVersion { version } => {
             error(py, "EmberwatchError", (text, "version_mismatch", version))
         }

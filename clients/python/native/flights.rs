@@ -1,6 +1,7 @@
 //! Paths flown move by move by many robots, in rows: where they are, what they have visited.
 
 use crate::airspace::Given;
+use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_protocol::model::{Pays, SeenCell};
@@ -70,6 +71,8 @@ impl Flights {
             let expected = format!("an integer within 1 to {MAX_MOVES}");
             return Err(invalid(py, "n_moves", expected, n_moves));
         }
+        let n_bytes = n_rows.saturating_mul(3 * shape.n_cells() + n_moves);
+        check_memory(py, format_args!("the flights of {n_rows} robots"), n_bytes)?;
         Ok(Self {
             shape,
             airspace: within,

@@ -11,6 +11,7 @@ mod lease;
 mod merit;
 mod model;
 mod moves;
+mod options;
 mod owned;
 mod planning;
 mod reader;
@@ -47,7 +48,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
     module.add_class::<connection::Server>()?;
-    module.add_class::<connection::Agent>()?;
     module.add_class::<flights::Flights>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Frames>()?;
@@ -56,7 +56,10 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<recording::Recording>()?;
     module.add_class::<belief::Transition>()?;
     module.add_class::<merit::MeritTally>()?;
+    module.add_class::<options::Options>()?;
+    module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
+    module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;

@@ -1,5 +1,6 @@
 //! The figures of merit of some worlds' runs.
 
+use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_belief::merit::{self, Found};
@@ -32,6 +33,12 @@ impl MeritTally {
         recent_steps: u32,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
+        let n_bytes = n_worlds.saturating_mul(size_of::<u32>() * shape.n_cells());
+        check_memory(
+            py,
+            format_args!("the figures of merit of {n_worlds} worlds"),
+            n_bytes,
+        )?;
         let tally = merit::MeritTally::new(shape, target, recent_steps);
         Ok(Self {
             shape,

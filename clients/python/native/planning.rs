@@ -1,7 +1,7 @@
 //! Beam search in many worlds.
 
 use crate::airspace::Given;
-use crate::errors::{interrupted, raise_of_channel};
+use crate::errors::{check_memory, interrupted, raise_of_channel};
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_belief::planning::objective::CellValues;
@@ -44,10 +44,10 @@ pub fn beam_search<'py>(
         None => Airspace::open(shape),
         Some(given) => given.on_grid(py, shape)?,
     };
-    check(py, &airspace, n_moves, width)?;
-    let mut paths = Array2::zeros((n_worlds, n_moves));
     // More states than there are beginnings of paths are never kept.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
+    check(py, &airspace, n_moves, (width, width.min(n_paths)))?;
+    let mut paths = Array2::zeros((n_worlds, n_moves));
     let mut search = BeamSearch::new(width.min(n_paths));
     let mut looked = Instant::now();
     let mut stops = || {
@@ -88,7 +88,12 @@ fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
 }
 
 /// Refuses what takes more memory than there may be.
-fn check(py: Python<'_>, airspace: &Airspace, n_moves: usize, width: usize) -> PyResult<()> {
+fn check(
+    py: Python<'_>,
+    airspace: &Airspace,
+    n_moves: usize,
+    (width, n_kept): (usize, usize),
+) -> PyResult<()> {
     let within = |most: usize| format!("an integer within 1 to {most}");
     if !(1..=MAX_MOVES).contains(&n_moves) {
         return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
@@ -106,5 +111,9 @@ fn check(py: Python<'_>, airspace: &Airspace, n_moves: usize, width: usize) -> P
     if !(1..=widest).contains(&width) {
         return Err(invalid(py, "width", within(widest), width));
     }
-    Ok(())
+    check_memory(
+        py,
+        format_args!("a beam of width {width}"),
+        n_kept * state_bytes,
+    )
 }

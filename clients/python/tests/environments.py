@@ -57,11 +57,6 @@ def private_pid(env: Any) -> int:
         return client.info.pid
 
 
-def agent_pid(env: Any) -> int:
-    """The process of an environment's own agent."""
-    return env.unwrapped._agent._own_agent.pid
-
-
 @contextlib.contextmanager
 def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
     """Calls of an environment wait no longer than that."""

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+import warnings
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -230,8 +231,8 @@ def test_a_radius_may_be_given_beside_a_model() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sensor_radius": 9}, "invalid value '9' for '--sensor-radius"),
-        ({"sensor_radius": -1}, "invalid value '-1' for '--sensor-radius"),
+        ({"sensor_radius": 9}, "sensor_radius: .* got 9"),
+        ({"sensor_radius": -1}, "sensor_radius: .* got -1"),
         ({"sensor_radius": 1.5}, "sensor_radius: .* got 1.5"),
         ({"sensor_radius": "1"}, "sensor_radius: .* got '1'"),
     ],
@@ -408,3 +409,34 @@ def test_no_argument_of_a_plan_is_taken_for_another() -> None:
             Airspace(**keywords)
     with refuses(r"no_fly: expected shape \(7, 5\), got \(5, 7\)"):
         Flights(1, 7, 5, 4, None, Airspace(no_fly=np.zeros((5, 7), bool)))
+
+
+@pytest.fixture
+def pocket(tmp_path: Path) -> dict[str, Any]:
+    """Keywords of worlds of 12 x 9 cells with a closed pocket of two: (4, 4) and (4, 5)."""
+    no_fly = np.zeros((12, 9), int)
+    no_fly[3:6, 3:7] = 1
+    no_fly[4, 4:6] = 0
+    path = tmp_path / "pocket.toml"
+    path.write_text(f"no_fly = {no_fly.tolist()}\n" + Model.named("wildfire-small").toml)
+    return {"model": path, "height": 12, "width": 9, "n_moves": 4, "burn_in": 0}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_random_starts_are_in_no_pocket(pocket: dict[str, Any], backend: str) -> None:
+    env = make(**pocket, backend=backend, start="random")
+    starts = {tuple(env.reset(seed=seed)[0]["robot"].tolist()) for seed in range(600)}
+    assert len(starts) == 12 * 9 - 12, "all cells but 10 no-fly cells and two in a pocket"
+    assert not starts & {(4, 4), (4, 5)}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_start_in_a_pocket_is_warned_of(pocket: dict[str, Any], backend: str) -> None:
+    words = r"start: no-fly cells close in \(4, 4\): .* reach 2 of 98 free cells"
+    with pytest.warns(UserWarning, match=words):
+        env = make(**pocket, backend=backend, start="4,4")
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        assert env.reset(seed=1)[0]["robot"].tolist() == [4, 4]
+        make(**pocket, backend=backend, start="centre").reset(seed=1)
+    assert not [each for each in found if "start" in str(each.message)], "once, when it is made"

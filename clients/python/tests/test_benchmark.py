@@ -1,8 +1,10 @@
 """`emberwatch.benchmark` against `emberwatch-agent compare`."""
 
 import io
+import itertools
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,13 +167,13 @@ def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
     [
         (
             {"seeds": range(3, 6)},
-            "expected worlds [3, 4, 5, 6], as those compared have, got [3, 4, 5]",
+            "expected one row for each world, 4 from seed 3 to 6, got 3 from seed 3 to 5",
         ),
-        ({"steps": 11}, "expected steps 12, as those compared have, got 11"),
-        ({"n_moves": 5}, "expected moves of a path 6, as those compared have, got 5"),
-        ({"recent_steps": 9}, "expected --recent-steps 10, as those compared have, got 9"),
-        ({"burn_in": 61}, "burning cells of world 3 (model, grid, burn-in)"),
-        ({"width": 8}, "burning cells of world 3 (model, grid, burn-in)"),
+        ({"steps": 11}, "steps: expected 12, got 11"),
+        ({"n_moves": 5}, "moves: expected 6, got 5"),
+        ({"recent_steps": 9}, "--recent-steps: expected 10, got 9"),
+        ({"burn_in": 61}, "worlds_fingerprint (model, grid, sensor, start, burn-in): expected"),
+        ({"width": 8}, "worlds_fingerprint (model, grid, sensor, start, burn-in): expected"),
         ({"name": "random_walk"}, 'policy "random_walk": expected a name that no policy compared'),
     ],
     ids=str,
@@ -186,13 +188,12 @@ def test_rows_of_other_worlds_are_refused(
     assert done.stderr.count("--add") == 1
 
 
-@pytest.mark.parametrize("text", ["", "policy,steps\nmine,3\n", "\x00\xff"], ids=repr)
+@pytest.mark.parametrize("text", ["policy,steps\nmine,3\n", "\x00\xff"], ids=repr)
 def test_what_is_no_file_of_rows_is_named(tmp_path: Path, text: str) -> None:
     file = tmp_path / "mine.csv"
     file.write_text(text, "latin-1")
-    if text:
-        done = compare("--policies=random_walk", f"--add={file}", *private())
-        assert done.returncode == 1 and f"--add: {file}: " in done.stderr, done.stderr
+    done = compare("--policies=random_walk", f"--add={file}", *private())
+    assert done.returncode == 1 and f"--add: {file}: " in done.stderr, done.stderr
     with refuses(r"csv: expected .* to have the columns policy,"):
         score(file)
 
@@ -208,39 +209,21 @@ def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert [row.mean_fire_cells for row in rows] == [row.mean_fire_cells for row in whole]
     assert kept != file.read_bytes() and len(read(file)) == 8
     assert "mine: 4 test worlds" in told.getvalue()
-    # Nothing is left to do: no server is started, the policy is not asked.
-    assert evaluate(lambda _: 1 / 0, name="mine", csv=file, **{**WORLDS, **SCALE}) == rows
+    assert f"mine: 2 rows kept in {file}, not run again" in told.getvalue()
     assert list(file.parent.iterdir()) == [file]
 
 
-@pytest.mark.parametrize("change", [{"steps": 13}, {"n_moves": 5}], ids=str)
-def test_an_evaluation_of_other_settings_does_not_go_on(
-    tmp_path: Path, change: dict[str, Any]
-) -> None:
-    file = tmp_path / "mine.csv"
-    score(file, seeds=[3])
-    expected = {"steps": 12, "n_moves": 6, **change}
-    problem = (
-        "has 12 steps of 6 moves of 'mine' on world 3, "
-        f"expected {expected['steps']} of {expected['n_moves']}: choose another file or name"
-    )
-    with refuses(problem):
-        score(file, **change)
-    assert len(read(file)) == 1
+def test_an_evaluation_that_is_complete_asks_no_policy(tmp_path: Path) -> None:
+    calls = itertools.count()
 
+    def still(frames: Any) -> NDArray[np.int64]:
+        next(calls)
+        return np.zeros(len(frames), np.int64)
 
-@pytest.mark.parametrize("change", [{"burn_in": 61}, {"width": 8}], ids=str)
-def test_rows_of_other_worlds_are_not_added(tmp_path: Path, change: dict[str, Any]) -> None:
-    file = tmp_path / "mine.csv"
-    score(file, seeds=[3])
-    kept = file.read_bytes()
-    with refuses(r"burning cells of world 3 \('mine'\), got"):
-        score(file, name="other", seeds=[3], **change)
-    assert file.read_bytes() == kept
-    # Other worlds, or other steps of the same, may burn otherwise.
-    score(file, name="other", seeds=[4])
-    score(file, name="another", seeds=[3], steps=11)
-    assert len(read(file)) == 3
+    keywords = {**WORLDS, **SCALE, "name": "mine", "csv": tmp_path / "mine.csv"}
+    rows = evaluate(still, **keywords)
+    assert evaluate(still, **keywords) == rows
+    assert next(calls) == 12 * 6
 
 
 @pytest.mark.parametrize(
@@ -262,14 +245,19 @@ def test_a_row_says_where_the_belief_came_from(changes: dict[str, Any], expected
 def test_a_summary_says_which_worlds_are_for_tests() -> None:
     rows = score(seeds=[3, 5000], steps=2)
     assert summary(rows).endswith("a step on 2 (1 test) worlds")
-    assert summary(rows[:1]).endswith("+- nan a step on 1 test worlds")
-    assert summary(rows[1:]).endswith("a step on 1 worlds")
+    assert summary(rows[:1]).endswith(" a step on 1 test world, too few for a standard error")
+    assert summary(rows[1:]).endswith(" a step on 1 world, too few for a standard error")
+    other = [replace(row, policy="other") for row in rows]
+    assert [line[:6] for line in summary(rows + other).splitlines()] == ["mine: ", "other:"]
+    with refuses("rows: expected at least one, got none"):
+        summary([])
 
 
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
         ({"name": ""}, "name: expected a name for the table, got ''"),
+        ({"estimator": "a\nb"}, r"estimator: expected a word for the table, or None, got 'a\\nb'"),
         ({"seeds": []}, "seeds: expected some, each once"),
         ({"seeds": [4, 4]}, "seeds: expected some, each once"),
         ({"seeds": 8}, r"seeds: expected some, such as range\(8\), got 8"),
@@ -291,11 +279,6 @@ def test_what_cannot_be_evaluated_is_named(changes: dict[str, Any], problem: str
         score(**changes)
     with refuses("policy: expected a function"):
         evaluate(None, name="mine", **{**WORLDS, **SCALE})
-
-
-def test_a_csv_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with refuses("csv: expected a file, got the folder"):
-        score(tmp_path)
 
 
 @pytest.mark.parametrize("flags", [{}, {"publish_truth": True, "reveal_model": False}], ids=str)

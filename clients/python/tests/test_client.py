@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from failures import fails, refuses
@@ -326,6 +327,21 @@ def test_each_refusal_on_control_has_its_exception() -> None:
     ended.release()
     refused(lambda: ask(op="renew", lease=ended.number), "lease_lost", 0)
     assert table.server.status().n_refused == 10
+
+
+def test_more_worlds_than_the_server_has_are_refused_with_the_flag_for_more() -> None:
+    table = Table()
+    more = "start it with --worlds N for more"
+    robots = f"no such robot: the server has robots 0 to 2; {more} worlds, or --robots N"
+    for ask in (
+        lambda: table.client.acquire(0, 8),
+        lambda: table.exchange(first_robot=2, n_robots=2, step=1, bytes=12),
+    ):
+        assert refused(ask, "no_such_robot", 3).startswith(robots)
+    with refuses("world: .*got 0 to 7; start the server with --worlds N for more"):
+        gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=8, instance=table.server.instance)
+    worlds = f"no such world: the server has worlds 0 to 2; {more}"
+    assert refused(lambda: table.lease.reset([1], worlds=[9]), "no_such_world", 3) == worlds
 
 
 def test_a_refusal_says_the_same_on_both_channels() -> None:

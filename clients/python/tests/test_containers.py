@@ -11,13 +11,12 @@ import sys
 import tempfile
 from collections.abc import Callable
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from failures import fails
 from processes import server
 
-from emberwatch import programs, resources
+from emberwatch import programs
 from emberwatch.model import Model
 from emberwatch.programs import Program, unused_instance
 
@@ -213,23 +212,16 @@ tell("connect", lambda: emberwatch.connect("lab"))
     assert "shared memory: expected room for 48 files in /dev/shm, got" in ended.stdout, ended
 
 
-def test_too_few_descriptors_are_called_so() -> None:
+def test_a_low_limit_on_file_sizes_is_called_so() -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
     started = server()
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    n_open = len(os.listdir("/proc/self/fd"))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (n_open + 8, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
     try:
-        with fails("channel", match=f"file descriptors, got fewer of the limit of {n_open + 8}"):
+        words = "expected a limit on file sizes of at least 512 KiB, got 1 KiB"
+        with fails("channel", match=words):
             started.connect()
     finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    started.connect()
-
-
-def test_a_low_limit_on_file_sizes_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource, "getrlimit", Mock(return_value=(1024, 1024)))
-    with fails("channel", match="expected a limit on file sizes of at least 512 KiB, got 1 KiB"):
-        resources.check_room()
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_private_names_are_random() -> None:

@@ -16,7 +16,6 @@ import pytest
 from environments import (
     LIVELY,
     MOVES,
-    OBJECTIVE,
     SMALL,
     WILDFIRE,
     actions,
@@ -151,7 +150,6 @@ def test_wrong_settings_are_refused(settings: dict[str, Any], words: str) -> Non
         (WILDFIRE, {"backend": 3}, "backend"),
         (WILDFIRE, {"instance": "lab"}, "expected 'server' with instance"),
         (WILDFIRE, {"takeover": True}, "expected instance=..."),
-        (OBJECTIVE, {}, "expected 'server', which the agent attaches to, got 'embedded'"),
     ],
 )
 def test_wrong_backends_are_refused(name: str, keywords: dict[str, Any], words: str) -> None:

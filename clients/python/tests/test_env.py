@@ -446,10 +446,10 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ({"height": -1}, "^height: expected 1 to 4096, got -1$"),
         ({"height": 10**30}, "^height: expected 1 to 4096, got 1e"),
         ({"width": 4097}, "^width: expected 1 to 4096, got 4097$"),
-        ({"sensor_radius": 9}, "^sensor_radius: expected -1 to 8, got 9$"),
+        ({"sensor_radius": 9}, "^sensor_radius: expected 0 to 8, or None, got 9$"),
         (
             {"states": "jacksboro"},
-            "^height: expected to be left out, as the states file decides it",
+            "^model: expected to be left out, as the states file decides it",
         ),
         ({"n_moves": 2.5}, r"n_moves: expected int \| None, got 2.5"),
         ({"n_moves": 5000}, "^n_moves: expected 1 to 4096, got 5000$"),

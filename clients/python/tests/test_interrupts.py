@@ -51,6 +51,7 @@ KINDS: dict[str, Callable[[], Any]] = {
         emberwatch.parallel_env(height=7, width=5, n_moves=4, burn_in=50, observation=MOVE)
     ),
     "objective": lambda: make(OBJECTIVE),
+    "objectives": lambda: make_vec(2, OBJECTIVE, max_episode_steps=3),
 }
 
 #: Of these a step may be refused, with these words.

@@ -1,34 +1,36 @@
-"""`WildfireObjective-v1` and the agent behind it."""
+"""`WildfireObjective-v1`: beliefs and plans in the process."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-import signal
+import pickle
 import subprocess
+import warnings
 from pathlib import Path
 from typing import Any
 
 import environments
+import golden_options
 import gymnasium
 import numpy as np
 import pytest
 from environments import (
     OBJECTIVE,
-    agent_pid,
     assert_same,
     closed_later,
-    impatient,
-    private_pid,
     rollout,
 )
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
-from processes import eventually, server, stopped
+from processes import eventually, server
 
 import emberwatch
 from emberwatch import errors
-from emberwatch.programs import Program, find
+from emberwatch.programs import find
 from emberwatch.wrappers import BeliefObservation
+
+GOLDEN = np.load(golden_options.FILE)
 
 
 def make(**keywords: Any) -> Any:
@@ -50,6 +52,10 @@ def any_env(request: pytest.FixtureRequest) -> Any:
     made = request.param()
     made.reset(seed=1000)
     return made
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def decide(env: Any) -> Any:
@@ -99,21 +105,118 @@ def trained(folder: Path, **world: object) -> Path:
     return folder / "out" / "checkpoint.safetensors"
 
 
-def test_a_checkpoint_brings_its_filter(tmp_path: Path) -> None:
-    checkpoint = trained(tmp_path, height=7, width=5, burn_in=50, model=environments.LIVELY)
-    learned = make(checkpoint=checkpoint)
-    seen, _ = learned.reset(seed=1000)
-    assert learned._agent.info.estimator == "learned_filter"
-    assert not np.array_equal(seen, make().reset(seed=1000)[0])
-    spatial = make_vec(checkpoint=str(checkpoint), estimator="learned_spatial_filter")
-    spatial.reset(seed=1000)
-    decide(spatial)
-    known = make(checkpoint=checkpoint, estimator="known_model")
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the checkpoints of the golden episodes, by what they are of."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    for name in ("learned_filter", "learned_own_filter", "neural_belief"):
+        (folder / name).write_bytes(GOLDEN[f"checkpoint {name}"].tobytes())
+    return folder
+
+
+def believing(name: str, checkpoints: Path) -> dict[str, Any]:
+    """The keywords of golden episodes."""
+    keywords = dict(golden_options.BELIEFS[name])
+    if "checkpoint" in keywords:
+        keywords["checkpoint"] = checkpoints / keywords["checkpoint"]
+    return {"prior": "simulated", **golden_options.WORLD, **keywords}
+
+
+@pytest.mark.parametrize("backend", ["server", "embedded"])
+@pytest.mark.parametrize("name", golden_options.BELIEFS)
+def test_episodes_are_those_that_were_recorded(name: str, backend: str, checkpoints: Path) -> None:
+    keywords = {"backend": backend, **believing(name, checkpoints)}
+    env = make(**keywords)
+    assert env.estimator == name.partition(",")[0]
+    found = golden_options.episode(env)
+    envs = make_vec(3, autoreset_mode="Disabled", max_episode_steps=4, **keywords)
+    found |= {f"vector {key}": value for key, value in golden_options.episodes(envs).items()}
+    for key, value in found.items():
+        expected = GOLDEN[f"{name} {key}"]
+        if name == "neural_belief":  # products of matrices add up in the processor's own order
+            assert np.allclose(value, expected, rtol=1e-3, atol=1e-4), key
+        else:
+            assert_same(value, expected, key)
+
+
+@pytest.mark.parametrize("name", ["spatial_filter", "learned_own_filter", "neural_belief"])
+@pytest.mark.parametrize("is_left", [True, False])
+def test_the_next_one_goes_on_from_the_same_belief(
+    name: str, is_left: bool, checkpoints: Path
+) -> None:
+    """From the belief that was left, or from the frames that are kept."""
+    flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "burn_in": 100}
+    started = server(worlds=3, **flags)
+    keywords = {"prior": "initial", **believing(name, checkpoints)}
+    keywords = {
+        key: keywords[key] for key in ("estimator", "checkpoint", "prior") if key in keywords
+    }
+    keywords |= {"instance": started.instance, "world": 1}
+    first = make_vec(2, **keywords)
+    first.reset(seed=1000)
+    for choice in (0, 3, 6):
+        seen, _, _, _, _ = first.step(np.array([choice, 7 - choice]))
+    if is_left:
+        first.close()
+    with emberwatch.connect(started.instance) as client:
+        assert (client.belief(1) is not None) == is_left
+    second = make_vec(2, takeover=not is_left, **keywords)
+    found, info = second.reset(options={"resume": True})
+    assert info["step"].tolist() == [3, 3]
+    assert_same(found, seen)
+
+
+def test_beliefs_are_shown_to_those_who_watch() -> None:
+    started = server(worlds=3)
+    envs = make_vec(2, instance=started.instance, world=1)
+    envs.reset(seed=1000)
+    with emberwatch.observer.OutlookReader(started.instance) as reader:
+        expected = {(1, "exploit"), (2, "entropy")}
+
+        def is_shown() -> bool:
+            envs.step(np.array([0, 3]))
+            outlook = reader.receive(0.0)
+            if outlook is not None:
+                assert (outlook.policy, outlook.belief_from) == ("options", "known_model")
+                assert outlook.robots == range(outlook.world, outlook.world + 1)
+                expected.discard((outlook.world, outlook.objective))
+            return not expected
+
+        assert eventually(is_shown)
+
+
+def ringed(folder: Path) -> Path:
+    """A model whose sensor sees further, by another matrix: twice as many observations."""
+    matrix = "[[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]]"
+    sensor = f"\n[sensor]\nradius = 1\nrings = [{{ observed_as = {matrix} }}]\n"
+    model = folder / "ringed.toml"
+    model.write_text(Path(environments.LIVELY).read_text() + sensor)
+    return model
+
+
+def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Path) -> None:
+    with refuses("checkpoint: expected one of a learned_own_filter, got none"):
+        make(checkpoint=checkpoints / "learned_filter", estimator="learned_own_filter")
+    for name in ("learned_filter", "neural_belief"):
+        for maker in (make, make_vec):
+            with refuses("checkpoint: expected 6 observations as the world's, got 3"):
+                maker(checkpoint=checkpoints / name, model=ringed(tmp_path))
+    (checkpoints / "damaged").write_bytes(b"no checkpoint")
+    with refuses("checkpoint .*damaged: expected a whole safetensors file"):
+        make(checkpoint=checkpoints / "damaged")
+
+
+def test_a_sensor_of_several_matrices_is_learned_for_without_its_model(tmp_path: Path) -> None:
+    world = {"model": ringed(tmp_path), "height": 7, "width": 5, "moves": 4, "burn_in": 50}
+    checkpoint = trained(tmp_path, **world)
+    shown = [server(reveal_model=reveals, **world) for reveals in (True, False)]
+    seen = [rollout(make(instance=it.instance, checkpoint=checkpoint), 3, seed=5) for it in shown]
+    assert_same(*seen)
+
+
+def test_an_estimator_that_knows_the_model_ignores_what_was_learned(checkpoints: Path) -> None:
+    known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
-    with fails("program", match="estimator learned_own_filter: expected a checkpoint of such a"):
-        make(checkpoint=checkpoint, estimator="learned_own_filter").reset()
-    with fails("program", match="no file"):
-        make(checkpoint=tmp_path / "no file").reset()
 
 
 def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> None:
@@ -125,8 +228,107 @@ def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> 
     env: Any = closed_later(gymnasium.make(OBJECTIVE, checkpoint=checkpoint, **world))
     env.reset(seed=1000)
     assert env.step(0)[4]["step"] == 1
-    with fails("program", match="recorded worlds, without a model"):
-        closed_later(gymnasium.make(OBJECTIVE, **world)).reset()
+    with refuses("model: expected one for the estimator 'known_model'.*got recorded worlds"):
+        gymnasium.make(OBJECTIVE, **world)
+
+
+@pytest.mark.parametrize("backend", ["server", "embedded"])
+@pytest.mark.parametrize("maker", [make, make_vec])
+def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
+    maker: Any, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = (maker(backend=backend) for _ in range(2))
+    for env in (one, other):
+        env.reset(seed=1000)
+        decide(env)
+    seen = other.step(np.zeros(other.action_space.shape, int))[0]
+    with monkeypatch.context() as patched:
+        # Between the world's step and the belief's.
+        patched.setattr(one._plans, "see", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            decide(one)
+    with fails("interrupted"):
+        decide(one)
+    found, info = one.reset(options={"resume": True})
+    assert np.all(info["step"] == 2)
+    assert_same(found, seen)
+
+
+def test_another_holder_is_named(env: Any) -> None:
+    env.reset(seed=1000)
+    other = make(instance=env.instance)
+    with fails("busy", match=f"held by pid {os.getpid()}"):
+        other.reset(seed=1001)
+    taken = make(instance=env.instance, takeover=True)
+    _, info = taken.reset(options={"resume": True})
+    assert info["step"] == 0
+    with pytest.raises(errors.LeaseLostError):
+        env.step(0)
+
+
+def test_a_copy_plans_by_itself() -> None:
+    env = make(backend="embedded")
+    expected = rollout(env, 3, seed=1000)
+    env.close()
+    copied = pickle.loads(pickle.dumps(env))
+    assert_same(rollout(closed_later(copied), 3, seed=1000), expected)
+
+
+def test_no_thread_starts_before_the_first_reset(checkpoints: Path) -> None:
+    keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
+    before = set(os.listdir("/proc/self/task"))
+    envs = make_vec(2, **keywords)
+    assert set(os.listdir("/proc/self/task")) <= before
+    envs.reset(seed=1000)
+
+
+def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
+    keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
+    envs = make_vec(2, **keywords)
+    expected = rollout(envs, 3, seed=1000)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe()
+
+    def child() -> None:
+        again = make_vec(2, **keywords)
+        sender.send([step[0] for step in rollout(again, 3, seed=1000)])
+        try:
+            envs.step(np.zeros(2, int))
+        except emberwatch.EmberwatchError as error:
+            sender.send(error.code)
+        os._exit(0)
+
+    process = context.Process(target=child)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads
+        process.start()
+    assert receiver.poll(60)
+    assert_same(receiver.recv(), [step[0] for step in expected])
+    assert receiver.recv() == "forked"
+    process.join()
+
+
+@pytest.mark.parametrize(
+    ("policy", "estimator"),
+    [("known_exploit", "known_model"), ("spatial_exploit", "spatial_filter")],
+)
+def test_exploiting_makes_the_steps_of_a_policy_that_does(policy: str, estimator: str) -> None:
+    found = []
+    for flies in (False, True):
+        started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
+        client = started.connect()
+        if flies:
+            env = make(instance=started.instance, estimator=estimator)
+            env.reset(options={"resume": True})
+            for _ in range(5):
+                env.step(0)
+        else:
+            flags = ["--instance", started.instance, "--policy", policy, "--steps", "5"]
+            command = [find("emberwatch-agent"), "run", "--prior", "initial", *flags]
+            subprocess.run(command, check=True, capture_output=True, timeout=60)
+        answers = [client.recall(step) for step in range(6)]
+        found.append([(answer.results.tolist(), answer.frames.tolist()) for answer in answers])
+    assert_same(*found)
 
 
 def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:
@@ -141,48 +343,6 @@ def test_the_world_is_that_of_wildfire_with_the_same_seed() -> None:
     assert counts[0] == counts[1]
 
 
-def test_a_resume_does_not_wait_for_the_end_of_a_server_that_runs(
-    any_env: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(Program, "exit_code")  # which waits for it
-    _, info = any_env.reset(options={"resume": True})
-    assert np.all(info["step"] == 0)
-
-
-def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
-    env.reset(seed=1000)
-    env.step(2)
-    for takeover in (False, True):
-        other = make(instance=env.instance, takeover=takeover)
-        with fails("program", match="served already, by pid"):
-            other.reset(seed=1001)
-    assert env.step(2)[4]["step"] == 2
-
-
-def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset(any_env: Any) -> None:
-    with (
-        stopped(agent_pid(any_env)),
-        impatient(any_env, 0.5),
-        pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"),
-    ):
-        decide(any_env)
-    with fails("closed", match="an earlier step or reset timed out"):
-        decide(any_env)
-    _, info = any_env.reset(options={"resume": True})
-    assert np.all(decide(any_env) == info["step"] + 1)
-
-
-def test_a_lease_lost_between_steps_is_told_as_that() -> None:
-    started = server(lease_millis=3000)
-    env = make(instance=started.instance)
-    env.reset(seed=1000)
-    started.connect().acquire(takeover=True, ttl=3600)
-    # The agent finds out when it renews its lease, and ends.
-    assert eventually(lambda: env._agent._own_agent.exit_code() is not None)
-    with pytest.raises(errors.LeaseLostError, match="lease lost"):
-        env.step(0)
-
-
 def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
     started = server(publish_truth=True)
     env = make(instance=started.instance, truth=True)
@@ -194,11 +354,26 @@ def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
 
 def test_a_hidden_model_must_be_given() -> None:
     instance = server(reveal_model=False).instance
-    with refuses("model: expected one"):
+    with refuses("model: expected one for the estimator 'known_model', or a checkpoint"):
         make(instance=instance)
     env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)
     assert env.step(2)[4]["step"] == 1
+
+
+def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> None:
+    """The same features as where the server reveals it."""
+    flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "sensor_radius": 1}
+    for name in ("learned_filter", "neural_belief"):
+        seen = [
+            rollout(
+                make(instance=server(**flags, **one).instance, checkpoint=checkpoints / name),
+                3,
+                seed=5,
+            )
+            for one in ({}, {"reveal_model": False})
+        ]
+        assert_same(*seen)
 
 
 @pytest.mark.parametrize("action", [8, [0, 1, 8], "fire"])
@@ -211,129 +386,19 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
 @pytest.mark.parametrize(
     ("keywords", "words"),
     [
-        (
-            {"estimator": "neural_belief"},
-            "checkpoint: expected the file that a training has saved, for estimator='neural",
-        ),
-        ({"estimator": "truth"}, "expected one of None, known_model, .*, got 'truth'"),
-        ({"prior": "none"}, "expected one of simulated, initial, uniform"),
-        ({"agent": "other"}, "expected one of own, running"),
-        ({"agent": "running"}, "expected instance="),
-        (
-            {"agent": "running", "instance": "lab", "checkpoint": "a.safetensors"},
-            "checkpoint: expected none, as the agent runs already, got 'a.safetensors'",
-        ),
+        ({"estimator": "truth"}, 'estimator: expected one of known_model, .*, got "truth"'),
+        ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
+        ({"estimator": 3}, "estimator: expected the name of one, got 3"),
+        ({"prior": None}, "prior: expected the name of one, got None"),
+        ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
+        ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
+        ({"estimator": "neural_belief"}, "checkpoint: expected one of a neural_belief, got none"),
     ],
 )
 @pytest.mark.parametrize("maker", [make, make_vec])
 def test_a_wrong_keyword_is_refused(maker: Any, keywords: dict[str, Any], words: str) -> None:
     with refuses(words):
         maker(**keywords)
-
-
-def test_more_worlds_than_frames_are_kept_of_are_not_drawn() -> None:
-    with refuses("expected at most 64 worlds, got 65"):
-        make_vec(65, render_mode="rgb_array")
-
-
-def test_a_reset_that_finds_agent_or_server_dead_starts_others(any_env: Any) -> None:
-    expected = any_env.reset(seed=1000)
-    for _ in range(2):
-        os.kill(agent_pid(any_env), signal.SIGKILL)
-        assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
-        os.kill(private_pid(any_env), signal.SIGKILL)
-        assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
-    os.kill(agent_pid(any_env), signal.SIGKILL)
-    with pytest.raises(errors.ServerGoneError):
-        any_env.reset(options={"resume": True})
-
-
-def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(any_env: Any) -> None:
-    os.kill(agent_pid(any_env), signal.SIGKILL)
-    with pytest.raises(errors.ServerGoneError, match="the agent on instance"):
-        decide(any_env)
-    any_env.reset(seed=1000)
-    assert np.all(decide(any_env) == 1)
-
-
-def test_a_server_that_is_killed_ends_the_agent_with_a_word(any_env: Any) -> None:
-    os.kill(private_pid(any_env), signal.SIGKILL)
-    with pytest.raises(errors.ServerGoneError, match="the server on instance"):
-        decide(any_env)
-    any_env.reset(seed=1000)
-
-
-def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> None:
-    env.reset(seed=1000)
-    env.step(2)
-    with fails("invalid_argument", match="estimator: expected that of the running agent"):
-        make(instance=env.instance, agent="running", estimator="spatial_filter").reset(seed=1)
-    guest = make(instance=env.instance, agent="running", estimator="known_model")
-    _, info = guest.reset(options={"resume": True})
-    assert info["step"] == 1
-    guest.step(2)
-    guest.close()
-    assert env.step(3)[4]["step"] == 3
-
-
-def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
-    started = server(worlds=4)
-    flags = ["--instance", started.instance, "--world", "1", "--worlds", "3", "--prior", "initial"]
-    agent = Program("emberwatch-agent", ["serve-decisions", *flags])
-    arguments = {"instance": started.instance, "world": 1, "agent": "running"}
-    envs = make_vec(**arguments)
-    envs.reset(seed=1000)
-    decide(envs)
-    with emberwatch.Decisions(started.instance, 1) as decisions:
-        assert (decisions.worlds, decisions.info.estimator) == (range(1, 4), "known_model")
-        assert decisions.features(decisions.last()).shape == (3, 8, 26)
-        assert [made.step for made in decisions.decide([2, None, np.int64(1)])] == [2, 1, 2]
-        assert [made.objective for made in decisions.reset([7], worlds=[3])] == [2, 0, None]
-        assert [made.seed for made in decisions.last()] == [1000, 1001, 7]
-        with fails("bad_objective", match="expected 0 to 7, got 9 for world 2") as refused:
-            decisions.decide([2, 9, 2])
-        assert refused.value.detail == 8
-        with fails("malformed", match="objectives: expected 3, one a world, got 1"):
-            decisions.decide([2])
-        for wrong in (1.5, -1, "fire", True, 2**64, [0, 1]):
-            with fails("invalid_argument", match="expected one integer, 0 to"):
-                decisions.decide([2, wrong, 2])
-        with fails("invalid_argument", match="seeds: expected 3, got 2"):
-            decisions.reset([7, 8])
-        with fails("no_such_world", match="the agent has worlds 1 to 3, got 0"):
-            decisions.reset([7], worlds=[0])
-        assert [made.step for made in decisions.last()] == [2, 1, 0]
-    _, info = envs.reset(options={"resume": True})
-    assert info["step"].tolist() == [2, 1, 0]
-    envs.close()
-    for n_worlds in (2, 1):
-        other = make_vec(n_worlds, **arguments)
-        words = f"expected one of worlds 1 to {n_worlds}, got one of 1 to 3"
-        with refuses(words):
-            other.reset(seed=1000)
-    agent.stop()
-
-
-def test_another_world_has_no_agent(env: Any) -> None:
-    env.reset(seed=1000)
-    with pytest.raises(errors.NoServerError, match="no agent serves decisions of world 7"):
-        emberwatch.Decisions(env.instance, 7)
-
-
-def test_a_world_that_is_taken_over_ends_the_agent(env: Any) -> None:
-    env.reset(seed=1000)
-    with emberwatch.connect(env.instance) as client:
-        client.acquire(takeover=True)
-        with pytest.raises(errors.LeaseLostError, match="lease lost to pid"):
-            env.step(0)
-
-
-def test_a_busy_world_is_refused_with_the_agents_own_words() -> None:
-    env = environments.make().unwrapped
-    env.reset(seed=1000)
-    other = make(instance=env.instance)
-    with fails("program", match="busy: held by pid"):
-        other.reset()
 
 
 def test_beliefs_start_from_the_programs_prior() -> None:

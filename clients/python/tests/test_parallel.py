@@ -375,12 +375,13 @@ def test_private_worlds_and_vectors_have_no_single_robot() -> None:
             make_vec(2, instance=instance, robot=0)
 
 
-def test_decisions_are_for_worlds_of_one_robot() -> None:
-    words = "expected worlds of one robot, as an agent that serves decisions flies one"
+def test_options_are_for_worlds_of_one_robot() -> None:
+    words = "expected worlds of one robot, as options are planned for one"
+    with refuses("robots: expected one robot in a world, got 2"):
+        make(OBJECTIVE, robots=2)
     with serving(robots=2) as instance:
-        for keywords in ({"robots": 2}, {"instance": instance, "robot": 0}):
-            with refuses(words):
-                make(OBJECTIVE, **keywords)
+        with refuses(words):
+            make(OBJECTIVE, instance=instance, robot=0)
         with refuses(words):
             make_vec(2, OBJECTIVE, instance=instance)
 

@@ -167,7 +167,7 @@ def recorded(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
 
 
 def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
-    """All of them by name, those of an agent or of several processes at a server."""
+    """All of them by name, those of several processes at a server."""
     path = {"observation": PARTS, "truth": True, **backend}
     moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True, **backend}
     team_moves = {"observation": MOVES_PARTS, "reward": "marginal", "max_episode_steps": 300}
@@ -177,7 +177,7 @@ def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
         "wildfire, all parts": functools.partial(single, WILDFIRE, 4, T, **path),
         "moves": functools.partial(single, MOVES, 4, **backend),
         "moves, all parts": functools.partial(single, MOVES, 4, **moves),
-        "objective": functools.partial(single, OBJECTIVE, 8),
+        "objective": functools.partial(single, OBJECTIVE, 8, **backend),
         "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True, **backend),
         "team, moves": functools.partial(team, "move", 4, **team_moves),
         "members": members,
@@ -193,18 +193,17 @@ def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
         found |= {
             f"wildfire, {mode.name}": functools.partial(of_paths, **path),
             f"moves, {mode.name}": functools.partial(of_moves, **moves),
-            f"objective, {mode.name}": functools.partial(vector, OBJECTIVE, mode, 8, truth=True),
+            f"objective, {mode.name}": functools.partial(
+                vector, OBJECTIVE, mode, 8, truth=True, **backend
+            ),
         }
     return found
 
 
 EMBEDDED = cases(backend="embedded")
 
-#: Those of several processes.
-AT_A_SERVER = {"members", *(name for name in EMBEDDED if name.startswith("objective"))}
 
-
-@pytest.mark.parametrize("case", [it for it in EMBEDDED if it not in AT_A_SERVER])
+@pytest.mark.parametrize("case", [it for it in EMBEDDED if it != "members"])
 def test_embedded_worlds_return_the_recorded_bytes(case: str) -> None:
     assert digests(EMBEDDED[case]()) == json.loads(FILE.read_text())[case]
 

@@ -15,7 +15,6 @@ from environments import (
     OBJECTIVE,
     WILDFIRE,
     actions,
-    agent_pid,
     assert_same,
     make,
     make_vec,
@@ -156,7 +155,7 @@ def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: s
         assert assert_same_steps(ours, theirs, 32 if name == MOVES else 8) > 4
         with emberwatch.connect(one) as client:
             holders = [world.holder_pids for world in client.status().worlds]
-        pid = agent_pid(ours) if name == OBJECTIVE else os.getpid()
+        pid = os.getpid()
         assert holders == [(None,), (None,), (pid,), (pid,), (pid,)]
 
 

@@ -100,7 +100,8 @@ def test_a_result_is_laid_out_as_documented(name: str) -> None:
 
 def test_every_status_has_a_refusal_with_its_name_and_code() -> None:
     rows = [(row[0], int(row[1])) for row in document.table("| status | code |")]
-    named = [(name, status) for status, (name, _) in enumerate(errors.STATUSES, start=1)]
+    known = enumerate(errors.STATUSES, start=1)
+    named = [(known_as[0], status) for status, known_as in known if known_as is not None]
     assert rows == [("ok", 0), *named]
     for name, status in named:
         error = errors.refusal(status, 7)

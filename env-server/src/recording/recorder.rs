@@ -8,6 +8,7 @@ use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::{ChannelError, FRAME_BUFFER, Instance};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::message::{FrameHeader, TruthHeader};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::recording::{Event, Record, RecordingError, Totals, Writer};
@@ -323,9 +324,8 @@ impl Writing {
         let (queue, records) = channel();
         let n_queued_bytes = Arc::new(AtomicUsize::new(0));
         let counter = n_queued_bytes.clone();
-        let thread = std::thread::Builder::new()
-            .name("writer".into())
-            .spawn(move || write(writer, &records, &counter))?;
+        let thread = spawn("writer", move || write(writer, &records, &counter));
+        let thread = thread.map_err(Error::other)?;
         Ok(Self {
             queue,
             n_queued_bytes,

@@ -1,7 +1,7 @@
 //! Results of work on other threads, and a descriptor that wakes the server's loop for them.
 
+use emberwatch_protocol::channels::{ChannelError, call_error};
 use rustix::event::{EventfdFlags, eventfd};
-use rustix::io::Errno;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -20,8 +20,12 @@ pub struct CompletionSender<T> {
 }
 
 /// Both ends.
-pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), Errno> {
-    let signal = Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?);
+///
+/// # Errors
+/// If the system gives no descriptor.
+pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), ChannelError> {
+    let signal = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
+    let signal = Arc::new(signal.map_err(|errno| call_error("eventfd2", errno))?);
     let (sender, results) = channel();
     let sender = CompletionSender {
         results: sender,

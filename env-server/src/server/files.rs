@@ -2,6 +2,7 @@
 
 use super::completions::{Completions, completions};
 use crate::snapshot::{Done, FileError, Job, WorldSpec};
+use emberwatch_protocol::limits::threads::spawn;
 use std::os::fd::BorrowedFd;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
@@ -22,7 +23,10 @@ pub struct Files {
 
 impl Files {
     /// Starts the thread.
-    pub fn start(spec: WorldSpec) -> std::io::Result<Self> {
+    ///
+    /// # Errors
+    /// If the system gives no descriptor, or starts no thread.
+    pub fn start(spec: WorldSpec) -> anyhow::Result<Self> {
         let (sender, finished) = completions()?;
         let (jobs, queue) = channel::<(u64, Job)>();
         let work = move || {
@@ -30,9 +34,7 @@ impl Files {
                 sender.send((number, job.run(&spec)));
             }
         };
-        std::thread::Builder::new()
-            .name("files".into())
-            .spawn(work)?;
+        spawn("files", work)?;
         Ok(Self {
             jobs: Some(jobs),
             n_jobs: 0,

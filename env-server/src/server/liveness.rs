@@ -2,6 +2,7 @@
 
 use crate::simulator::ClientId;
 use emberwatch_protocol::cleanup::remove_leftovers;
+use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::wait::sleep_until_readable;
@@ -73,8 +74,7 @@ impl Clients {
         let is_running = self.cleanup.as_ref().is_some_and(|it| !it.is_finished());
         if self.is_cleanup_due && !is_running {
             self.is_cleanup_due = false;
-            let thread = std::thread::Builder::new().name("cleanup".into());
-            self.cleanup = thread.spawn(clean_up).ok();
+            self.cleanup = spawn("cleanup", clean_up).ok();
         }
     }
 
@@ -95,7 +95,7 @@ impl Clients {
                     tracing::warn!(
                         pid,
                         n_unsaid,
-                        "a client cannot be watched, so its leases may outlive it: {problem}"
+                        "a client cannot be watched, so its leases may outlive it: pidfd_open: {problem}"
                     );
                 }
                 false

@@ -16,7 +16,7 @@ use emberwatch_protocol::message::{
     FrameHeader, Header, Status, StepReply, StepRequest, TruthHeader,
 };
 use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
-use emberwatch_protocol::program::node_pid;
+use emberwatch_protocol::program::{WatchedProcess, node_pid};
 use emberwatch_protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
 };
@@ -88,6 +88,7 @@ impl Ports {
 
     /// Opens ports for messages of these sizes.
     pub fn open_with(config: &PortConfig) -> Result<Self> {
+        WatchedProcess::check()?;
         check_shared_memory(config)?;
         raise_limit()?;
         once_free(|| Self::open_once(config))

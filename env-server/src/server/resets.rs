@@ -4,8 +4,8 @@
 use super::completions::{CompletionSender, Completions, completions};
 use crate::simulator::ResetJob;
 use crate::world::{Episode, Rules};
+use emberwatch_protocol::channels::ChannelError;
 use rayon::ThreadPool;
-use rustix::io::Errno;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 
@@ -19,7 +19,10 @@ pub struct Resets {
 
 impl Resets {
     /// Threads without work yet.
-    pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, Errno> {
+    ///
+    /// # Errors
+    /// If the system gives no descriptor.
+    pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, ChannelError> {
         let (sender, finished) = completions()?;
         Ok(Self {
             threads,

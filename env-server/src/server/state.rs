@@ -7,8 +7,10 @@ use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
 use crate::config::Checked;
+use crate::limits::{check_memory, n_threads, start};
 use crate::simulator::{PendingFile, PendingReply, ResetJob, Simulator, Ticket};
-use anyhow::{Context, Result};
+use crate::world::Reach;
+use anyhow::Result;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::program::WatchedProcess;
@@ -65,15 +67,17 @@ pub struct Rate {
 impl Server {
     pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self> {
         let exit_with = exit_with.map(WatchedProcess::watch).transpose()?;
+        let n_threads = n_threads(&checked.config);
+        let steps = start(ThreadPoolBuilder::new(), n_threads)?;
+        let reset_threads = start(ThreadPoolBuilder::new(), n_threads)?;
+        check_memory(&checked, n_threads)?;
         let ports = Ports::open(&checked)?;
         announce(&checked);
-        let n_threads = checked.config.threads;
         let autosave = Autosave::new(&checked)?;
-        let (simulator, resets_due) = simulator(checked)?;
+        let (simulator, resets_due) = simulator(checked, steps)?;
         let spec = simulator.spec().clone();
-        let resets = Resets::new(threads(n_threads)?, spec.rules.clone());
-        let resets = resets.context("start the threads for resets")?;
-        let files = Files::start(spec).context("start the thread for files")?;
+        let resets = Resets::new(reset_threads, spec.rules.clone())?;
+        let files = Files::start(spec)?;
         resets.start(resets_due);
         let now = Instant::now();
         Ok(Self {
@@ -191,6 +195,7 @@ fn announce(checked: &Checked) {
         seed = config.seed,
         "serving"
     );
+    announce_reach(&checked.reach);
     if checked.model.reward().iter().all(|&reward| reward == 0.0) {
         tracing::warn!(
             model = checked.model.name(),
@@ -199,11 +204,20 @@ fn announce(checked: &Checked) {
     }
 }
 
+/// Logs how many free cells robots cannot reach, and which fixed starts are closed in.
+pub fn announce_reach(reach: &Reach) {
+    if let Some(words) = reach.cut_off() {
+        tracing::info!("{words}");
+    }
+    for closed_in in &reach.closed_in {
+        tracing::warn!("{closed_in}");
+    }
+}
+
 /// The worlds, restored if there is a snapshot of them, and the resets that start the others.
-fn simulator(checked: Checked) -> Result<(Simulator, Vec<ResetJob>)> {
+fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
-    let pool = threads(checked.config.threads)?;
-    let (mut simulator, mut resets) = Simulator::new(checked, pool, token_source())?;
+    let (mut simulator, mut resets) = Simulator::new(checked, steps, token_source())?;
     if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
         tracing::info!(file = %path.display(), "restored");
         let worlds = worlds.into_iter().enumerate();
@@ -212,11 +226,6 @@ fn simulator(checked: Checked) -> Result<(Simulator, Vec<ResetJob>)> {
             .collect();
     }
     Ok((simulator, resets))
-}
-
-fn threads(n_threads: usize) -> Result<ThreadPool> {
-    let pool = ThreadPoolBuilder::new().num_threads(n_threads).build();
-    pool.with_context(|| format!("start {n_threads} threads"))
 }
 
 /// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.

@@ -5,6 +5,7 @@
 
 use anyhow::Result;
 use emberwatch_protocol::program::WatchedProcess;
+use rustix::io::Errno;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -24,8 +25,11 @@ pub struct Taken {
 
 impl Taken {
     fn is_left_over(&self) -> bool {
-        let watched = WatchedProcess::watch(self.pid);
-        watched.map_or(true, |process| process.has_ended())
+        match WatchedProcess::open(self.pid) {
+            Ok(process) => process.has_ended(),
+            // Any other error tells nothing of the process.
+            Err(errno) => errno == Errno::SRCH,
+        }
     }
 }
 

@@ -75,7 +75,14 @@ impl Beliefs {
             ));
         }
         if part.offset == 0 {
-            let bytes = Vec::with_capacity(part.length as usize);
+            let mut bytes = Vec::new();
+            let reserved = bytes.try_reserve_exact(part.length as usize);
+            reserved.map_err(|_| {
+                format!(
+                    "length: expected memory for {} bytes, got less",
+                    part.length
+                )
+            })?;
             *left = Some(StoredBelief { info, bytes });
         }
         if let Some(left) = left {

@@ -10,6 +10,7 @@ use emberwatch_protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION,
 };
 use emberwatch_protocol::path::{MoveError, check_moves};
+use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -43,7 +44,7 @@ impl Simulator {
         payload: &mut Vec<u8>,
     ) -> Stepped {
         payload.clear();
-        match self.try_step(now, client, request, body) {
+        match self.try_step(now, client, request, body, payload) {
             Ok(Granted::Waits(ticket)) => Stepped::Waits(ticket),
             Ok(Granted::Present) => Stepped::Reply(self.write_present(request, payload)),
             Ok(Granted::Past(steps)) => Stepped::Reply(self.write_past(request, steps, payload)),
@@ -57,6 +58,7 @@ impl Simulator {
         client: ClientId,
         request: &StepRequest,
         body: &'a [u8],
+        payload: &mut Vec<u8>,
     ) -> Result<Granted<'a>, Refusal> {
         if request.version != VERSION {
             return Err(Refusal::new(Status::VersionMismatch, VERSION.into()));
@@ -69,6 +71,7 @@ impl Simulator {
             Operation::Observe => {
                 check_length(body, 0)?;
                 self.check_present(&self.worlds_of(&robots))?;
+                self.reserve(&robots, request.flags, payload)?;
                 Ok(Granted::Present)
             }
             Operation::Recall => {
@@ -76,6 +79,7 @@ impl Simulator {
                 check_length(body, worlds.len() * size_of::<u64>())?;
                 self.check_present(&worlds)?;
                 self.check_kept(worlds, body)?;
+                self.reserve(&robots, request.flags, payload)?;
                 Ok(Granted::Past(body))
             }
             Operation::Step => {
@@ -84,6 +88,7 @@ impl Simulator {
                 self.check_whole(client, &robots)?;
                 self.check_ready(&robots, body)?;
                 self.check_new(client, &robots)?;
+                self.reserve(&robots, request.flags, payload)?;
                 let waiting = self.fly(now, client, request, body, coverage);
                 Ok(waiting.map_or(Granted::Present, Granted::Waits))
             }
@@ -148,6 +153,24 @@ impl Simulator {
             self.waiting_worlds.push(world);
         }
         ticket
+    }
+
+    /// Takes the memory for the answer, before anything changes.
+    fn reserve(
+        &self,
+        robots: &Range<usize>,
+        flags: u32,
+        payload: &mut Vec<u8>,
+    ) -> Result<(), Refusal> {
+        let (n_robots, n_worlds) = (robots.len(), self.worlds_of(robots).len());
+        let n_frames = match flags & FLAG_TEAM_FRAMES {
+            0 => n_robots,
+            _ => n_worlds,
+        };
+        let n_cells = self.spec.rules.shape.n_cells();
+        let n_bytes = n_worlds * WORLD_BYTES + n_robots * ROBOT_BYTES + n_frames * n_cells;
+        let reserved = payload.try_reserve_exact(n_bytes);
+        reserved.map_err(|_| Refusal::new(Status::NoMemory, n_bytes as u64))
     }
 
     /// Checks that worlds kept what steps showed.

@@ -12,6 +12,7 @@ use bincode::error::DecodeError;
 use bincode::{Decode, Encode};
 use bytemuck::AnyBitPattern;
 use emberwatch_protocol::Grid;
+use emberwatch_protocol::limits::memory::in_words;
 use emberwatch_protocol::path::path_to_bytes;
 
 /// What every snapshot begins with.
@@ -85,7 +86,14 @@ pub fn encode(
     let n_bytes: u64 = worlds.iter().map(SnapshotWorld::n_bytes).sum();
     check_size(n_bytes)?;
     let worlds: Vec<_> = worlds.iter().map(SnapshotWorld::encoded).collect();
-    let mut bytes = Vec::with_capacity(n_bytes as usize + HEADER_BYTES + settings.model.len());
+    let mut bytes = Vec::new();
+    let reserved = bytes.try_reserve(n_bytes as usize + HEADER_BYTES + settings.model.len());
+    reserved.map_err(|_| {
+        SnapshotError::Unfit(format!(
+            "expected memory for {}, got less",
+            in_words(n_bytes)
+        ))
+    })?;
     bytes.resize(HEADER_BYTES, 0);
     // Only a writer can fail, and memory does not.
     let _ = bincode::encode_into_std_write((settings, worlds), &mut bytes, FORM);

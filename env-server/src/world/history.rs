@@ -5,8 +5,8 @@ use emberwatch_protocol::Coverage;
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use std::collections::VecDeque;
 
-/// Least room for a world's frames, bytes: full frames share it, however many steps are to be kept.
-const LEAST_ROOM: usize = 1 << 20;
+/// Minimum capacity for a world's frames, bytes: whole frames share it, however many steps are to be kept.
+pub const LEAST_ROOM: usize = 1 << 20;
 
 /// The frames of consecutive steps, the last one the world's present; bounded in steps and in bytes.
 #[derive(Debug, Clone)]
@@ -16,6 +16,13 @@ pub struct History {
     room: usize,
     n_bytes: usize,
     steps: VecDeque<PastStep>,
+}
+
+/// The memory of the frames of `n_steps` steps of `n_robots` paths each, from which so many cells are seen.
+pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> usize {
+    let of_robot = size_of::<PastRobot>() + 5 * most_seen;
+    let of_step = size_of::<PastStep>() + n_robots * of_robot;
+    n_steps.saturating_mul(of_step)
 }
 
 /// What one step showed.
@@ -43,11 +50,9 @@ impl History {
     /// the present one.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
-        let of_robot = size_of::<PastRobot>() + 5 * most_seen;
-        let of_step = size_of::<PastStep>() + n_robots * of_robot;
         Self {
             n_steps,
-            room: LEAST_ROOM.max(n_steps.saturating_mul(of_step)),
+            room: LEAST_ROOM.max(bytes_of_history(n_steps, n_robots, most_seen)),
             n_bytes: 0,
             steps: VecDeque::new(),
         }

@@ -25,6 +25,14 @@ pub struct Scratch {
     rings: Vec<u8>,
 }
 
+/// The memory of a robot that flies `n_moves` moves and sees up to `most_seen` of `n_cells` cells, and of its path
+/// before that is flown.
+pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize {
+    let of_path = n_moves * (2 * size_of::<Move>() + size_of::<usize>());
+    let of_sight = most_seen * (size_of::<SeenCell>() + size_of::<usize>());
+    size_of::<Robot>() + n_cells + of_path + of_sight
+}
+
 impl Robot {
     /// A robot after a reset.
     pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {

@@ -3,6 +3,7 @@
 use super::hidden::Source;
 use super::recorded::Recorded;
 use super::sensor::Sensor;
+use super::starts::{fixed_start, random_starts};
 use emberwatch_protocol::model::ModelError;
 use emberwatch_protocol::randomness::{Purpose, stream};
 use emberwatch_protocol::task::Start;
@@ -55,7 +56,7 @@ impl Rules {
         let airspace = model.airspace(shape)?;
         Ok(Self {
             shape,
-            starts: airspace.starts().map(Arc::new),
+            starts: random_starts(&airspace).map(Arc::new),
             airspace,
             reward: model.reward().to_vec(),
             target_state: model.target_state() as u8,
@@ -96,64 +97,19 @@ impl Rules {
         })
     }
 
-    /// Most cells that a robot sees in a step.
+    /// The maximum number of cells that a robot sees in a step.
     pub(super) fn most_seen(&self) -> usize {
-        match self.airspace.radius() {
-            0 => self.n_moves,
-            radius => {
-                let side = 2 * radius + 1;
-                (side * (self.n_moves + side)).min(self.shape.n_cells())
-            }
-        }
+        most_seen(self.airspace.radius(), self.n_moves, self.shape.n_cells())
     }
 }
 
-/// Where a robot starts, unless that is random.
-fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Cell> {
-    match start {
-        Start::Corner => Some(corner_or_side(shape, robot)),
-        Start::Centre => Some(shape.centre()),
-        Start::Random => None,
-        Start::At(cell) => Some(cell),
-    }
-}
-
-/// Checks that so many robots can start in an airspace and leave their start.
-///
-/// # Errors
-/// What was expected of the start, and what was got.
-pub fn check_start(start: Start, airspace: &Airspace, n_robots: usize) -> Result<(), [String; 2]> {
-    if airspace.starts().is_some_and(|starts| starts.is_empty()) {
-        let got = "a no-fly map that leaves none".into();
-        return Err(["a cell that robots can leave".into(), got]);
-    }
-    let places = (0..n_robots).filter_map(|robot| fixed_start(start, airspace.shape(), robot));
-    for cell in places.filter(|_| !airspace.is_open()) {
-        if !airspace.is_free(cell) {
-            let got = format!("{cell}, a no-fly cell");
-            return Err(["a cell where robots may be".into(), got]);
-        }
-        if !airspace.has_way_out(cell) {
-            let got = format!("{cell}, which no-fly cells cut off");
-            return Err(["a cell that robots can leave".into(), got]);
+/// The maximum number of cells that a robot sees from a path, with a sensor of this radius.
+pub fn most_seen(radius: usize, n_moves: usize, n_cells: usize) -> usize {
+    match radius {
+        0 => n_moves,
+        radius => {
+            let side = 2 * radius + 1;
+            (side * (n_moves + side)).min(n_cells)
         }
     }
-    Ok(())
-}
-
-/// A place at the edge, another one for each of eight robots.
-fn corner_or_side(shape: Shape, robot: usize) -> Cell {
-    let (bottom, right) = (shape.height() - 1, shape.width() - 1);
-    let places = [
-        (0, 0),
-        (bottom, right),
-        (0, right),
-        (bottom, 0),
-        (0, right / 2),
-        (bottom, right / 2),
-        (bottom / 2, 0),
-        (bottom / 2, right),
-    ];
-    let (row, col) = places[robot % places.len()];
-    Cell { row, col }
 }

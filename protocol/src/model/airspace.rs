@@ -125,15 +125,6 @@ impl Airspace {
         Move::ALL.iter().any(|step| self.after(*step, cell) != cell)
     }
 
-    /// The cells where a random start may be, by row-major index: those that a robot can leave, perhaps none. `None` if
-    /// there are no no-fly cells: then it may be anywhere.
-    pub fn starts(&self) -> Option<Vec<usize>> {
-        self.no_fly.as_ref()?;
-        let cells = (0..self.shape.n_cells()).map(|index| (index, self.shape.cell(index)));
-        let free = cells.filter(|(_, cell)| self.is_free(*cell) && self.has_way_out(*cell));
-        Some(free.map(|(index, _)| index).collect())
-    }
-
     /// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, unless that is off the grid or a no-fly cell).
     pub fn fly(&self, start: Cell, path: &[Move]) -> Flight {
         let mut visited = Vec::new();

@@ -90,6 +90,13 @@ impl Dynamics {
         })
     }
 
+    /// The memory of the work space of a model on a grid, which each clone has, bytes.
+    pub fn n_bytes(model: &Model, shape: Shape) -> usize {
+        let (n_places, n_homes) = Places::lengths(model, shape);
+        let in_band = n_homes.min(BAND);
+        n_places + n_homes + (2 * in_band + LANES) * size_of::<u32>()
+    }
+
     /// The states at step 0 of a world: each cell drawn from the model's initial distribution.
     pub fn initial(&self, seed: u64) -> Grid<u8> {
         let mut rng = stream(seed, Purpose::Initial, 0);

@@ -21,7 +21,7 @@ pub use super::channel_files::lives_elsewhere;
 pub use super::directory::{Entries, SHARED_MEMORY, channel_directory, node_config};
 pub use super::error::{ChannelError, Ipc};
 pub use super::node::create_node;
-pub use super::resources::{check_room, ipc_error, limited_error};
+pub use super::resources::{call_error, check_room, ipc_error, limited_error};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
@@ -62,7 +62,7 @@ pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8
 /// The `step` service.
 pub type StepService = RequestResponse<StepRequest, StepReply>;
 
-/// A service of JSON messages: `control`, or the decisions of a world.
+/// The `control` service.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
 /// The `frames` service.
@@ -98,10 +98,6 @@ pub enum Channel {
     WakeServer,
     /// Wakes clients, event.
     WakeClient,
-    /// Decisions for a world, answered by its agent, request-response.
-    Decisions(u32),
-    /// Wakes the agent that answers a world's decisions, event.
-    WakeAgent(u32),
 }
 
 impl Instance {
@@ -145,36 +141,23 @@ impl Instance {
 
     /// The error for a channel that does not exist in this version of the protocol.
     fn none_of(&self, channel: Channel) -> ChannelError {
-        match other_version(&self.0, &channel.name()) {
+        match other_version(&self.0, channel.name()) {
             Some(version) => ChannelError::OtherVersion { version },
-            None => self.no_server_of(channel),
-        }
-    }
-
-    /// The error for a channel without a server port.
-    fn no_server_of(&self, channel: Channel) -> ChannelError {
-        match channel {
-            Channel::Decisions(world) => ChannelError::NoAgent {
-                instance: self.0.clone(),
-                world,
-            },
-            _ => self.no_server(),
+            None => self.no_server(),
         }
     }
 }
 
 impl Channel {
-    fn name(self) -> String {
+    fn name(self) -> &'static str {
         match self {
-            Self::Step => "step".into(),
-            Self::Control => "control".into(),
-            Self::Frames => "frames".into(),
-            Self::Truth => "truth".into(),
-            Self::Agent => "agent".into(),
-            Self::WakeServer => "wake-server".into(),
-            Self::WakeClient => "wake-client".into(),
-            Self::Decisions(world) => format!("decisions-{world}"),
-            Self::WakeAgent(world) => format!("wake-agent-{world}"),
+            Self::Step => "step",
+            Self::Control => "control",
+            Self::Frames => "frames",
+            Self::Truth => "truth",
+            Self::Agent => "agent",
+            Self::WakeServer => "wake-server",
+            Self::WakeClient => "wake-client",
         }
     }
 }
@@ -218,22 +201,6 @@ impl Services<'_> {
     /// If there is none.
     pub fn open_control(&self) -> Result<ControlService, ChannelError> {
         self.open(Channel::Control)
-    }
-
-    /// The service of a world's decisions, created if need be; for the agent.
-    ///
-    /// # Errors
-    /// As [`Self::create_step`].
-    pub(crate) fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
-        self.create(Channel::Decisions(world))
-    }
-
-    /// The service of a world's decisions, which a running agent answers.
-    ///
-    /// # Errors
-    /// If there is none.
-    pub fn open_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
-        self.open(Channel::Decisions(world))
     }
 
     /// The `frames` service; observers may create it before the server starts.
@@ -353,7 +320,7 @@ impl Services<'_> {
         if service.dynamic_config().number_of_servers() > 0 {
             Ok(service)
         } else {
-            Err(self.instance.no_server_of(channel))
+            Err(self.instance.no_server())
         }
     }
 

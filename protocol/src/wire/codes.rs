@@ -1,5 +1,6 @@
 //! The numbers of the binary messages: version, operations, flags, status codes.
 
+use crate::limits::memory::in_words;
 use thiserror::Error;
 
 /// Version of the protocol.
@@ -72,10 +73,6 @@ pub enum Status {
     NotPermitted = 13,
     /// A flag that the server does not know; detail: the flags received.
     UnknownFlags = 14,
-    /// Not an objective of the agent's; detail: number of objectives.
-    BadObjective = 15,
-    /// The agent that was asked ends: it was asked to, or it failed; detail: 0.
-    AgentEnds = 16,
     /// A file that cannot be read or written, or is refused; detail: 0.
     BadFile = 17,
     /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
@@ -90,13 +87,13 @@ pub enum Status {
     Incomplete = 21,
     /// A robot outside the server's; detail: number of robots of all worlds.
     NoSuchRobot = 22,
-    /// There is too little shared memory for the answer; detail: 0.
+    /// There is too little memory for the answer; detail: bytes of a step's answer, or 0 if it is shared memory.
     NoMemory = 23,
 }
 
 impl Status {
     /// Every status, in the order of its code.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 22] = [
         Self::Ok,
         Self::VersionMismatch,
         Self::UnknownOperation,
@@ -112,8 +109,6 @@ impl Status {
         Self::EpisodeOver,
         Self::NotPermitted,
         Self::UnknownFlags,
-        Self::BadObjective,
-        Self::AgentEnds,
         Self::BadFile,
         Self::NotKept,
         Self::Late,
@@ -141,7 +136,7 @@ impl Status {
             }
             Self::Malformed => "malformed control message".into(),
             Self::NoSuchWorld => format!(
-                "no such world: the server has worlds 0 to {}",
+                "no such world: the server has worlds 0 to {}; start it with --worlds N for more",
                 detail.saturating_sub(1)
             ),
             Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
@@ -171,8 +166,6 @@ impl Status {
             Self::UnknownFlags => {
                 format!("flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}")
             }
-            Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
-            Self::AgentEnds => "the agent ends".into(),
             Self::BadFile => "the file cannot be used".into(),
             Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
             Self::Late => format!(
@@ -183,9 +176,16 @@ impl Status {
                 "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
                  a step of several worlds needs them all"
             ),
-            Self::NoMemory => "shared memory is full: free some, and ask again".into(),
+            Self::NoMemory if detail == 0 => {
+                "shared memory is full: free some, and ask again".into()
+            }
+            Self::NoMemory => format!(
+                "memory: expected {} for the answer, got less; ask for fewer robots at a time",
+                in_words(detail)
+            ),
             Self::NoSuchRobot => format!(
-                "no such robot: the server has robots 0 to {}",
+                "no such robot: the server has robots 0 to {}; start it with --worlds N for more worlds, or --robots N \
+                 for more in each",
                 detail.saturating_sub(1)
             ),
         }
@@ -196,7 +196,7 @@ impl TryFrom<u32> for Status {
     type Error = UnknownCode;
 
     fn try_from(value: u32) -> Result<Self, UnknownCode> {
-        let known = Self::ALL.get(value as usize).copied();
+        let known = Self::ALL.into_iter().find(|&it| it as u32 == value);
         known.ok_or(UnknownCode {
             what: "status",
             value,
@@ -226,15 +226,16 @@ mod tests {
 
     #[test]
     fn status_codes_survive_the_wire() {
-        for (code, status) in Status::ALL.into_iter().enumerate() {
-            assert_eq!(status as usize, code);
-            assert_eq!(Status::try_from(code as u32), Ok(status));
+        for status in Status::ALL {
+            assert_eq!(Status::try_from(status as u32), Ok(status));
             for detail in [0, 1, u64::MAX] {
                 assert!(!status.explain(detail).is_empty());
             }
         }
-        let (what, value) = ("status", Status::ALL.len() as u32);
-        assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
+        for value in [15, 16, 24] {
+            let what = "status";
+            assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
+        }
         for value in [0, 4, u32::MAX] {
             let what = "operation";
             assert_eq!(Operation::try_from(value), Err(UnknownCode { what, value }));

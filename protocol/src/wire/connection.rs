@@ -2,14 +2,13 @@
 //!
 //! Nothing returned points into shared memory.
 
-use super::channels::{
-    Channel, Entries, Instance, Ipc, Services, StepService, create_node, limited_error,
-};
+use super::channels::{Entries, Instance, Ipc, Services, StepService, create_node, limited_error};
 use super::control::{Reply, Request, ServerInfo};
-use super::exchange::{check_answer, garbled};
+use super::exchange::{check_answer, copied, garbled};
 use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
 use super::node::Opened;
 use super::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
+use super::resources::{CLIENT_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::texts::TextPort;
 use super::turn::Turn;
@@ -45,6 +44,8 @@ type StepClient = Client<Ipc, [u8], StepRequest, [u8], StepReply>;
 
 struct Ports {
     step: Option<StepClient>,
+    /// One of the entries: if it were closed before the ports, these would look like another program's.
+    step_service: StepService,
     texts: TextPort,
 }
 
@@ -60,7 +61,7 @@ impl Connection {
     ) -> Result<Self, ConnectionError> {
         let start = Instant::now();
         let left = || timeout.saturating_sub(start.elapsed());
-        let (mut ports, step) = Self::open_ports(instance, left())?;
+        let mut ports = Self::open_ports(instance, left())?;
         let hello = ports.texts.shake_hands(client, left())?;
         let info = match parse("hello", &hello)? {
             Reply::Hello(info) => *info,
@@ -69,8 +70,8 @@ impl Connection {
         let of_world = size_of::<u64>() + info.n_robots as usize * info.n_moves;
         let longest = info.n_worlds as usize * of_world;
         let _turn = Turn::take_within(left())?;
-        let step = step.client_builder().initial_max_slice_len(longest.max(1));
-        let step = step.create();
+        let step = ports.step_service.client_builder();
+        let step = step.initial_max_slice_len(longest.max(1)).create();
         ports.step = Some(step.map_err(limited_error("create a step client", "16 clients"))?);
         fill_ports(&ports.texts.exchange.node, true)?;
         Ok(Self {
@@ -81,11 +82,9 @@ impl Connection {
     }
 
     /// All ports but that for steps, whose size the server tells.
-    fn open_ports(
-        instance: &Instance,
-        limit: Duration,
-    ) -> Result<(Opened<Ports>, StepService), ConnectionError> {
+    fn open_ports(instance: &Instance, limit: Duration) -> Result<Opened<Ports>, ConnectionError> {
         let _turn = Turn::take_within(limit)?; // declared first: what fails below is dropped within it
+        check_descriptors("connect", CLIENT_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
             node: &node,
@@ -93,12 +92,16 @@ impl Connection {
         };
         let control = services.open_control()?;
         let step_service = services.open_step()?;
-        let texts = TextPort::create(node, instance, &control, Channel::WakeServer)?;
+        let texts = TextPort::create(node, instance, &control)?;
         let node = &texts.exchange.node;
         fill_ports(node, true)?;
         let entries = Entries::of(node)?;
-        let ports = Ports { step: None, texts };
-        Ok((Opened::new(entries, ports), step_service))
+        let ports = Ports {
+            step: None,
+            step_service,
+            texts,
+        };
+        Ok(Opened::new(entries, ports))
     }
 
     /// What the server said of itself.
@@ -193,8 +196,9 @@ impl Connection {
             listener_high,
             ..request
         };
-        let copy = |reply: &StepReply, payload: &[u8]| (*reply, payload.to_vec());
+        let copy = |reply: &StepReply, payload: &[u8]| (*reply, copied(WHAT, payload));
         let (reply, payload) = exchange.request(step, header, body, WHAT, timeout, copy)?;
+        let payload = payload?;
         check_status(WHAT, reply.status, reply.detail, None)?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         check_asked(&self.info, &request, &reply)?;

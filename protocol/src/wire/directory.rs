@@ -1,7 +1,7 @@
 //! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
 
 use super::error::{ChannelError, Ipc};
-use super::resources::{REMEDY, ipc_error, no_descriptors};
+use super::resources::{CLIENT_DESCRIPTORS, REMEDY, ipc_error, no_descriptors};
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 use rustix::io::Errno;
@@ -125,7 +125,7 @@ pub(crate) fn prefix() -> String {
 /// The error of a file or folder that the system does not let be used.
 pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
     if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) {
-        return no_descriptors("use the channel directory");
+        return no_descriptors("use the channel directory", CLIENT_DESCRIPTORS);
     }
     directory_error(
         path,

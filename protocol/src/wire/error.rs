@@ -52,17 +52,6 @@ pub enum ChannelError {
         /// What the server speaks.
         version: u32,
     },
-    /// No agent takes decisions for the world.
-    #[error(
-        "no agent serves decisions of world {world} on instance {instance:?}: start one with \
-         `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
-    )]
-    NoAgent {
-        /// Name of the instance.
-        instance: String,
-        /// The world that has no agent.
-        world: u32,
-    },
     /// Its server is in another PID namespace, where process ids mean other processes.
     #[error(
         "instance {instance:?} is served from another PID namespace: run both programs in one (docker: \
@@ -99,6 +88,17 @@ pub enum ChannelError {
         needed: usize,
         /// How many the process may have.
         limit: String,
+    },
+    /// The system refuses a call that channels need, as a container's seccomp profile does.
+    #[error(
+        "{call}: expected the system to allow this call, got: {problem}; allow it in the seccomp profile of the container \
+         (docker: --security-opt seccomp=PROFILE), or use a newer kernel if it lacks the call"
+    )]
+    RefusedCall {
+        /// The system call.
+        call: &'static str,
+        /// The system's words.
+        problem: String,
     },
     /// The check of [`super::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]

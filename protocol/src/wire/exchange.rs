@@ -8,6 +8,7 @@ use super::interrupt::check_interrupt;
 use super::message::{Header, Status, VERSION};
 use super::process::WatchedProcess;
 use super::wait::{Waiter, descriptor, drain, sleep_until_readable};
+use crate::limits::memory::{NoMemory, with_capacity};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
@@ -29,11 +30,12 @@ pub enum ConnectionError {
     /// The channel could not be used.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The server, or the agent asked for decisions, ended while, or before, it was asked.
-    #[error("the {who} on instance {instance:?} is gone")]
+    /// There is too little memory for the answer, which has come.
+    #[error(transparent)]
+    Memory(#[from] NoMemory),
+    /// The server ended while, or before, it was asked.
+    #[error("the server on instance {instance:?} is gone")]
     ServerGone {
-        /// "server" or "agent".
-        who: &'static str,
         /// Name of the instance.
         instance: String,
     },
@@ -69,7 +71,6 @@ pub enum ConnectionError {
 
 /// What a request and its answer need: both ends of waking, and the server's process.
 pub(super) struct Exchange {
-    pub(super) who: &'static str,
     pub(super) instance: Instance,
     pub(super) server: Notifier<Ipc>,
     pub(super) listener: Listener<Ipc>,
@@ -147,7 +148,6 @@ impl Exchange {
     pub(super) fn server_gone(&self) -> ConnectionError {
         let _ = remove_leftovers(); // Else the next program removes them.
         ConnectionError::ServerGone {
-            who: self.who,
             instance: self.instance.name().into(),
         }
     }
@@ -223,6 +223,13 @@ pub(super) fn check_answer(
         return Ok(());
     };
     Err(garbled(what, problem))
+}
+
+/// A copy of an answer's payload.
+pub(super) fn copied(what: &str, payload: &[u8]) -> Result<Vec<u8>, NoMemory> {
+    let mut copy = with_capacity(format_args!("the answer to {what}"), payload.len())?;
+    copy.extend_from_slice(payload);
+    Ok(copy)
 }
 
 /// The error of an answer that makes no sense.

@@ -1,6 +1,6 @@
 //! Connections that could not be opened, for example as no file descriptors are left: their clients get no answer.
 
-use super::resources::free_descriptors;
+use super::resources::{SERVER_DESCRIPTORS, free_descriptors};
 use crate::throttle::Throttle;
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationFn, DegradationInfo};
 use rustix::process::{Resource, getrlimit};
@@ -37,7 +37,7 @@ impl FailedConnections {
         if self.count.swap(0, Ordering::Relaxed) == 0 {
             return;
         }
-        let Err(problem) = free_descriptors() else {
+        let Err(problem) = free_descriptors(SERVER_DESCRIPTORS) else {
             return;
         };
         if let Some(n_unsaid) = self.warnings.borrow_mut().pass(now) {

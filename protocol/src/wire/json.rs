@@ -1,4 +1,4 @@
-//! Reads requests in JSON, of `control` and of a world's decisions.
+//! Reads requests in JSON, of `control`.
 
 use super::codes::Status;
 use serde::de::DeserializeOwned;

@@ -7,6 +7,7 @@ use super::channels::{
 use super::interrupt::check_interrupt;
 use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use super::node::Opened;
+use super::resources::{OBSERVER_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::turn::Turn;
 use iceoryx2::node::Node;
@@ -104,6 +105,7 @@ impl<H: Header> Observer<H> {
         is_of_server: bool,
     ) -> Result<Self, ChannelError> {
         let _turn = Turn::take()?;
+        check_descriptors("observe an instance", OBSERVER_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
             node: &node,

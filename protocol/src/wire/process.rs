@@ -1,8 +1,10 @@
 //! Other processes: whether they run, and a descriptor that tells when they end.
 
+use super::error::ChannelError;
 use super::poll::is_readable;
+use super::resources::call_error;
 use rustix::io::Errno;
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::process::{Pid, PidfdFlags, getpid, pidfd_open};
 use std::io::{Error, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
@@ -10,12 +12,23 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 #[derive(Debug)]
 pub struct WatchedProcess(OwnedFd);
 
-/// The process to end with does not run.
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
-#[error("--exit-with {pid}: expected a running process, got {errno}")]
-pub struct NotRunning {
-    pid: i32,
-    errno: Errno,
+/// The process to end with does not run, or cannot be watched.
+#[derive(Debug, thiserror::Error)]
+pub enum NotWatched {
+    /// There is no such process.
+    #[error("--exit-with {pid}: expected a running process, got none of this number")]
+    NotRunning {
+        /// Its number.
+        pid: i32,
+    },
+    /// The system does not allow it.
+    #[error("--exit-with {pid}: {problem}")]
+    Refused {
+        /// Its number.
+        pid: i32,
+        /// The call, and what to do.
+        problem: ChannelError,
+    },
 }
 
 impl WatchedProcess {
@@ -31,9 +44,25 @@ impl WatchedProcess {
     /// Watches the process that `--exit-with` names.
     ///
     /// # Errors
-    /// If it does not run.
-    pub fn watch(pid: i32) -> Result<Self, NotRunning> {
-        Self::open(pid).map_err(|errno| NotRunning { pid, errno })
+    /// If it does not run, or the system refuses to tell when it ends.
+    pub fn watch(pid: i32) -> Result<Self, NotWatched> {
+        Self::open(pid).map_err(|errno| match errno {
+            Errno::SRCH | Errno::INVAL => NotWatched::NotRunning { pid },
+            errno => NotWatched::Refused {
+                pid,
+                problem: watch_error(errno),
+            },
+        })
+    }
+
+    /// Checks that this process may watch others: without that, nobody notices when one dies.
+    ///
+    /// # Errors
+    /// If the system refuses it.
+    pub fn check() -> Result<(), ChannelError> {
+        Self::open(getpid().as_raw_nonzero().get())
+            .map(drop)
+            .map_err(watch_error)
     }
 
     /// Readable when it has ended.
@@ -45,6 +74,11 @@ impl WatchedProcess {
     pub fn has_ended(&self) -> bool {
         is_readable(self.descriptor())
     }
+}
+
+/// The error of a process that cannot be watched, though it may run.
+pub(super) fn watch_error(errno: Errno) -> ChannelError {
+    call_error("pidfd_open", errno)
 }
 
 /// The PID namespace of this process, by its number; `None` if the system does not say.

@@ -1,4 +1,4 @@
-//! A recording: what a server published, in a file. PROTOCOL.md section 14 has its byte tables.
+//! A recording: what a server published, in a file. PROTOCOL.md section 13 has its byte tables.
 //!
 //! A file begins with a [`FileHeader`]; records follow, each a [`RecordHeader`] and a compressed body,
 //! and the last one says how many there are. So a file itself shows what it lacks: samples that the

@@ -2,12 +2,14 @@
 //! all the same, the error names what is missing.
 
 use super::error::ChannelError;
+use crate::limits::memory::in_words;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::statvfs;
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 use std::fmt::Debug;
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixDatagram;
 
 /// Where iceoryx2 keeps shared memory: a folder that every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -21,8 +23,17 @@ const PORT_BYTES: u64 = 512 << 10;
 /// The files of these: 25 (measured).
 const PORT_FILES: u64 = 48;
 
-/// Their descriptors.
-const PORT_DESCRIPTORS: usize = 10;
+/// File descriptors of a connection to a server, or to an agent: 31, and one for a moment (measured).
+pub(super) const CLIENT_DESCRIPTORS: usize = 33;
+
+/// File descriptors of an observer: 9, and 3 for a moment (measured).
+pub(super) const OBSERVER_DESCRIPTORS: usize = 12;
+
+/// File descriptors that a server takes for one more client.
+pub(super) const SERVER_DESCRIPTORS: usize = 10;
+
+/// With fewer free descriptors, their lack is the likely reason why iceoryx2 fails.
+const FEW_DESCRIPTORS: usize = 10;
 
 /// Checks that there is room for the ports of a connection, and for a message of them.
 ///
@@ -81,14 +92,6 @@ pub(super) fn no_room<T>(problem: String) -> Result<T, ChannelError> {
     Err(ChannelError::NoRoom { problem })
 }
 
-/// A number of bytes, rounded to the next KiB or MiB.
-pub(super) fn in_words(n_bytes: u64) -> String {
-    match n_bytes >> 20 {
-        0..10 => format!("{} KiB", n_bytes.div_ceil(1 << 10)),
-        _ => format!("{} MiB", n_bytes.div_ceil(1 << 20)),
-    }
-}
-
 /// Adds context to an error of iceoryx2, whose cause is asked of the system where iceoryx2 does not tell it.
 pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
     limited_error(what, "64 processes")
@@ -104,33 +107,58 @@ pub fn limited_error<E: Debug>(
         if problem.contains("ExceedsMaxSupported") || problem.contains("ExceedsMaxNumberOf") {
             return ChannelError::NoPlace { what, most };
         }
-        let no_descriptors = check_descriptors(what).err();
-        no_descriptors
+        let has_few = free_descriptors(FEW_DESCRIPTORS).is_err();
+        has_few
+            .then(|| no_descriptors(what, CLIENT_DESCRIPTORS))
             .or_else(|| check_room_for_ports(0).err())
+            .or_else(|| check_sockets().err())
             .unwrap_or(ChannelError::Ipc { what, problem })
     }
 }
 
-/// Checks that descriptors are left for the ports of a connection.
-fn check_descriptors(what: &'static str) -> Result<(), ChannelError> {
-    free_descriptors().map_err(|_| no_descriptors(what))
+/// Checks that the system gives sockets, which wake other processes.
+fn check_sockets() -> Result<(), ChannelError> {
+    let socket = UnixDatagram::unbound();
+    let errno = socket.err().and_then(|error| Errno::from_io_error(&error));
+    errno.map_or(Ok(()), |errno| Err(call_error("socket (AF_UNIX)", errno)))
+}
+
+/// Checks that so many descriptors are free, before any of them is used: what iceoryx2 began and could not finish may stay
+/// open.
+pub(super) fn check_descriptors(what: &'static str, needed: usize) -> Result<(), ChannelError> {
+    free_descriptors(needed).map_err(|_| no_descriptors(what, needed))
+}
+
+/// The error of a system call that does not depend on a file.
+pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
+    match errno {
+        Errno::MFILE | Errno::NFILE => no_descriptors(call, CLIENT_DESCRIPTORS),
+        errno => ChannelError::RefusedCall {
+            call,
+            problem: errno.to_string(),
+        },
+    }
 }
 
 /// The error of a process that may open no more files.
-pub(super) fn no_descriptors(what: &'static str) -> ChannelError {
+pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError {
     let limit = getrlimit(Resource::Nofile).current;
     ChannelError::NoDescriptors {
         what,
-        needed: PORT_DESCRIPTORS,
+        needed,
         limit: limit.map_or("the system".into(), |n| n.to_string()),
     }
 }
 
-/// Opens as many descriptors as the ports of a connection take, and closes them again.
+/// Opens so many descriptors and closes them again.
 ///
 /// # Errors
 /// The system's, if there are not as many.
-pub(super) fn free_descriptors() -> Result<(), Errno> {
-    let opened = (0..PORT_DESCRIPTORS).map(|_| eventfd(0, EventfdFlags::CLOEXEC));
-    opened.collect::<Result<Vec<OwnedFd>, Errno>>().map(drop)
+pub(super) fn free_descriptors(n: usize) -> Result<(), Errno> {
+    let opened = (0..n).map(|_| eventfd(0, EventfdFlags::CLOEXEC));
+    match opened.collect::<Result<Vec<OwnedFd>, Errno>>() {
+        Err(errno @ (Errno::MFILE | Errno::NFILE)) => Err(errno),
+        // Where the call is refused, nothing is known.
+        _ => Ok(()),
+    }
 }

@@ -1,34 +1,23 @@
 //! The answering side of a request channel: take a request, send its answer, wake its client.
 //!
-//! The server uses [`Answers`] on each of its channels; an agent uses a [`Responder`] for the decisions of a world.
+//! The server uses [`Answers`] on each of its channels.
 
-use super::channel_files::lives_elsewhere;
 use super::channels::{
-    Channel, ChannelError, ControlService, Entries, Instance, Ipc, RequestResponse, Services,
-    create_node, ipc_error, server_node,
+    Channel, ChannelError, ControlService, Ipc, RequestResponse, Services, ipc_error, server_node,
 };
 use super::control::Reply;
 use super::failed_connections::FailedConnections;
 use super::message::{ControlReply, ControlRequest, Header, Status, VERSION};
-use super::node::Opened;
-use super::process::node_pid;
 use super::resources::check_room_for_ports;
-use super::shared_memory::fill_ports;
-use super::turn::Turn;
-use super::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
-use iceoryx2::node::Node;
 use iceoryx2::port::ReceiveError;
-use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::{ListenerKey, Notifier};
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use serde::Serialize;
 use std::collections::HashMap;
-use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Length that answers in JSON may have before their segment grows, bytes.
 pub const JSON_SLICE: usize = 16_384;
@@ -53,43 +42,6 @@ pub type ControlServer = Server<Ipc, [u8], ControlRequest, [u8], ControlReply>;
 pub struct Answers {
     notifier: Notifier<Ipc>,
     listeners: HashMap<u128, ListenerKey>,
-}
-
-/// The answering port for the decisions of a world.
-#[derive(Debug)]
-pub struct Responder {
-    ports: Opened<Ports>,
-    failed_connections: FailedConnections,
-}
-
-#[derive(Debug)]
-struct Ports {
-    server: ControlServer,
-    answers: Answers,
-    listener: Listener<Ipc>,
-    _node: Node<Ipc>,
-}
-
-/// Why decisions cannot be answered.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ResponderError {
-    /// Another agent answers them.
-    #[error(
-        "decisions of world {world} on instance {instance:?} are served already, by pid {pid}: \
-         shut it down first"
-    )]
-    Taken {
-        /// Name of the instance.
-        instance: String,
-        /// The world whose decisions it answers.
-        world: u32,
-        /// The other agent's process.
-        pid: i32,
-    },
-    /// A channel could not be made.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
 }
 
 impl Answers {
@@ -173,74 +125,6 @@ impl Answers {
             let _ = one.notify();
             CallbackProgression::Stop
         });
-    }
-}
-
-impl Responder {
-    /// Opens the answering port of a world's decisions.
-    ///
-    /// # Errors
-    /// If another agent has it, or it cannot be made.
-    pub fn open(instance: &Instance, world: u32) -> Result<Self, ResponderError> {
-        let _turn = Turn::take()?;
-        let node = create_node()?;
-        let services = Services {
-            node: &node,
-            instance,
-        };
-        let service = services.create_decisions(world)?;
-        let failed_connections = FailedConnections::default();
-        let server =
-            control_server(&service, &failed_connections).map_err(|error| {
-                match port_owner(&service, &error) {
-                    Some(node) if lives_elsewhere(node) => instance.elsewhere().into(),
-                    Some(node) => ResponderError::Taken {
-                        instance: instance.name().into(),
-                        world,
-                        pid: node_pid(node),
-                    },
-                    None => ipc_error("create a server")(error).into(),
-                }
-            })?;
-        let listener = services.listener(Channel::WakeAgent(world))?;
-        let answers = Answers::new(&services)?;
-        fill_ports(&node, true)?;
-        let entries = Entries::of(&node)?;
-        let ports = Ports {
-            server,
-            answers,
-            listener,
-            _node: node,
-        };
-        Ok(Self {
-            ports: Opened::new(entries, ports),
-            failed_connections,
-        })
-    }
-
-    /// The next request.
-    pub fn receive(&self) -> Option<ActiveControl> {
-        let request = received(self.ports.server.receive(), &self.failed_connections);
-        self.failed_connections.warn(Instant::now());
-        request
-    }
-
-    /// Answers a request.
-    pub fn answer(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
-        self.ports.answers.send_json(request, status, reply);
-    }
-
-    /// Drops wake-ups; returns whether there were any.
-    ///
-    /// # Errors
-    /// If iceoryx2 cannot read them.
-    pub fn drain(&self) -> Result<bool, ChannelError> {
-        drain(&self.ports.listener)
-    }
-
-    /// Readable while there are wake-ups.
-    pub fn descriptor(&self) -> BorrowedFd<'_> {
-        descriptor(&self.ports.listener)
     }
 }
 

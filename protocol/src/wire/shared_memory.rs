@@ -4,7 +4,8 @@
 use super::channel_files::ChannelFiles;
 use super::directory::{directory_error, not_usable};
 use super::error::{ChannelError, Ipc};
-use super::resources::{REMEDY, SHARED_MEMORY, check_free, in_words, no_room};
+use super::resources::{REMEDY, SHARED_MEMORY, call_error, check_free, no_room};
+use crate::limits::memory::in_words;
 use iceoryx2::node::Node;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
@@ -124,6 +125,9 @@ fn fill(path: &Path, file: &File, n_bytes: u64) -> Result<(), ChannelError> {
                 return no_room(format!(
                     "expected {needed} in {SHARED_MEMORY}, got: {errno}; {REMEDY}"
                 ));
+            }
+            Err(errno @ (Errno::PERM | Errno::ACCESS | Errno::NOSYS)) => {
+                return Err(call_error("fallocate", errno));
             }
             Err(errno) => return Err(directory_error(path, errno.to_string())),
         }

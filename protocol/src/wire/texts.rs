@@ -1,4 +1,4 @@
-//! A client's side of a channel of JSON text: `control`, or the decisions of a world.
+//! A client's side of `control`, the channel of JSON text.
 
 use super::channel_files::lives_elsewhere;
 use super::channels::{
@@ -6,14 +6,15 @@ use super::channels::{
     server_node,
 };
 use super::control::Request;
-use super::exchange::{ConnectionError, Exchange, check_answer, check_status, garbled};
+use super::exchange::{ConnectionError, Exchange, check_answer, check_status, copied, garbled};
 use super::message::{ControlReply, ControlRequest, VERSION};
-use super::process::{WatchedProcess, node_pid, pid_namespace};
+use super::process::{WatchedProcess, node_pid, pid_namespace, watch_error};
 use super::resources::check_room_for_ports;
 use super::wait::Waiter;
 use iceoryx2::node::Node;
 use iceoryx2::port::client::Client;
 use iceoryx2::prelude::AllocationStrategy;
+use rustix::io::Errno;
 use serde::Deserialize;
 use std::time::Duration;
 
@@ -39,19 +40,21 @@ struct Common {
 }
 
 impl TextPort {
-    /// Makes the port of a service whose server listens on `wake`; it keeps the node, which dies with it.
+    /// Makes the port of the service; it keeps the node, which dies with it.
     pub(super) fn create(
         node: Node<Ipc>,
         instance: &Instance,
         service: &ControlService,
-        wake: Channel,
     ) -> Result<Self, ChannelError> {
         let services = Services {
             node: &node,
             instance,
         };
         let server_process = server_process(service, instance)?;
-        let notifier = services.wake(wake)?.notifier_builder().create();
+        let notifier = services
+            .wake(Channel::WakeServer)?
+            .notifier_builder()
+            .create();
         let server = notifier.map_err(ipc_error("create a notifier"))?;
         let listener = services.listener(Channel::WakeClient)?;
         let client = service.client_builder().initial_max_slice_len(SLICE);
@@ -59,16 +62,10 @@ impl TextPort {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(limited_error("create a control client", "16 clients"))?;
-        let who = if wake == Channel::WakeServer {
-            "server"
-        } else {
-            "agent"
-        };
         Ok(Self {
             client,
             sequence: 0,
             exchange: Exchange {
-                who,
                 instance: instance.clone(),
                 server,
                 listener,
@@ -120,9 +117,10 @@ impl TextPort {
             listener_low,
             listener_high,
         };
-        let copy = |reply: &ControlReply, answer: &[u8]| (*reply, answer.to_vec());
+        let copy = |reply: &ControlReply, answer: &[u8]| (*reply, copied(WHAT, answer));
         let (client, exchange) = (&self.client, &self.exchange);
         let (reply, answer) = exchange.request(client, header, text, WHAT, timeout, copy)?;
+        let answer = answer?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         if reply.status != 0 {
             let said: Common = serde_json::from_slice(&answer).unwrap_or_default();
@@ -138,10 +136,10 @@ fn server_process(
     instance: &Instance,
 ) -> Result<WatchedProcess, ChannelError> {
     let node = server_node(service).ok_or_else(|| instance.no_server())?;
-    let process = WatchedProcess::open(node_pid(node)).ok();
-    match process.filter(|process| !process.has_ended()) {
-        Some(process) => Ok(process),
-        None if lives_elsewhere(node) => Err(instance.elsewhere()),
-        None => Err(instance.no_server()),
+    match WatchedProcess::open(node_pid(node)) {
+        Ok(process) if !process.has_ended() => Ok(process),
+        Ok(_) | Err(Errno::SRCH) if lives_elsewhere(node) => Err(instance.elsewhere()),
+        Ok(_) | Err(Errno::SRCH) => Err(instance.no_server()),
+        Err(errno) => Err(watch_error(errno)),
     }
 }

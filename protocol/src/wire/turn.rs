@@ -7,6 +7,7 @@ use super::directory::{not_usable, own_channel_directory};
 use super::error::ChannelError;
 use super::interrupt::check_interrupt;
 use super::process::process_state;
+use super::resources::call_error;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
 use rustix::io::Errno;
 use std::cell::Cell;
@@ -149,6 +150,9 @@ fn wait(
             Ok(()) if is_file(&file, path) => return Ok(Some(file)),
             Ok(()) => continue, // It was removed meanwhile: others lock another file now.
             Err(Errno::WOULDBLOCK | Errno::INTR) => {}
+            Err(errno @ (Errno::PERM | Errno::ACCESS | Errno::NOSYS)) => {
+                return Err(call_error("flock", errno));
+            }
             Err(errno) => return Err(wrong(errno)),
         }
         let elapsed = start.elapsed();

@@ -2,7 +2,8 @@
 
 use super::models::{shape, unit};
 use emberwatch_protocol::model::{
-    Airspace, CellMap, KernelEntry, ModelFile, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry,
+    Airspace, CellMap, KernelEntry, ModelFile, Parts, Pays, RingEntry, SensorEntry, StateEntry,
+    ZoneEntry,
 };
 use emberwatch_protocol::{Cell, Grid, Model, Move};
 use proptest::prelude::*;
@@ -63,6 +64,58 @@ proptest! {
         prop_assert_eq!(seen.len(), expected.len());
         for it in seen {
             prop_assert_eq!(expected.get(&it.cell), Some(&it.ring));
+        }
+    }
+}
+
+/// The parts of a map's free cells, by joining neighbours until nothing changes.
+fn parts(map: &Grid<bool>) -> Vec<Vec<usize>> {
+    let width = map.ncols();
+    let free: Vec<usize> = (0..map.len())
+        .filter(|&at| !map[[at / width, at % width]])
+        .collect();
+    let mut parts: Vec<Vec<usize>> = free.iter().map(|&cell| vec![cell]).collect();
+    let touch = |&a: &usize, &b: &usize| {
+        (a / width).abs_diff(b / width) + (a % width).abs_diff(b % width) == 1
+    };
+    let joined = |a: &Vec<usize>, b: &Vec<usize>| a.iter().any(|a| b.iter().any(|b| touch(a, b)));
+    let mut at = 0;
+    while at < parts.len() {
+        match (at + 1..parts.len()).find(|&other| joined(&parts[at], &parts[other])) {
+            Some(other) => {
+                let other = parts.remove(other);
+                parts[at].extend(other);
+            }
+            None => at += 1,
+        }
+    }
+    parts.iter_mut().for_each(|part| part.sort_unstable());
+    parts
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn random_starts_are_the_largest_connected_part(
+        key in 0_u64..1_000_000,
+        side in (1_usize..9, 1_usize..9),
+    ) {
+        let map = random_map(key, side);
+        let parts = parts(&map);
+        let air = Airspace::new(shape(side.0, side.1), Some(Arc::new(map)), 0, 1, Pays::Visited);
+        let found = Parts::of(&air);
+        let n_largest = parts.iter().map(Vec::len).max().unwrap_or(0);
+        prop_assert_eq!(found.n_largest(), n_largest);
+        prop_assert_eq!(found.n_free(), parts.iter().map(Vec::len).sum::<usize>());
+        let mut largest = parts.iter().filter(|part| part.len() == n_largest && n_largest > 1);
+        let first = largest.clone().min_by_key(|part| part[0]).cloned().unwrap_or_default();
+        prop_assert_eq!(found.starts(), first);
+        let reached = |cell: usize| found.n_around(air.shape().cell(cell));
+        prop_assert!(parts.iter().all(|part| part.iter().all(|&cell| reached(cell) == part.len())));
+        // Of a connected map, all free cells are starts, in the order of their indices.
+        if parts.len() == 1 {
+            prop_assert!(largest.next().is_none_or(|all| all.len() == found.n_free()));
         }
     }
 }

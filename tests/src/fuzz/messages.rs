@@ -4,7 +4,6 @@ use super::target::Seed;
 use bytemuck::{Pod, bytes_of};
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
 use emberwatch_protocol::control::{Reply, parse};
-use emberwatch_protocol::decisions;
 use emberwatch_protocol::message::{
     AgentHeader, FLAG_TEAM_FRAMES, FrameHeader, RobotResult, Status, StepReply, VERSION,
     WorldResult,
@@ -126,12 +125,6 @@ pub fn control_reply(bytes: &[u8]) -> bool {
         let _ = (info.airspace(), zones.map(|zones| zones.zone_map(shape)));
     }
     reply.is_some_and(|reply| reply.status() == Status::Ok)
-}
-
-/// A request or a reply of a learner's `decisions`.
-pub fn decision(bytes: &[u8]) -> bool {
-    let reply = survives::<decisions::Reply>(bytes);
-    survives::<decisions::Request>(bytes).is_some() || reply.is_some()
 }
 
 /// What is parsed is written, and is the same when it is parsed again.

@@ -21,9 +21,9 @@ pub struct DqnSettings {
     pub replay: usize,
     /// Transitions an update learns from.
     pub batch: usize,
-    /// Discount.
+    /// Discount per step.
     pub gamma: f32,
-    /// Steps that a transition spans, see [`Track`]: what follows it is discounted by `gamma^n`.
+    /// Steps that a transition spans, fewer at the end of an episode, see [`Track`].
     pub n_step: usize,
     /// Share of the network in its target after each update.
     pub tau: f32,
@@ -147,6 +147,7 @@ struct Batch {
     action: Tensor,
     reward: Tensor,
     next: Tensor,
+    discount: Tensor,
 }
 
 impl Perceptron {
@@ -252,9 +253,19 @@ impl Dqn {
         }
     }
 
-    /// Makes transitions of [`DqnSettings::n_step`] steps out of one world's single steps.
+    /// Makes transitions of [`DqnSettings::n_step`] steps out of the single steps of an episode.
     pub fn track(&self) -> Track {
-        Track::new(self.settings.n_step, self.settings.gamma)
+        Track::new(self.settings.n_step)
+    }
+
+    /// Factor on the value of what follows one step: nothing follows the end of an episode that terminated. What
+    /// follows a truncated episode counts, because the world goes on.
+    pub fn discount(&self, is_terminated: bool) -> f32 {
+        if is_terminated {
+            0.0
+        } else {
+            self.settings.gamma
+        }
     }
 
     /// Remembers a transition, and forgets the oldest if there are too many.
@@ -312,7 +323,7 @@ impl Dqn {
         Ok(loss)
     }
 
-    /// The mean of `(Q(h, a) - (r + gamma^n Q'(h', a')))^2`, or of its Huber loss.
+    /// The mean of `(Q(h, a) - (r + discount Q'(h', a')))^2`, or of its Huber loss.
     fn loss(&self, batch: &Batch) -> CandleResult<Tensor> {
         let after = self.choices(&self.target, &batch.next)?.detach();
         let judge = if self.settings.double {
@@ -321,8 +332,7 @@ impl Dqn {
             after.clone()
         };
         let next = after.gather(&judge.argmax_keepdim(1)?, 1)?;
-        let gamma = f64::from(self.settings.gamma).powi(self.settings.n_step.max(1) as i32);
-        let goal = (&batch.reward + (next * gamma)?)?;
+        let goal = (&batch.reward + (next * &batch.discount)?)?;
         let values = self.network.forward(&batch.input)?;
         let values = values.gather(&batch.action, 1)?;
         if self.settings.huber {
@@ -347,21 +357,26 @@ impl Batch {
             let numbers: Vec<f32> = rows.iter().flat_map(vector).copied().collect();
             Tensor::from_vec(numbers, (rows.len(), length), &Device::Cpu)
         };
+        let column = |number: fn(&&'a Transition) -> f32| {
+            let numbers: Vec<f32> = rows.iter().map(number).collect();
+            Tensor::new(numbers, &Device::Cpu)?.unsqueeze(1)
+        };
         let actions: Vec<u32> = rows.iter().map(|row| row.action as u32).collect();
-        let rewards: Vec<f32> = rows.iter().map(|row| row.reward).collect();
         Ok(Self {
             input: vectors(|row| &row.input, shape.n_inputs)?,
             next: vectors(|row| &row.next, shape.n_numbers())?,
             action: Tensor::new(actions, &Device::Cpu)?.unsqueeze(1)?,
-            reward: Tensor::new(rewards, &Device::Cpu)?.unsqueeze(1)?,
+            reward: column(|row| row.reward)?,
+            discount: column(|row| row.discount)?,
         })
     }
 
-    fn named(&self) -> [(String, &Tensor); 3] {
+    fn named(&self) -> [(String, &Tensor); 4] {
         [
             ("dqn.replay.input".into(), &self.input),
             ("dqn.replay.next".into(), &self.next),
             ("dqn.replay.reward".into(), &self.reward),
+            ("dqn.replay.discount".into(), &self.discount),
         ]
     }
 }

@@ -60,14 +60,14 @@ impl Dqn {
         Ok(())
     }
 
-    /// A world's saved track to go on with; without steps if its transitions were of other lengths or discounts.
+    /// Resumes the saved track of an episode; without steps if its transitions were of another length.
     ///
     /// # Errors
     /// For a step of another DQN.
     pub fn resume_track(&self, saved: Track) -> Result<Track, NetworkError> {
         let track = self.track();
         let length = saved.open.len();
-        if (saved.n_step, saved.gamma) != (track.n_step, track.gamma) || length >= saved.n_step {
+        if saved.n_step != track.n_step || length >= saved.n_step {
             return Ok(track);
         }
         let mut steps = saved.open.iter().enumerate();
@@ -81,16 +81,20 @@ impl Dqn {
             action,
             reward,
             next,
+            discount,
         } = transition;
         let mut numbers = input.iter().chain(next).chain([reward]);
-        if self.fits(transition) && numbers.all(|number| number.is_finite()) {
+        let is_finite = numbers.all(|number| number.is_finite());
+        if self.fits(transition) && is_finite && (0.0..=1.0).contains(discount) {
             return Ok(());
         }
         let (n_inputs, n_outputs) = (self.shape.n_inputs, self.shape.n_outputs);
         Err(NetworkError::Transition {
             at,
-            expected: format!("{n_inputs} finite inputs and an action below {n_outputs}"),
-            got: format!("{} and {action}", input.len()),
+            expected: format!(
+                "{n_inputs} finite inputs, an action below {n_outputs} and a discount from 0 to 1"
+            ),
+            got: format!("{}, {action} and {discount}", input.len()),
         })
     }
 }

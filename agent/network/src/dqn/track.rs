@@ -1,9 +1,9 @@
-//! Transitions, and those over several steps: from one world's steps in a row.
+//! Transitions, and returns over several steps of one episode.
 
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
-/// One row `(h, a, r, h')` of the replay.
+/// One row `(h, a, r, h')` of the replay, with the discount of what follows `h'`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Transition {
     /// Before; of several candidates, the chosen one's numbers.
@@ -14,42 +14,54 @@ pub struct Transition {
     pub reward: f32,
     /// After; of several candidates, the numbers of each.
     pub next: Vec<f32>,
+    /// Factor on the value of `next`: `gamma` after one step, `gamma^m` after m, 0 where the episode terminated.
+    pub discount: f32,
 }
 
-/// One world's latest steps. Where the world or its robot begins again, so does its track.
+/// The latest steps of one episode, whose n-step returns are not complete (Sutton and Barto, section 7.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Track {
     pub(super) n_step: usize,
-    pub(super) gamma: f32,
-    /// Steps whose transition is not complete.
+    /// Steps whose transition is not complete, the oldest first.
     pub(super) open: VecDeque<Transition>,
 }
 
 impl Track {
-    /// A track without steps, whose transitions span `n_step` of them.
-    pub(super) fn new(n_step: usize, gamma: f32) -> Self {
+    /// An empty track, whose transitions span `n_step` steps.
+    pub(super) fn new(n_step: usize) -> Self {
         Self {
             n_step: n_step.max(1),
-            gamma,
             open: VecDeque::new(),
         }
     }
 
-    /// Takes the next step; gives the transition that it completes: `n` steps from where the oldest
-    /// began, with the reward `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. `None` for the first `n - 1`.
+    /// Adds the episode's next step. Returns the transition that it completes, of `n` steps: the reward is
+    /// `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. `None` for the first `n - 1` steps.
     pub fn add(&mut self, step: Transition) -> Option<Transition> {
-        let next = step.next.clone();
         self.open.push_back(step);
         if self.open.len() < self.n_step {
             return None;
         }
+        self.complete()
+    }
+
+    /// Ends the episode: returns the transitions of its last steps, which span fewer than `n`, up to its last state.
+    pub fn end(&mut self) -> Vec<Transition> {
+        std::iter::from_fn(|| self.complete()).collect()
+    }
+
+    /// The transition from the oldest step to the latest.
+    fn complete(&mut self) -> Option<Transition> {
+        let next = self.open.back()?.next.clone();
         let later = self.open.iter().rev();
-        let reward = later.fold(0.0, |sum, step| step.reward + self.gamma * sum);
-        let first = self.open.pop_front()?;
+        let reward = later.fold(0.0, |sum, step| step.reward + step.discount * sum);
+        let discounts = self.open.iter().map(|step| f64::from(step.discount));
+        let discount = discounts.product::<f64>() as f32;
         Some(Transition {
             reward,
             next,
-            ..first
+            discount,
+            ..self.open.pop_front()?
         })
     }
 }
@@ -65,28 +77,86 @@ mod tests {
             action: at as usize,
             reward: at,
             next: vec![at + 1.0],
+            discount: 0.5,
+        }
+    }
+
+    /// A transition from one step on, with the rewards of as many steps as given.
+    fn over(first: u8, reward: f32, n_steps: u8, discount: f32) -> Transition {
+        Transition {
+            reward,
+            next: vec![f32::from(first + n_steps)],
+            discount,
+            ..step(first)
         }
     }
 
     #[test]
     fn single_steps_pass_through() {
-        let mut track = Track::new(1, 0.5);
+        let mut track = Track::new(1);
         assert_eq!(track.add(step(3)), Some(step(3)));
         assert_eq!(track.add(step(4)), Some(step(4)));
+        assert_eq!(track.end(), []);
     }
 
     #[test]
     fn three_steps_become_one_with_the_discounted_reward() {
-        let mut track = Track::new(3, 0.5);
+        let mut track = Track::new(3);
         assert_eq!([step(2), step(3)].map(|step| track.add(step)), [None, None]);
         for first in 2..6 {
             let [a, b, c] = [0, 1, 2].map(|later| f32::from(first + later));
-            let expected = Transition {
-                reward: a + 0.5 * b + 0.25 * c,
-                next: vec![c + 1.0],
-                ..step(first)
-            };
+            let expected = over(first, a + 0.5 * b + 0.25 * c, 3, 0.125);
             assert_eq!(track.add(step(first + 2)), Some(expected));
+        }
+    }
+
+    #[test]
+    fn every_step_of_an_episode_becomes_one_transition_however_short_it_is() {
+        // 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6: all up to the last state, 7.
+        let last = [
+            over(4, 8.0, 3, 0.125),
+            over(5, 8.0, 2, 0.25),
+            over(6, 6.0, 1, 0.5),
+        ];
+        for n_steps in 1..=3 {
+            let mut track = Track::new(4);
+            let steps = 7 - n_steps..7;
+            assert!(steps.map(|at| track.add(step(at))).all(|it| it.is_none()));
+            assert_eq!(track.end(), last[3 - usize::from(n_steps)..]);
+        }
+        let mut track = Track::new(3);
+        let full: Vec<_> = (2..7).filter_map(|at| track.add(step(at))).collect();
+        assert_eq!((full.len(), &full[2]), (3, &last[0]));
+        assert_eq!(track.end(), last[1..]);
+        assert_eq!((track.end(), track), (vec![], Track::new(3)));
+    }
+
+    #[test]
+    fn nothing_follows_the_end_of_an_episode_that_terminated() {
+        let mut track = Track::new(2);
+        let last = Transition {
+            discount: 0.0,
+            ..step(5)
+        };
+        track.add(step(4));
+        assert_eq!(track.add(last.clone()), Some(over(4, 6.5, 2, 0.0)));
+        assert_eq!(track.end(), [last]);
+    }
+
+    #[test]
+    fn discounts_are_powers_to_the_bit() {
+        for (gamma, n) in [(0.97_f32, 4), (0.99, 1), (0.99, 3), (0.9, 8), (0.5, 20)] {
+            let mut track = Track::new(n);
+            let step = Transition {
+                discount: gamma,
+                ..step(0)
+            };
+            let whole = (0..n).filter_map(|_| track.add(step.clone())).last();
+            let expected = f64::from(gamma).powi(n as i32) as f32;
+            assert_eq!(
+                whole.expect("n steps").discount.to_bits(),
+                expected.to_bits()
+            );
         }
     }
 }

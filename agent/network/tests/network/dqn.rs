@@ -32,6 +32,7 @@ fn batch(update: u64) -> Vec<Transition> {
             action: (split_mix(4, first) % N_ACTIONS as u64) as usize,
             reward: 3.0 * number(first + 50),
             next: vector(20),
+            discount: 0.99,
         }
     };
     (0..64).map(row).collect()
@@ -149,11 +150,7 @@ fn double_updates_are_those_of_stock_layers() {
 
 #[test]
 fn it_learns_which_action_pays() {
-    let settings = DqnSettings {
-        gamma: 0.0,
-        ..DqnSettings::paper()
-    };
-    let mut dqn = Dqn::new(settings, DqnShape::of_actions(1, 2), 1);
+    let mut dqn = Dqn::new(DqnSettings::paper(), DqnShape::of_actions(1, 2), 1);
     for index in 0..200_u64 {
         let input = if index % 2 == 0 { 1.0 } else { -1.0 };
         let action = (index / 2 % 2) as usize;
@@ -164,6 +161,7 @@ fn it_learns_which_action_pays() {
             action,
             reward,
             next: vec![input],
+            discount: 0.0,
         });
     }
     for _ in 0..200 {
@@ -285,24 +283,31 @@ fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
         "dqn.target.2.bias: missing",
     );
     let words = |got: &str| {
-        format!("dqn.transitions: 7: expected 6 finite inputs and an action below 4, got {got}")
+        format!(
+            "dqn.transitions: 7: expected 6 finite inputs, an action below 4 and a discount from 0 to 1, got {got}"
+        )
     };
-    let action = words("6 and 4");
+    let action = words("6, 4 and 0.99");
     check(|(_, saved)| saved.transitions[7].action = 4, &action);
-    let inputs = words("5 and 0");
+    let inputs = words("5, 0 and 0.99");
     let shorter = |(_, saved): &mut Saved| {
         let transition = &mut saved.transitions[7];
         transition.action = 0;
         transition.input.pop();
     };
     check(shorter, &inputs);
-    let number = words("6 and 0");
+    let number = words("6, 0 and 0.99");
     let infinite = |(_, saved): &mut Saved| {
         let transition = &mut saved.transitions[7];
         transition.action = 0;
         transition.next[0] = f32::INFINITY;
     };
     check(infinite, &number);
+    let discounted = |(_, saved): &mut Saved| {
+        let transition = &mut saved.transitions[7];
+        (transition.action, transition.discount) = (0, 1.5);
+    };
+    check(discounted, &words("6, 0 and 1.5"));
 }
 
 /// Whose number is not finite, and after how many updates.
@@ -348,24 +353,32 @@ fn a_step_that_overflows_is_not_made() {
 }
 
 #[test]
-fn what_follows_several_steps_is_discounted_as_often() {
-    let targets = |gamma: f32, n_step: usize| {
-        let settings = DqnSettings {
-            gamma,
-            n_step,
-            ..small()
-        };
-        let mut dqn = Dqn::new(settings, ACTIONS, 2);
-        dqn.learn(&batch(0)).expect("finite")
-    };
-    assert_eq!(targets(0.5, 3), targets(0.125, 1));
-    assert_ne!(targets(0.5, 3), targets(0.5, 1));
+fn what_follows_counts_by_each_transitions_own_discount() {
+    let mut dqn = Dqn::new(small(), ACTIONS, 2);
+    let mut row = batch(0).swap_remove(0);
+    let best = dqn.values(&row.next).into_iter().fold(f32::MIN, f32::max);
+    let value = dqn.values(&row.input)[row.action];
+    for discount in [0.0, 0.5, 0.97] {
+        row.discount = discount;
+        let expected = (value - row.reward - discount * best).powi(2);
+        let alone = Dqn::new(small(), ACTIONS, 2).learn(std::slice::from_ref(&row));
+        assert!((alone.expect("finite") / expected - 1.0).abs() < 1e-4);
+    }
+    let rows = [0.0, 0.97].map(|discount| Transition {
+        discount,
+        ..row.clone()
+    });
+    let alone = rows.each_ref().map(|row| {
+        let loss = Dqn::new(small(), ACTIONS, 2).learn(std::slice::from_ref(row));
+        loss.expect("finite")
+    });
+    let together = dqn.learn(&rows).expect("finite");
+    assert!((together * 2.0 / (alone[0] + alone[1]) - 1.0).abs() < 1e-4);
 }
 
 #[test]
 fn it_learns_which_candidate_pays() {
     let settings = DqnSettings {
-        gamma: 0.5,
         double: true,
         huber: true,
         width: 16,
@@ -381,6 +394,7 @@ fn it_learns_which_candidate_pays() {
             action: 0,
             reward: now[2 * chosen],
             next: candidates(row + 1),
+            discount: 0.5,
         });
     }
     for _ in 0..500 {
@@ -401,13 +415,10 @@ fn it_learns_which_candidate_pays() {
 #[test]
 fn hubers_loss_grows_linearly_with_large_errors() {
     let loss = |reward: f32, huber: bool| {
-        let settings = DqnSettings {
-            gamma: 0.0,
-            huber,
-            ..small()
-        };
+        let settings = DqnSettings { huber, ..small() };
         let mut dqn = Dqn::new(settings, ACTIONS, 2);
         let mut row = batch(0).swap_remove(0);
+        row.discount = 0.0;
         row.reward = dqn.values(&row.input)[row.action] + reward;
         dqn.learn(&[row]).expect("finite")
     };

@@ -119,6 +119,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         }),
         network: Some(Arc::new(network)),
         decisions: None,
+        digests: Vec::new(),
     };
     for policy in [
         "shooting_exploit",

@@ -1,6 +1,7 @@
 //! Entries of the leaderboard, a CSV file each, and the page that they make together.
 
 use crate::benchmark::report::columns::markdown;
+use crate::benchmark::report::common_worlds::CommonWorlds;
 use crate::benchmark::report::figures::{Height, draw_bars};
 use crate::benchmark::report::number::number;
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
@@ -8,9 +9,13 @@ use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::suite::{Aggregate, FLOOR, TaskRuns, by_score, render_suite, told};
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, ensure};
+use emberwatch_protocol::task::is_file_name;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+
+/// Characters of plain words besides letters and digits.
+const PUNCTUATION: &str = " .,'-_&()@+/#?=%~";
 
 /// One policy: who made it, how, and its reward of each world of each task.
 #[derive(Debug, Clone)]
@@ -46,6 +51,8 @@ struct Row {
     mean_reward: f64,
     brier: Option<f64>,
     log_likelihood: Option<f64>,
+    #[serde(default)]
+    worlds_fingerprint: String,
 }
 
 impl Entry {
@@ -61,11 +68,6 @@ impl Entry {
         );
         let mut tasks: Vec<TaskRuns> = Vec::new();
         for row in rows {
-            ensure!(
-                row.mean_reward.is_finite(),
-                "mean_reward: expected finite numbers, got {}",
-                row.mean_reward
-            );
             match tasks.iter_mut().find(|task| task.task == row.task) {
                 Some(task) => task.runs.push(row.run()),
                 None => tasks.push(TaskRuns {
@@ -74,10 +76,55 @@ impl Entry {
                 }),
             }
         }
-        Ok(Self {
-            about: about.clone(),
-            tasks,
-        })
+        let about = about.clone();
+        let entry = Self { about, tasks };
+        entry.check()?;
+        Ok(entry)
+    }
+
+    /// Checks what flags and files say before it reaches a page.
+    pub fn check(&self) -> Result<()> {
+        let About {
+            policy,
+            by,
+            code,
+            commit,
+            training_seconds,
+        } = &self.about;
+        let names = self.tasks.iter().map(|task| ("task", &task.task));
+        for (what, name) in [("policy", policy)].into_iter().chain(names) {
+            ensure!(
+                is_file_name(name),
+                "{what}: expected 1 to 64 letters, digits, - and _, got {name:?}"
+            );
+        }
+        let runs = || self.tasks.iter().flat_map(|task| &task.runs);
+        let estimators = runs().map(|run| ("estimator", &run.estimator));
+        for (what, text) in [("by", by), ("code", code)].into_iter().chain(estimators) {
+            ensure!(
+                is_plain(text),
+                "{what}: expected 1 to 200 letters, digits, spaces and {}, or an address that begins with \
+                 https://, got {text:?}",
+                PUNCTUATION.trim_start()
+            );
+        }
+        ensure!(
+            (7..=40).contains(&commit.len()) && commit.bytes().all(|it| it.is_ascii_hexdigit()),
+            "commit: expected 7 to 40 hexadecimal digits, got {commit:?}"
+        );
+        ensure!(
+            (0.0..1e12).contains(training_seconds),
+            "training_seconds: expected 0 or more, got {training_seconds}"
+        );
+        for run in runs() {
+            let numbers = [Some(run.mean_reward), run.brier, run.log_likelihood];
+            ensure!(
+                numbers.iter().flatten().all(|number| number.is_finite()),
+                "world {}: expected finite numbers, got {numbers:?}",
+                run.world_seed
+            );
+        }
+        Ok(())
     }
 
     pub fn write(&self, path: &Path) -> Result<()> {
@@ -92,12 +139,8 @@ impl Entry {
         replace_file(path, &writer.into_inner()?, Readers::Any)
     }
 
-    fn worlds(&self, task: &str) -> BTreeSet<(u64, u64)> {
-        let tasks = self.tasks.iter().filter(|other| other.task == task);
-        tasks
-            .flat_map(|task| &task.runs)
-            .map(|run| (run.world_seed, run.steps))
-            .collect()
+    fn of_task(&self, task: &str) -> Option<&TaskRuns> {
+        self.tasks.iter().find(|other| other.task == task)
     }
 }
 
@@ -123,6 +166,7 @@ impl Row {
             mean_reward: run.mean_reward,
             brier: run.brier,
             log_likelihood: run.log_likelihood,
+            worlds_fingerprint: run.worlds_fingerprint.clone(),
         }
     }
 
@@ -147,6 +191,7 @@ impl Row {
             mean_reward: self.mean_reward,
             brier: self.brier,
             log_likelihood: self.log_likelihood,
+            worlds_fingerprint: self.worlds_fingerprint,
             ..PolicyRun::default()
         }
     }
@@ -166,11 +211,11 @@ pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
     files.map(|path| read(path)).collect()
 }
 
-/// Refuses entries of other worlds or steps of a task than the random walk's, two of one policy, and a world twice.
+/// Checks that each entry has the random walk's worlds of its tasks, and that no policy has two entries.
 pub fn check_entries(entries: &[Entry]) -> Result<()> {
-    let mut names = entries.iter().map(|entry| &*entry.about.policy);
-    let floor = names.position(|name| name == FLOOR);
-    let floor = &entries[floor.with_context(|| format!("expected an entry of {FLOOR}"))?];
+    let mut all = entries.iter();
+    let floor = all.find(|entry| entry.about.policy == FLOOR);
+    let floor = floor.with_context(|| format!("expected an entry of {FLOOR}"))?;
     let mut known = BTreeSet::new();
     for entry in entries {
         let policy = &entry.about.policy;
@@ -179,18 +224,45 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
             "entry {policy}: expected one file of it, got more"
         );
         for TaskRuns { task, runs } in &entry.tasks {
-            let worlds = entry.worlds(task);
-            ensure!(
-                worlds == floor.worlds(task),
-                "entry {policy}: expected the worlds and steps of task {task} that {FLOOR} has"
-            );
-            ensure!(
-                worlds.len() == runs.len(),
-                "entry {policy}: expected each world of task {task} once"
-            );
+            let runs: Vec<&PolicyRun> = runs.iter().collect();
+            let checked = worlds(floor, task).and_then(|worlds| worlds.check(policy, &runs));
+            checked.with_context(|| format!("entry {policy}, task {task}"))?;
         }
     }
     Ok(())
+}
+
+/// The worlds of the random walk's entry.
+fn worlds(floor: &Entry, task: &str) -> Result<CommonWorlds> {
+    let runs = floor.of_task(task).map(|task| &task.runs);
+    let runs = runs.with_context(|| format!("expected an entry of {FLOOR}"))?;
+    let mut seeds: Vec<u64> = runs.iter().map(|run| run.world_seed).collect();
+    seeds.sort_unstable();
+    seeds.dedup();
+    let fingerprint = &runs[0].worlds_fingerprint;
+    ensure!(
+        !fingerprint.is_empty(),
+        "expected worlds_fingerprint in the entry of {FLOOR}, got none: run `suite` again, and add all entries anew"
+    );
+    Ok(CommonWorlds {
+        fingerprint: Some(fingerprint.clone()),
+        seeds,
+        steps: runs[0].steps,
+        moves: None,
+        robots: None,
+        recent_steps: None,
+    })
+}
+
+/// Whether words can stand in a Markdown table as they are: no HTML, no code, no links but the web's.
+fn is_plain(text: &str) -> bool {
+    let address = ["https://", "http://"];
+    let rest = address.iter().find_map(|scheme| text.strip_prefix(scheme));
+    (1..=200).contains(&text.len())
+        && rest
+            .unwrap_or(text)
+            .chars()
+            .all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
 }
 
 /// The page: a row an entry, the best first, then each task's scores.
@@ -249,7 +321,7 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let height = |group: &Group<'_>| match scores.get(group.policy).copied().flatten() {
         Some(score) => Height {
             value: score.mean,
-            ends: Some([score.low, score.high]),
+            ends: score.interval,
             label: told(Some(score)),
         },
         None => Height {

@@ -1,11 +1,8 @@
 //! What a comparison measured, and its groups.
 
 use crate::benchmark::report::statistics::Estimate;
-use crate::file::{Readers, replace_file};
-use anyhow::Result;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::Path;
 
 /// The team of robots that know nothing of each other, and of one robot.
 pub const ALONE: &str = "alone";
@@ -53,6 +50,12 @@ pub struct PolicyRun {
     pub grid_seen_share: Option<f64>,
     /// Mean `ln P(y)` of a visited cell under the prediction before the frame, where the estimator predicts frames.
     pub log_likelihood: Option<f64>,
+    /// The server's `worlds_fingerprint`; empty in files of earlier releases.
+    #[serde(default)]
+    pub worlds_fingerprint: String,
+    /// Identifies all that the policy's actions depend on besides the worlds; empty in files of earlier releases.
+    #[serde(default)]
+    pub policy_fingerprint: String,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,
@@ -67,20 +70,6 @@ fn one() -> u32 {
 
 fn alone() -> String {
     ALONE.into()
-}
-
-/// Writes one row per run, ordered by policy, then seed; a missing Brier score is an empty field.
-///
-/// Numbers are the shortest that read back as the same `f64`.
-pub fn write_csv(path: &Path, runs: &[PolicyRun]) -> Result<()> {
-    let mut sorted: Vec<&PolicyRun> = runs.iter().collect();
-    sorted.sort_by_key(|run| {
-        let crew = (run.robots, &run.team);
-        (&run.policy, run.world_seed, &run.estimator, crew)
-    });
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    sorted.iter().try_for_each(|run| writer.serialize(run))?;
-    replace_file(path, &writer.into_inner()?, Readers::Any)
 }
 
 /// The runs of one policy with one estimator and one kind of team, in the order given.

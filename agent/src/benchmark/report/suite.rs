@@ -31,8 +31,8 @@ pub struct TaskRuns {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Aggregate {
     pub mean: f64,
-    pub low: f64,
-    pub high: f64,
+    /// `None` if a task has only one world, whose spread is unknown.
+    pub interval: Option<[f64; 2]>,
 }
 
 impl Aggregate {
@@ -43,6 +43,11 @@ impl Aggregate {
     pub fn of(tasks: &[Vec<f64>]) -> Option<Self> {
         if tasks.is_empty() || tasks.iter().any(Vec::is_empty) {
             return None;
+        }
+        let mean = interquartile_mean(tasks.concat());
+        if tasks.iter().any(|scores| scores.len() == 1) {
+            let interval = None;
+            return Some(Self { mean, interval });
         }
         let mut random = ChaCha8Rng::seed_from_u64(0);
         let mut draw = || {
@@ -58,11 +63,8 @@ impl Aggregate {
         };
         let mut means: Vec<f64> = (0..N_DRAWS).map(|_| draw()).collect();
         means.sort_by(f64::total_cmp);
-        Some(Self {
-            mean: interquartile_mean(tasks.concat()),
-            low: quantile(&means, 0.025),
-            high: quantile(&means, 0.975),
-        })
+        let interval = Some([0.025, 0.975].map(|share| quantile(&means, share)));
+        Some(Self { mean, interval })
     }
 }
 
@@ -166,11 +168,14 @@ pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
 
 /// A score with its interval, as tables and figures show it.
 pub fn told(score: Option<Aggregate>) -> String {
-    let Some(Aggregate { mean, low, high }) = score else {
+    let Some(Aggregate { mean, interval }) = score else {
         return NOTHING.into();
     };
-    let [mean, low, high] = [mean, low, high].map(|it| number(it, 3));
-    format!("{mean} [{low}, {high}]")
+    let mean = number(mean, 3);
+    match interval.map(|ends| ends.map(|it| number(it, 3))) {
+        Some([low, high]) => format!("{mean} [{low}, {high}]"),
+        None => format!("{mean} (one world)"),
+    }
 }
 
 fn reward(run: &PolicyRun) -> Option<f64> {
@@ -203,7 +208,8 @@ mod tests {
             vec![0.57, 0.49, 0.79, 0.48, 0.56, 0.49, 0.81, 0.47],
             vec![1.09, 1.01, 0.69, 0.91, 0.53, 0.81, 0.86, 1.01],
         ];
-        let Aggregate { mean, low, high } = Aggregate::of(&tasks).expect("scores");
+        let Aggregate { mean, interval } = Aggregate::of(&tasks).expect("scores");
+        let [low, high] = interval.expect("eight worlds");
         // rliable 1.2: 0.54583333, [0.4775 to 0.4783, 0.6200 to 0.6217] in three runs of 50,000 draws.
         assert!((mean - 0.545_833_333).abs() < 1e-8, "{mean}");
         assert!((low - 0.478).abs() < 0.003, "{low}");
@@ -211,5 +217,25 @@ mod tests {
         assert_eq!(Aggregate::of(&tasks), Aggregate::of(&tasks));
         assert_eq!(Aggregate::of(&[vec![1.0], vec![]]), None);
         assert_eq!(interquartile_mean(vec![9.0, 1.0, 3.0, 2.0, -7.0]), 2.0);
+    }
+
+    #[test]
+    fn a_task_of_one_world_leaves_no_interval() {
+        for tasks in [
+            vec![vec![0.5]],
+            vec![vec![0.5], vec![0.5]],
+            vec![vec![0.5], vec![0.4, 0.5, 0.6]],
+        ] {
+            let score = Aggregate::of(&tasks).expect("scores");
+            let expected = Aggregate {
+                mean: 0.5,
+                interval: None,
+            };
+            assert_eq!(score, expected, "{tasks:?}");
+            assert_eq!(told(Some(score)), "0.500 (one world)");
+        }
+        // Worlds of equal scores are an observation: their interval is a point.
+        let equal = Aggregate::of(&[vec![0.5, 0.5]]).expect("scores");
+        assert_eq!(told(Some(equal)), "0.500 [0.500, 0.500]");
     }
 }

@@ -117,6 +117,9 @@ pub trait Learner {
 
     fn n_updates(&self) -> u64;
 
+    /// Why a run of that many steps made no update, and what to do.
+    fn lacks(&self, steps: u64) -> String;
+
     /// What it predicts of its first world, and the state of that which it thinks pays most.
     fn belief(&self) -> Option<(&Belief, usize)>;
 
@@ -125,6 +128,11 @@ pub trait Learner {
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;
+}
+
+/// The cause where a run's steps have not earned an update. `name`: the setting.
+pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
+    format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }
 
 pub(super) fn place(observation: &Observation) -> Place {

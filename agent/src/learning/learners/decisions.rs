@@ -8,12 +8,12 @@ mod saved;
 pub use self::base::Base;
 pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
 
-use self::run::Run;
+use self::run::{Run, features};
 use self::saved::{Held, SavedRun, belief_tensors};
 use crate::config::AgentConfig;
 use crate::learning::belief::SavedBelief;
 use crate::learning::checkpoint::{Contents, check};
-use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::base::{Learner, Worlds, lacks_steps, without_truth};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
@@ -119,8 +119,8 @@ impl DecisionsLearner {
         let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
         let mut runs = std::mem::take(&mut self.runs);
         for (index, (run, mut proposals)) in runs.iter_mut().zip(proposals).enumerate() {
-            let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
-            if let Some(transition) = run.led_to(&features) {
+            let features = features(&proposals);
+            if let Some(transition) = run.led_to(&features, &self.dqn) {
                 self.dqn.remember(transition);
             }
             let option = self.choose(index, &features, &mut run.held);
@@ -195,8 +195,15 @@ impl Learner for DecisionsLearner {
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let run = self.begun(observation)?;
-        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
+        let begun = self.begun(observation)?;
+        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
+        let mut ended = std::mem::replace(run, begun);
+        if !self.is_frozen {
+            let start = Instant::now();
+            let transitions = ended.end(&self.dqn).into_iter();
+            transitions.for_each(|transition| self.dqn.remember(transition));
+            self.times[0].1 += start.elapsed();
+        }
         Ok(())
     }
 
@@ -268,6 +275,18 @@ impl Learner for DecisionsLearner {
 
     fn n_updates(&self) -> u64 {
         self.dqn.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        let (batch, n) = (self.dqn.settings().batch, self.dqn.n_remembered());
+        if n < batch {
+            return format!(
+                "an update learns from {batch} transitions, and the steps gave {n}; train for more --steps, or with a \
+                 smaller decisions.batch"
+            );
+        }
+        let rate = self.config.decisions.updates_per_step;
+        lacks_steps("decisions.updates_per_step", rate)
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

@@ -249,6 +249,10 @@ impl Learner for FilterLearner {
         self.fit.n_updates()
     }
 
+    fn lacks(&self, steps: u64) -> String {
+        self.fit.lacks(steps)
+    }
+
     fn belief(&self) -> Option<(&Belief, usize)> {
         let rollout = self.rollouts.first()?;
         Some((rollout.agent.belief(), self.learned.target))

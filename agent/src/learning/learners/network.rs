@@ -107,19 +107,28 @@ impl NetworkLearner {
         }
     }
 
-    /// Remembers what the last decision brought.
+    /// Remembers what the last decision brought, and at the end of an episode the last ones before it.
     fn remember(&mut self) {
         let decision = self.decision.as_ref();
         let decision = decision.expect("invariant: a step begins with a decision");
+        let Observation { world, robot, .. } = self.at_world().observation();
+        let is_over = world.truncated != 0 || world.terminated != 0;
         let step = Transition {
             input: decision.input.clone(),
             action: decision.action,
-            reward: self.at_world().observation().robot.reward as f32,
+            reward: robot.reward as f32,
             next: self.input(),
+            discount: self.progress.dqn.discount(world.terminated != 0),
         };
-        if let Some(transition) = self.progress.position.track.add(step) {
-            self.progress.dqn.remember(transition);
-        }
+        let Progress { position, dqn, .. } = &mut self.progress;
+        let full = position.track.add(step);
+        let short = if is_over {
+            position.track.end()
+        } else {
+            Vec::new()
+        };
+        let transitions = full.into_iter().chain(short);
+        transitions.for_each(|transition| dqn.remember(transition));
     }
 
     fn update_dqn(&mut self) -> Result<[Option<f64>; 2]> {
@@ -278,6 +287,15 @@ impl Learner for NetworkLearner {
 
     fn n_updates(&self) -> u64 {
         self.progress.autoencoder.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        format!(
+            "an update learns from a window of {} frames of one episode that see some cell twice, and there was none; \
+             train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
+             autoencoder.window",
+            self.config.autoencoder.window
+        )
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

@@ -14,7 +14,7 @@ use self::replay::Replay;
 use self::saved::{SavedRun, estimator};
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::{Contents, check};
-use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::base::{Learner, Worlds, lacks_steps, without_truth};
 use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::learners::filter::model::SavedModel;
 use crate::learning::metrics::{ModelUpdate, Tick};
@@ -313,6 +313,14 @@ impl Learner for NeuralLearner {
 
     fn n_updates(&self) -> u64 {
         self.network.n_updates()
+    }
+
+    fn lacks(&self, steps: u64) -> String {
+        let rate = self.config.neural.updates_per_step;
+        if (steps as f64) * rate < 1.0 {
+            return lacks_steps("neural.updates_per_step", rate);
+        }
+        "the frames show no cell".into()
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

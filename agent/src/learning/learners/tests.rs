@@ -3,7 +3,7 @@
 use crate::config::AgentConfig;
 use crate::learning::belief::LearnedBelief;
 use crate::learning::checkpoint::Contents;
-use crate::learning::learners::decisions::{Base, DecisionsLearner};
+use crate::learning::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use crate::learning::learners::filter::FilterLearner;
 use crate::learning::learners::filter::fit::{FilterFit, LearnedModel};
 use crate::learning::learners::network::{NetworkLearner, Progress};
@@ -16,7 +16,7 @@ use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
     BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
 };
-use emberwatch_network::{Device, NeuralBelief};
+use emberwatch_network::{Device, NeuralBelief, Transition};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use emberwatch_protocol::randomness::split_mix;
@@ -270,6 +270,62 @@ fn decisions_resume_bit_for_bit() {
             contents[0] == contents[1] && learner.n_updates() > 20,
             "{kind:?}"
         );
+    }
+}
+
+/// The transitions that decisions remember of one episode, which ended that way.
+fn remembered(n_steps: u64, is_terminated: bool) -> Vec<Transition> {
+    let model = Model::wildfire();
+    let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape())).expect("valid");
+    let base = Base::known(EstimatorKind::KNOWN, filter, &model);
+    let config = config(BasisKind::Estimate);
+    let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
+    learner.attach(vec![observation(0)]).expect("possible");
+    for step in 1..=n_steps {
+        learner.plan();
+        let mut seen = observation(step);
+        seen.robot.reward = step as f64;
+        seen.world.truncated = u16::from(step == n_steps && !is_terminated);
+        seen.world.terminated = u16::from(step == n_steps && is_terminated);
+        learner.see(vec![seen]).expect("possible");
+        learner.predict();
+    }
+    learner.begin(0, observation(0)).expect("possible");
+    let contents = learner.contents().expect("whole");
+    contents
+        .state::<SavedDecisions>()
+        .expect("its state")
+        .dqn
+        .transitions
+}
+
+#[test]
+fn decisions_learn_from_every_step_of_an_episode() {
+    let decisions = config(BasisKind::Estimate).decisions;
+    let (gamma, n) = (decisions.learning.gamma, decisions.learning.n_step as u64);
+    assert_eq!(n, 4);
+    let scale = decisions.reward_scale / worlds().n_moves as f32;
+    for n_steps in [1, 3, 4, 5, 6] {
+        for is_terminated in [false, true] {
+            let got = remembered(n_steps, is_terminated);
+            let expected = (1..=n_steps).map(|first| {
+                let last = n_steps.min(first + n - 1);
+                let reward = (first..=last)
+                    .rev()
+                    .fold(0.0, |sum, step| step as f32 * scale + gamma * sum);
+                let is_last = last == n_steps && is_terminated;
+                let discount = gamma.powi((last + 1 - first) as i32);
+                (reward, if is_last { 0.0 } else { discount })
+            });
+            assert_eq!(got.len() as u64, n_steps);
+            for (got, (reward, discount)) in got.iter().zip(expected) {
+                assert!((got.reward - reward).abs() < 1e-4 * reward, "{n_steps}");
+                assert!((got.discount - discount).abs() < 1e-6, "{n_steps}");
+            }
+            // Those of the last steps lead to the same state.
+            let short = &got[got.len().saturating_sub(4)..];
+            assert!(short.iter().all(|it| it.next == short[0].next));
+        }
     }
 }
 

@@ -62,6 +62,7 @@ pub fn learner(
                 progress.load(contents).with_context(of_file)?;
             }
             check_full_frames(&progress, spec, info)?;
+            check_window(spec, info)?;
             Box::new(NetworkLearner::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
@@ -92,6 +93,22 @@ fn check_full_frames(
              or full, or the setting 0"
         );
     }
+    Ok(())
+}
+
+/// Refuses episodes that are too short for a window, from which nothing could be learned.
+fn check_window(spec: &TrainingSpec, info: &ServerInfo) -> Result<()> {
+    // Recorded worlds may have longer episodes than their shortest.
+    let is_cut = info.max_steps > 0 && info.recorded_world.is_none();
+    let (window, n_frames) = (
+        spec.config.autoencoder.window as u64,
+        info.max_steps.saturating_add(1),
+    );
+    ensure!(
+        spec.freeze || !is_cut || window <= n_frames,
+        "autoencoder.window: expected at most the {n_frames} frames of an episode (--max-steps of the server), got \
+         {window}"
+    );
     Ok(())
 }
 

@@ -12,6 +12,7 @@ use anyhow::{Context, Result, anyhow, bail, ensure};
 use emberwatch_network::Device;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::message::Status;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -119,6 +120,12 @@ impl TrainingSpec {
                 "the autoencoder follows one robot: expected a server with --robots 1, got {team}"
             );
         }
+        let n_worlds = info.n_worlds;
+        ensure!(
+            self.worlds.end <= n_worlds,
+            "{}",
+            Status::NoSuchWorld.explain(n_worlds.into())
+        );
         let number = |world: u32| world.checked_mul(team);
         let ends = number(self.worlds.start).zip(number(self.worlds.end));
         let (first, end) = ends.context("--world: expected a world that the server has")?;

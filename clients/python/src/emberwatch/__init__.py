@@ -17,7 +17,6 @@ import gymnasium
 
 from emberwatch import recording
 from emberwatch.client import Client, connect, embed
-from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv, WildfireVectorEnv
 from emberwatch.errors import EmberwatchError, TrainingOnTestWorldsWarning
 from emberwatch.lease import Lease
@@ -25,7 +24,7 @@ from emberwatch.moves_env import WildfireMovesEnv, WildfireMovesVectorEnv
 from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVectorEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
-from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
+from emberwatch.replies import ServerInfo, ServerStatus, WorldInfo
 from emberwatch.tasks import Task, built_in_tasks
 from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
 
@@ -38,9 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Client",
-    "Decision",
-    "Decisions",
-    "DecisionsInfo",
     "EmberwatchError",
     "Frame",
     "Lease",

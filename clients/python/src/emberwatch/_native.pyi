@@ -18,12 +18,43 @@ class _Airspace(Protocol):
     @property
     def radius(self) -> int: ...
     @property
+    def n_rings(self) -> int: ...
+    @property
     def pays(self) -> str: ...
     @property
     def no_fly(self) -> NDArray[np.bool_] | None: ...
 
+class _Text(Protocol):
+    """A model or a description."""
+
+    @property
+    def toml(self) -> str: ...
+
+class _Spec(Protocol):
+    """What counts of a `WorldSpec`."""
+
+    @property
+    def height(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def n_moves(self) -> int: ...
+    @property
+    def n_observations(self) -> int: ...
+    @property
+    def burn_in(self) -> int: ...
+    @property
+    def airspace(self) -> _Airspace: ...
+    @property
+    def model(self) -> _Text | None: ...
+    @property
+    def description(self) -> _Text | None: ...
+
 def check_settings(settings: str) -> str:
     """All settings that a server with these would have; JSON from JSON."""
+
+def worlds_fingerprint(settings: str) -> str:
+    """The `worlds_fingerprint` of a server with these settings, as JSON; simulates nothing."""
 
 class Server:
     """A connection to a server, or worlds in this process. Threads may share it, in turns."""
@@ -32,8 +63,11 @@ class Server:
         """Opens it; `client` names this program in the server's log."""
 
     @staticmethod
-    def embedded(settings: str) -> Server:
-        """Worlds in this process, of these settings of `config/server.toml`, as JSON."""
+    def embedded(settings: str, warns: bool) -> Server:
+        """Worlds in this process, of these settings of `config/server.toml`, as JSON.
+
+        `warns`: of starts that no-fly cells close in.
+        """
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
         """The hidden states of embedded worlds, as the fields of `Truth`; refused of a server's."""
@@ -65,19 +99,54 @@ class Server:
     def close(self) -> None:
         """Closes it. May be called again."""
 
-class Agent:
-    """A connection to the agent whose first world is `world`, which serves decisions."""
+class Options:
+    """Beliefs about worlds of one robot each, and the plans there; worlds count from 0."""
 
-    def __init__(self, instance: str, world: int, client: str, seconds: float) -> None: ...
+    def __init__(
+        self,
+        spec: _Spec,
+        n_worlds: int,
+        estimator: str | None,
+        checkpoint: str | None,
+        prior: str,
+        watched: tuple[str, int] | None,
+    ) -> None:
+        """Checks all arguments.
+
+        `watched`: the instance on which beliefs are shown, and which is the first world there.
+        """
+
     @property
-    def info(self) -> str:
-        """What the agent said of itself, as JSON."""
+    def estimator(self) -> str:
+        """What keeps the beliefs."""
 
-    def control(self, text: bytes, what: str, seconds: float) -> str:
-        """As `Server.control`."""
+    def begin(self, worlds: list[int], seeds: list[int]) -> None:
+        """New beliefs before the first frame."""
+
+    def take_over(self, world: int, kind: str, data: bytes) -> bool:
+        """Goes on with the belief that was left for the present step, if it fits."""
+
+    def left(self, world: int) -> tuple[str, bytes] | None:
+        """Kind and bytes of a belief, for the next who flies there."""
+
+    def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
+        """Takes in an earlier step: bytes of `wire.RESULT_DTYPE`, frames `(n, H, W)`."""
+
+    def plan(
+        self,
+        worlds: list[int],
+        results: NDArray[np.uint8],
+        frames: NDArray[np.uint8] | None,
+        flown: list[int] | None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Takes in the present step, unless it is in the belief, and plans.
+
+        Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
+        worlds, new arrays.
+        """
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Forgets all. May be called again."""
 
 class Flights:
     """The present path of each robot, as far as it is flown. Rows are robots.
@@ -197,6 +266,9 @@ class Recording:
 
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
         """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
+
+def option_names() -> tuple[list[str], list[str]]:
+    """The names of options, and those of the numbers that describe the plan of each."""
 
 def read_model(text: str) -> dict[str, Any]:
     """The fields of `Model` but `toml`; raises `ValueError` for what is no model file."""

@@ -10,8 +10,8 @@ import os
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable
-from typing import Final, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeVar
 
 from emberwatch import _native, wire
 from emberwatch.arguments import as_setting
@@ -191,14 +191,20 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
 
     Raises:
         InvalidArgumentError: If a setting is unknown or wrong.
-        EmberwatchError: With code `"embedded"` if there is too little memory.
+        NotEnoughMemoryError: If they would take more than the machine, a cgroup or a `ulimit` has.
+        EmberwatchError: With code `"threads"` if the system starts none.
     """
+    return embed_settings(settings, warns=True)
+
+
+def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
+    """Like `embed`; `warns`: of starts that no-fly cells close in, unless a check has done so."""
     # Nobody else waits for its robots.
     chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
     for name, given in settings.items():
         if given is not None:
             chosen[name] = as_setting(name, given)
-    return Client("(embedded)", embedded=_native.Server.embedded(json.dumps(chosen)))
+    return Client("(embedded)", embedded=_native.Server.embedded(json.dumps(chosen), warns))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

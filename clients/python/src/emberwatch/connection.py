@@ -37,7 +37,7 @@ class Closable:
 class Connection(Closable):
     """A channel of JSON messages. Threads may share it: they take turns."""
 
-    def __init__(self, instance: str, native: _native.Server | _native.Agent) -> None:
+    def __init__(self, instance: str, native: _native.Server) -> None:
         self.instance: Final = instance
         self._native: Any = native
 

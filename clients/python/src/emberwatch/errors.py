@@ -14,7 +14,8 @@ class EmberwatchError(Exception):
             `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
             earlier step or reset did not finish: reset or resume), `"forked"` (neither shared
             memory nor embedded worlds survive `fork`), `"embedded"` (worlds in this process could
-            not be made), `"channel"` (iceoryx2 failed), `"bad_answer"` (client and server
+            not be made), `"threads"` (the system starts no more), `"channel"` (iceoryx2, or a
+            system call that it needs, failed), `"bad_answer"` (client and server
             are not of one release), `"program"` (could not be started, or failed),
             `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
@@ -58,6 +59,12 @@ class NoServerError(EmberwatchError):
     code = "no_server"
 
 
+class NotEnoughMemoryError(EmberwatchError, MemoryError):
+    """More memory was asked for than the machine, a cgroup or a `ulimit` has."""
+
+    code = "no_memory"
+
+
 class RequestTimeoutError(EmberwatchError, TimeoutError):
     """No answer in time. A step may have been made all the same: observe before stepping again."""
 
@@ -65,7 +72,7 @@ class RequestTimeoutError(EmberwatchError, TimeoutError):
 
 
 class ServerGoneError(EmberwatchError, ConnectionError):
-    """The server, or the agent asked for decisions, ended while or before it was asked."""
+    """The server ended while or before it was asked."""
 
     code = "server_gone"
 
@@ -74,15 +81,18 @@ class TrainingOnTestWorldsWarning(UserWarning):
     """A reset has begun an episode on a test seed of the task, outside of an evaluation."""
 
 
-#: Name and sentence of each status code, from code 1; `step` sends the code alone.
-STATUSES: Final = (
+#: Name and sentence of each status code, from code 1; `step` sends the code alone. None: not used.
+STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
     (
         "version_mismatch",
         "protocol version mismatch: the server speaks {}; use a client and a server of one release",
     ),
     ("unknown_operation", "operation: expected 1 (step), 2 (observe) or 3 (recall), got {}"),
     ("malformed", "malformed control message"),
-    ("no_such_world", "no such world: the server has worlds 0 to {last}"),
+    (
+        "no_such_world",
+        "no such world: the server has worlds 0 to {last}; start it with --worlds N for more",
+    ),
     ("wrong_length", "wrong payload length: expected {} bytes"),
     ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
     ("bad_move", "byte {} of the payload: expected a move in 0..=3"),
@@ -97,8 +107,8 @@ STATUSES: Final = (
         "takes no steps",
     ),
     ("unknown_flags", "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {}"),
-    ("bad_objective", "objective: expected one below {}"),
-    ("agent_ends", "the agent ends"),
+    None,
+    None,
     ("bad_file", "the file cannot be used"),
     ("not_kept", "not kept: the nearest step that is kept is {}"),
     (
@@ -111,21 +121,28 @@ STATUSES: Final = (
         "incomplete: robot {} is missing; a step names all robots that its client holds in a "
         "world, and a step of several worlds needs them all",
     ),
-    ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
-    ("no_memory", "shared memory is full: free some, and ask again"),
+    (
+        "no_such_robot",
+        "no such robot: the server has robots 0 to {last}; start it with --worlds N for more "
+        "worlds, or --robots N for more in each",
+    ),
+    ("no_memory", "memory: expected {} bytes for the answer, got less; ask for fewer robots"),
 )
 
-_CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}
+_CLASSES: Final = {"lease_lost": LeaseLostError, "no_memory": NotEnoughMemoryError}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
     """The error of a status code other than 0, in the server's words if they fit Python."""
-    if not 1 <= status <= len(STATUSES):
+    known = STATUSES[status - 1] if 1 <= status <= len(STATUSES) else None
+    if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"
         return EmberwatchError(message, detail=detail)
-    code, sentence = STATUSES[status - 1]
+    code, sentence = known
     if code == "lease_lost" and detail == 0:
         sentence = "lease lost: it expired or was released; acquire the robots again"
+    if code == "no_memory" and detail == 0:
+        sentence = "shared memory is full: free some, and ask again"
     if message is None or code == "busy":  # the server's words name a flag, not a keyword
         message = sentence.format(detail, last=max(detail - 1, 0))
     return _CLASSES.get(code, EmberwatchError)(message, code, detail)

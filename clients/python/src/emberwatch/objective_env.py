@@ -3,40 +3,30 @@
 For one world, or for many.
 """
 
-from os import PathLike, fspath
-from typing import Any, Literal, Unpack
+from os import PathLike
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch.agent_session import AgentSession, AgentSessionOwner, Features
 from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, WorldEnv
+from emberwatch.plans import Estimator, FirstBelief, Plans, PlansOwner
+from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
-from emberwatch.vector_base import WorldVectorEnv
+from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.wire import StepAnswer
 
-_Estimator = Literal[
-    "known_model",
-    "spatial_filter",
-    "learned_filter",
-    "learned_spatial_filter",
-    "learned_own_filter",
-    "learned_own_spatial_filter",
-    "neural_belief",
-]
 
-
-class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
+class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     """The paper's high-level decision: what the next path of the robot is for.
 
     ## Description
 
-    The world is that of `WildfireEnv`. An `emberwatch-agent` keeps the belief about it, plans a
-    path for each of eight objectives, and describes what each path promises. A learner here
-    chooses which of them is flown: it takes the place of the paper's deep Q-network (section
-    III.E).
+    The world is that of `WildfireEnv`. The environment keeps the belief about it, plans a path for
+    each of eight objectives, and describes what each path promises. A learner chooses which of them
+    is flown: it takes the place of the paper's deep Q-network (section III.E).
 
     ## Action Space
 
@@ -47,12 +37,14 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
     ## Observation Space
 
     `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
-    `feature_names` names the 26 numbers, PROTOCOL.md section 13 explains them. One network can
-    score each row by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of them.
+    `feature_names` names the 26 numbers, docs/environments/objective.md explains them. One network
+    can score each row by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of them.
 
     ## Starting State
 
-    As `WildfireEnv`, with the first belief that `prior` names, or the learned one.
+    As `WildfireEnv`, with the first belief that `prior` names, or the learned one. With
+    ``reset(options={"resume": True})`` the belief is the one that was left for the world's present
+    step, or else is made anew from the frames of the episode that are still kept.
 
     ## Rewards, Episode End, Information
 
@@ -72,13 +64,15 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
       second), `"initial"` or `"uniform"`.
-    * `agent`: `"own"` starts an agent on the world; `"running"` uses one that serves decisions
-      already, for `world` of `instance`.
+
+    With `instance`, beliefs and plans are kept here, too: other clients see the beliefs as those of
+    `emberwatch-agent`, and `close` leaves them to whoever flies next. A server that hides its model
+    needs `model`, or a `checkpoint`.
 
     ## Vectorized environment
 
     `gymnasium.make_vec("emberwatch/WildfireObjective-v1", num_envs=64)` is
-    `WildfireObjectiveVectorEnv`: one agent decides for all worlds.
+    `WildfireObjectiveVectorEnv`: all worlds are planned for at once, on several threads.
 
     ## Version History
 
@@ -89,25 +83,26 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
     def __init__(
         self,
         *,
-        estimator: _Estimator | None = None,
+        estimator: Estimator | None = None,
         checkpoint: str | PathLike[str] | None = None,
-        prior: Literal["simulated", "initial", "uniform"] = "simulated",
-        agent: Literal["own", "running"] = "own",
+        prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
-        settings = Settings.of(WildfireObjectiveEnv, world)
-        self._agent = AgentSession(settings, _arguments(estimator, checkpoint, prior, agent))
-        super().__init__(self._agent)
-        self.action_space = self._agent.action_space
-        self.observation_space = self._agent.space
+        session = Session(Settings.of(WildfireObjectiveEnv, world))
+        super().__init__(session)
+        self._plans = Plans(session, estimator, checkpoint, prior)
+        self.action_space = self._plans.action_space
+        self.observation_space = self._plans.space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`. An agent that does not start says why."""
+        """Begins an episode; see `WildfireEnv`."""
         with self._session.turn:
-            seen = self._seen(self._begin(seed, options))
+            answer = self._begin(seed, options)
+            self._plans.begin(ONE_ROW, answer.results, answer.frames)
+            seen = self._seen(answer)
             self._session.finish()
         return seen
 
@@ -117,32 +112,39 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
         """Flies the path planned for an objective.
 
         Raises:
-            EmberwatchError: As `WildfireEnv.step`, in the agent's words if it has ended.
+            EmberwatchError: As `WildfireEnv.step`.
         """
-        objective = as_choice(action, int(self._agent.action_space.n))
+        choice = np.array([as_choice(action, int(self._plans.action_space.n))], np.uint8)
         with self._session.turn:
             self._session.begin_step()
-            answer = self._agent.decide(np.array([objective], np.uint8), ONE_ROW)
+            path = self._plans.paths(choice)
+            answer = self._session.step(path)
+            self._plans.see(ONE_ROW, choice, answer.results, answer.frames)
+            result = answer.result()
             if self.render_mode is not None:
-                self._path = self._agent.paths[0]
+                self._trace(result.robot, path[0])
             observation, info = self._seen(answer)
-            world = answer.result().world
+            world = result.world
             self._session.finish()
         return observation, world.reward, bool(world.terminated), bool(world.truncated), info
+
+    def close(self) -> None:
+        self._plans.close(None if self._answer is None else self._answer.results)
+        super().close()
 
     def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
         self._answer = answer
         info = self._describe(answer, answer.result())
         if self.render_mode == "human":
             self._draw()
-        return self._agent.features[0], info
+        return self._plans.features[0], info
 
 
-class WildfireObjectiveVectorEnv(AgentSessionOwner, WorldVectorEnv):
-    """Many worlds of `WildfireObjectiveEnv`: one message to one agent, which steps them together.
+class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
+    """Many worlds of `WildfireObjectiveEnv`, stepped and planned for together.
 
     As `WildfireVectorEnv`; arguments are those of `WildfireObjectiveEnv`, and `num_envs`,
-    `max_episode_steps`, `autoreset_mode`. With `agent="running"` that agent acts on these worlds.
+    `max_episode_steps`, `autoreset_mode`.
     """
 
     @shows_keywords
@@ -152,39 +154,33 @@ class WildfireObjectiveVectorEnv(AgentSessionOwner, WorldVectorEnv):
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        estimator: _Estimator | None = None,
+        estimator: Estimator | None = None,
         checkpoint: str | PathLike[str] | None = None,
-        prior: Literal["simulated", "initial", "uniform"] = "simulated",
-        agent: Literal["own", "running"] = "own",
+        prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
-        settings = Settings.of(WildfireObjectiveVectorEnv, world)
-        arguments = _arguments(estimator, checkpoint, prior, agent)
-        self._agent = AgentSession(settings, arguments, num_envs)
+        session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
+        self._plans = Plans(session, estimator, checkpoint, prior)
         super().__init__(
-            self._agent,
-            Features(self._agent),
-            self._agent.action_space,
+            session,
+            self._plans,
+            self._plans.action_space,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
 
+    def close_extras(self, **kwargs: Any) -> None:
+        self._plans.close(self._results)
+        super().close_extras(**kwargs)
+
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
-        return as_choices(actions, self.num_envs, int(self._agent.action_space.n))
+        return as_choices(actions, self.num_envs, int(self._plans.action_space.n))
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
-        if flown.any():
-            self._take(self._agent.decide(actions, flown))
-        self._exchanged = flown
-        if self.render_mode is not None:
-            for index in np.flatnonzero(flown).tolist():
-                self._paths[index] = self._agent.paths[index]
+        self._exchange(self._plans.paths(actions), flown)
+        self._plans.see(flown, actions, self._results, self._frames)
         return self._results["world"]["reward"].copy()
 
-
-def _arguments(
-    estimator: str | None, checkpoint: str | PathLike[str] | None, prior: str, agent: str
-) -> dict[str, str | None]:
-    file = None if checkpoint is None else fspath(checkpoint)
-    return {"estimator": estimator, "checkpoint": file, "prior": prior, "agent": agent}
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        self._plans.begin(begun, self._results, self._frames)

@@ -1,4 +1,4 @@
-"""Reads recordings, the files of `emberwatch-server record` (PROTOCOL.md section 14).
+"""Reads recordings, the files of `emberwatch-server record` (PROTOCOL.md section 13).
 
 Such as `for record in emberwatch.recording.read("lab.recording", world=0): ...`. It needs no server
 and opens no shared memory.

@@ -151,53 +151,6 @@ class LeftBelief(NamedTuple):
     data: bytes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DecisionsInfo:
-    """How an agent that serves decisions describes itself."""
-
-    protocol: int
-    build: str
-    pid: int
-    instance: str
-    #: The first of its worlds.
-    first_world: int
-    n_worlds: int
-    height: int
-    width: int
-    n_moves: int
-    max_steps: int
-    states: tuple[str, ...]
-    #: What can be decided, by position: plans, by their names.
-    objectives: tuple[str, ...]
-    #: What keeps the belief.
-    estimator: str
-    #: Names of the numbers that describe a plan.
-    features: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
-    """What came of a world's last decision: the step's result, and what the next plans promise.
-
-    `seed` and `n_target_cells` are not for learners.
-    """
-
-    step: int
-    reward: float
-    n_target_cells: int
-    n_visited: int
-    n_hits: int
-    robot: tuple[int, int]
-    terminated: bool
-    truncated: bool
-    seed: int
-    episode: int
-    #: What was decided; None after a reset.
-    objective: int | None
-    #: Of each objective's plan, in base64: `Decisions.features` reads them.
-    features: str
-
-
 def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
     """The records of a reply's worlds."""
     worlds = reply.get("worlds")

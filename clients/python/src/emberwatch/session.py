@@ -10,7 +10,7 @@ import os
 import threading
 import warnings
 import weakref
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.client import Client, connect, embed
+from emberwatch.client import Client, connect, embed_settings
 from emberwatch.connection import RESET_TIMEOUT
 from emberwatch.errors import (
     EmberwatchError,
@@ -33,6 +33,7 @@ from emberwatch.errors import (
 from emberwatch.lease import Lease
 from emberwatch.observer import Newest, Present, Truth, TruthReader
 from emberwatch.programs import Program, unused_instance
+from emberwatch.replies import LeftBelief
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.tasks import FIRST_TRAINING_SEED
 from emberwatch.wire import StepAnswer, WorldResult
@@ -249,10 +250,36 @@ class Session:
         step = int(answer.worlds["step"][0])
         return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
+    def left_belief(self, row: int) -> LeftBelief | None:
+        """The belief that was left for a robot's present step."""
+        if self._client is None:
+            raise not_reset()
+        try:
+            return self._client.belief(self._robots[row], timeout=self.settings.timeout)
+        except LOST as error:
+            raise self._lost(error) from None
+
+    def history(self, row: int, step: int) -> Iterator[StepAnswer]:
+        """The steps of a robot's episode before this one, from the first on whose are all kept."""
+        client, robot, past = self._client, self._robots[row], 0
+        while client is not None and past < step:
+            try:
+                yield client.recall(past, robot, timeout=self.settings.timeout)
+            except LOST as error:
+                raise self._lost(error) from None
+            except EmberwatchError as error:
+                if error.code != "not_kept":
+                    raise
+                if past > 0:
+                    return
+                past = error.detail - 1
+            past += 1
+
     def launch(self, seed: int) -> Client:
         """Begins worlds of its own, with this seed for world 0; `close` ends them."""
         if self.settings.is_embedded:
-            return embed(seed=seed, **self.settings.of_server(self.n_worlds))
+            chosen = {"seed": seed, **self.settings.of_server(self.n_worlds)}
+            return embed_settings(chosen, warns=False)
         instance = unused_instance()
         flags = [f"--instance={instance}", f"--seed={seed}"]
         flags += self.settings.server_flags(self.n_worlds)

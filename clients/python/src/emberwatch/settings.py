@@ -10,7 +10,7 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
-from emberwatch.airspace import Airspace, Zones
+from emberwatch.airspace import MAX_RADIUS, Airspace, Zones
 from emberwatch.arguments import as_setting, check_settings
 from emberwatch.connection import STEP_TIMEOUT
 from emberwatch.errors import InvalidArgumentError, invalid
@@ -108,6 +108,8 @@ class Settings:
         for name in ("task", "model", "states", "start"):
             if getattr(self, name) is not None:
                 utf8(name, getattr(self, name))
+        if self.sensor_radius is not None and not 0 <= self.sensor_radius <= MAX_RADIUS:
+            raise invalid("sensor_radius", f"0 to {MAX_RADIUS}, or None", self.sensor_radius)
         if self.robots is not None and self.robots < 1:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
@@ -291,7 +293,8 @@ def running_spec(
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
-        raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", f"{first} to {last}")
+        got = f"{first} to {last}; start the server with --worlds N for more"
+        raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", got)
     if settings.truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
     model = None if info.model is None else Model.from_toml(info.model)

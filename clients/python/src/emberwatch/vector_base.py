@@ -15,7 +15,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from emberwatch.agent_session import Features
 from emberwatch.arguments import as_array, as_integer, as_seed, told
 from emberwatch.base import (
     NOTHING_TO_DRAW,
@@ -27,6 +26,7 @@ from emberwatch.errors import invalid
 from emberwatch.moves import fly
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.owner import SessionOwner
+from emberwatch.plans import Plans
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import View
@@ -44,7 +44,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def __init__(
         self,
         session: Session,
-        observations: Observations | Features,
+        observations: Observations | Plans,
         action_space: spaces.Space[Any],
         *,
         max_episode_steps: int | None,

@@ -24,16 +24,23 @@ pub(super) struct Places {
 impl Places {
     pub(super) fn new(model: &Model, shape: Shape) -> Self {
         let (_, _, kernel_height, kernel_width) = model.kernel().dim();
-        let stride = shape.width() + kernel_width - 1;
-        let n_homes = (shape.height() * stride).next_multiple_of(LANES);
-        let n_places = n_homes + (kernel_height - 1) * stride + kernel_width - 1;
+        let (n_places, n_homes) = Self::lengths(model, shape);
         Self {
             width: shape.width(),
-            stride,
+            stride: shape.width() + kernel_width - 1,
             margins: [kernel_height / 2, kernel_width / 2],
             states: vec![OFF_GRID; n_places],
             next: vec![0; n_homes],
         }
+    }
+
+    /// The number of places, and that of homes.
+    pub(super) fn lengths(model: &Model, shape: Shape) -> (usize, usize) {
+        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let stride = shape.width() + kernel_width - 1;
+        let n_homes = (shape.height() * stride).next_multiple_of(LANES);
+        let n_places = n_homes + (kernel_height - 1) * stride + kernel_width - 1;
+        (n_places, n_homes)
     }
 
     /// Where each tap of a model's kernel reads, relative to a cell's home.

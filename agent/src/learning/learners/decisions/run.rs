@@ -44,15 +44,24 @@ impl Run {
         self.rollout.agent.take_up(option, proposal).moves
     }
 
-    /// Takes in the features of what can be flown now; gives the transition that is complete by then.
-    pub(super) fn led_to(&mut self, features: &[f32]) -> Option<Transition> {
+    /// Adds the step that led to these features of all options; returns the transition that it completes.
+    pub(super) fn led_to(&mut self, features: &[f32], dqn: &Dqn) -> Option<Transition> {
         let (input, reward) = self.last.take()?;
+        let is_terminated = self.rollout.observation().world.terminated != 0;
         self.track.add(Transition {
             input,
             action: 0,
             reward,
             next: features.to_vec(),
+            discount: dqn.discount(is_terminated),
         })
+    }
+
+    /// Ends the episode; returns the transitions of its last steps, up to the options of its last state.
+    pub(super) fn end(&mut self, dqn: &Dqn) -> Vec<Transition> {
+        let features = features(&self.propose());
+        let full = self.led_to(&features, dqn);
+        full.into_iter().chain(self.track.end()).collect()
     }
 
     pub(super) fn saved(&self) -> SavedRun {
@@ -94,4 +103,9 @@ impl Run {
             next: None,
         })
     }
+}
+
+/// The features of all options, one after the other.
+pub(super) fn features(proposals: &[Proposal]) -> Vec<f32> {
+    proposals.iter().flat_map(|it| it.features).collect()
 }

@@ -7,6 +7,7 @@ pub use self::neighbours::Neighbours;
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Optimiser, Update};
+use crate::learning::learners::base::lacks_steps;
 use crate::learning::learners::filter::form::{Form, check_zones, named_tensors, zones_tensor};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
@@ -152,6 +153,23 @@ impl FilterFit {
         } else {
             KIND
         }
+    }
+
+    /// Why a run of that many steps made no update, and what to do.
+    pub fn lacks(&self, steps: u64) -> String {
+        let config = self.optimiser.config();
+        let (expected, got) = (config.streams, self.replay.n_blocks());
+        if got < expected {
+            return format!(
+                "an update needs {expected} blocks of frames (learning.streams), and there were {got}; a block ends \
+                 after {} frames or with its episode: train for more --steps",
+                config.window * config.block_windows
+            );
+        }
+        if steps as f64 * config.updates_per_step < 1.0 {
+            return lacks_steps("learning.updates_per_step", config.updates_per_step);
+        }
+        "the frames show no cell".into()
     }
 
     pub fn n_updates(&self) -> u64 {

@@ -1,0 +1,468 @@
+//! Options: the beliefs about worlds of one robot each, and all plans there that a learner chooses among.
+
+use crate::airspace::Given;
+use crate::belief::first_belief;
+use crate::connection::checked;
+use crate::errors::error;
+use crate::model::{model_of, shape_of};
+use crate::owned::Owned;
+use crate::refusal::{failed, invalid};
+use anyhow::{Context, Result, ensure};
+use emberwatch_agent::acting::options::{Crew, Planned, Shown};
+use emberwatch_agent::client::feed::{Feed, View};
+use emberwatch_agent::config::{AgentConfig, PriorKind};
+use emberwatch_agent::learning::learned::Learned;
+use emberwatch_agent::policy::EstimatorKind;
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::Prior;
+use emberwatch_belief::estimation::estimator::EstimatorError;
+use emberwatch_belief::planning::OPTIONS;
+use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
+use emberwatch_network::Device;
+use emberwatch_protocol::agent_belief::Intent;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::message::{RobotResult, WorldResult};
+use emberwatch_protocol::model::Description;
+use emberwatch_protocol::path::path_to_bytes;
+use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use emberwatch_protocol::{Frame, Model};
+use numpy::ndarray::{Array3, ArrayView1, s};
+use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
+use pyo3::prelude::*;
+use rayon::prelude::*;
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+/// Bytes of a world's result and its robot's.
+const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
+
+/// What plans promise, and their paths.
+type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
+
+/// The names of the options, and those of the numbers that describe the plan of each.
+#[pyfunction]
+pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
+    (
+        OPTIONS.iter().map(|option| option.name).collect(),
+        feature_names(),
+    )
+}
+
+/// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
+#[derive(FromPyObject)]
+pub struct Spec<'py> {
+    height: usize,
+    width: usize,
+    n_moves: usize,
+    n_observations: usize,
+    burn_in: u64,
+    model: Option<Text>,
+    description: Option<Text>,
+    airspace: Given<'py>,
+}
+
+/// A file's text.
+#[derive(FromPyObject)]
+struct Text {
+    toml: String,
+}
+
+/// The beliefs about many worlds, and what can be flown next in each.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Options {
+    /// What keeps the beliefs.
+    #[pyo3(get)]
+    estimator: String,
+    /// How the first belief is made, once it is needed.
+    first: (Prior, Model),
+    prior: OnceLock<Belief>,
+    state: Owned<State>,
+}
+
+struct State {
+    crew: Crew,
+    /// `None` before a world's first episode.
+    worlds: Vec<Option<Planned>>,
+    /// Of its own, as those of a global pool do not survive a fork.
+    threads: Option<ThreadPool>,
+    watched: Option<Watched>,
+}
+
+/// Where beliefs are shown to those who watch.
+struct Watched {
+    instance: Instance,
+    first_world: u32,
+    feed: Option<Feed>,
+}
+
+/// What one world shows, and what of it is to be done.
+struct Task<'a> {
+    index: usize,
+    planned: &'a mut Planned,
+    world: WorldResult,
+    robot: RobotResult,
+    /// Seen before, if there is none.
+    frame: Option<&'a [u8]>,
+    flown: Option<usize>,
+    plans: bool,
+    is_shown: bool,
+}
+
+/// What is shown of a world: the belief after its frame.
+struct Outlook {
+    index: usize,
+    world: WorldResult,
+    belief: Belief,
+    intent: Intent,
+}
+
+#[pymethods]
+impl Options {
+    /// Checks all arguments; beliefs begin later. `watched`: the instance on which beliefs are shown, and its first
+    /// world here.
+    #[new]
+    fn new(
+        py: Python<'_>,
+        spec: Spec<'_>,
+        n_worlds: usize,
+        estimator: Option<&str>,
+        checkpoint: Option<PathBuf>,
+        prior: &str,
+        watched: Option<(String, u32)>,
+    ) -> PyResult<Self> {
+        let estimator = estimator.map(str::parse).transpose();
+        let estimator: Option<EstimatorKind> =
+            estimator.map_err(|problem: String| refused(py, format!("estimator: {problem}")))?;
+        let kind: PriorKind = serde_json::from_value(prior.into()).map_err(|_| {
+            let got = format!("'{prior}'");
+            invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
+        })?;
+        let learned = py.detach(|| Learned::read(checkpoint.as_deref(), &Device::Cpu));
+        let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
+        let shape = shape_of(py, spec.height, spec.width)?;
+        let kind_of_belief = estimator.unwrap_or_else(|| learned.estimator());
+        let model = model(py, &spec, kind_of_belief)?;
+        let crew = Crew::new(estimator, learned, model, shape, spec.n_moves);
+        let crew = crew.map_err(|error| refused(py, format!("{error:#}")))?;
+        let config = AgentConfig {
+            prior: kind,
+            ..AgentConfig::default()
+        };
+        let first = if crew.estimator().knows_model() {
+            config.prior(spec.burn_in)
+        } else {
+            Prior::Initial
+        };
+        let watched = watched.map(|(instance, first_world)| {
+            Ok::<_, PyErr>(Watched {
+                instance: checked(py, &instance)?,
+                first_world,
+                feed: None,
+            })
+        });
+        Ok(Self {
+            estimator: crew.estimator().label(),
+            first: (first, crew.model().clone()),
+            prior: OnceLock::new(),
+            state: Owned::new(
+                "options",
+                State {
+                    crew,
+                    worlds: (0..n_worlds).map(|_| None).collect(),
+                    threads: None,
+                    watched: watched.transpose()?,
+                },
+            ),
+        })
+    }
+
+    /// New beliefs, before the first frame of some worlds with these seeds; the first time the first one may be
+    /// simulated.
+    fn begin(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
+        let prior = match self.prior.get() {
+            Some(prior) => prior,
+            None => {
+                let shape = self.state.with(py, |state| state.crew.shape())?;
+                let (prior, model) = &self.first;
+                let prior = first_belief(py, *prior, model, shape)?;
+                self.prior.get_or_init(|| prior)
+            }
+        };
+        let begun = self.state.with(py, |state| {
+            state.begin(worlds.into_iter().zip(seeds), prior)
+        });
+        begun?.map_err(|error| raise(py, &error))
+    }
+
+    /// Goes on in a world with the belief that another left for the present step; whether it fits.
+    fn take_over(&self, py: Python<'_>, world: usize, kind: &str, data: &[u8]) -> PyResult<bool> {
+        self.state.with(py, |state| {
+            let planned = state.worlds.get_mut(world).and_then(Option::as_mut);
+            planned.is_some_and(|planned| planned.take_over(kind, data))
+        })
+    }
+
+    /// Kind and bytes of the belief about a world, for the next who flies there.
+    fn left(&self, py: Python<'_>, world: usize) -> PyResult<Option<(String, Vec<u8>)>> {
+        self.state.with(py, |state| {
+            let agent = state.worlds.get(world)?.as_ref()?.agent();
+            agent.handover_kind().zip(agent.handover())
+        })
+    }
+
+    /// Takes in an earlier step of some worlds: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
+    fn see(
+        &self,
+        py: Python<'_>,
+        worlds: Vec<usize>,
+        results: PyReadonlyArray1<'_, u8>,
+        frames: PyReadonlyArray3<'_, u8>,
+    ) -> PyResult<()> {
+        let (results, frames) = (results.as_slice()?, frames.as_slice()?);
+        let seen = self.state.with(py, |state| {
+            state.update(&worlds, results, Some(frames), None, false)
+        });
+        seen?.map_err(|error| raise(py, &error))
+    }
+
+    /// Takes in the present step of some worlds, unless it is in the belief already, and plans all options there.
+    /// Features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds; `flown`: which
+    /// options brought them there.
+    fn plan<'py>(
+        &self,
+        py: Python<'py>,
+        worlds: Vec<usize>,
+        results: PyReadonlyArray1<'py, u8>,
+        frames: Option<PyReadonlyArray3<'py, u8>>,
+        flown: Option<Vec<usize>>,
+    ) -> PyResult<Plans<'py>> {
+        let results = results.as_slice()?;
+        let frames = frames.as_ref().map(|frames| frames.as_slice());
+        let frames = frames.transpose()?;
+        let plans = self.state.with(py, |state| {
+            state.update(&worlds, results, frames, flown.as_deref(), true)?;
+            Ok(state.plans())
+        });
+        let (features, paths) = plans?.map_err(|error| raise(py, &error))?;
+        Ok((features.into_pyarray(py), paths.into_pyarray(py)))
+    }
+
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        self.state.close(py)
+    }
+}
+
+impl State {
+    fn begin(&mut self, seeds: impl Iterator<Item = (usize, u64)>, prior: &Belief) -> Result<()> {
+        let seeds: Vec<(usize, u64)> = seeds.collect();
+        let Self { crew, threads, .. } = self;
+        let begun = in_parallel(crew, threads, seeds, |(world, seed)| {
+            Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?))
+        });
+        for begun in begun {
+            let (world, planned) = begun?;
+            let n_worlds = self.worlds.len();
+            let place = self.worlds.get_mut(world);
+            *place.with_context(|| no_such_world(n_worlds, world))? = Some(planned);
+        }
+        Ok(())
+    }
+
+    /// Takes in frames, and plans.
+    fn update(
+        &mut self,
+        worlds: &[usize],
+        results: &[u8],
+        frames: Option<&[u8]>,
+        flown: Option<&[usize]>,
+        plans: bool,
+    ) -> Result<()> {
+        let n_cells = self.crew.shape().n_cells();
+        ensure!(
+            results.len() == worlds.len() * RESULT_BYTES
+                && frames.is_none_or(|frames| frames.len() == worlds.len() * n_cells)
+                && flown.is_none_or(|flown| flown.len() == worlds.len()),
+            "options: expected a result, a frame and an option for each of {} worlds, got others",
+            worlds.len()
+        );
+        let shown = self.shown(worlds.len() * usize::from(plans && frames.is_some()));
+        let mut row_of = vec![None; self.worlds.len()];
+        for (row, &world) in worlds.iter().enumerate() {
+            let place = row_of.get_mut(world);
+            *place.with_context(|| no_such_world(self.worlds.len(), world))? = Some(row);
+        }
+        let Self {
+            crew,
+            threads,
+            worlds: all,
+            ..
+        } = self;
+        let tasks = all.iter_mut().zip(row_of).enumerate();
+        let tasks = tasks.filter_map(|(index, (planned, row))| {
+            let (planned, row) = (planned.as_mut()?, row?);
+            let result = &results[row * RESULT_BYTES..][..RESULT_BYTES];
+            let (world, robot) = result.split_at(WORLD_BYTES);
+            Some(Task {
+                index,
+                planned,
+                world: bytemuck::pod_read_unaligned(world),
+                robot: bytemuck::pod_read_unaligned(robot),
+                frame: frames.map(|frames| &frames[row * n_cells..][..n_cells]),
+                flown: flown.map(|flown| flown[row]),
+                plans,
+                is_shown: shown.contains(&row),
+            })
+        });
+        let done = in_parallel(crew, threads, tasks.collect(), |task| task.done(crew));
+        let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
+        self.show(outlooks.into_iter().flatten());
+        Ok(())
+    }
+
+    /// What the last plans of all worlds promise, and their paths.
+    fn plans(&self) -> (Array3<f32>, Array3<u8>) {
+        let dim = (self.worlds.len(), OPTIONS.len());
+        let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
+        let mut paths = Array3::zeros((dim.0, dim.1, self.crew.n_moves()));
+        for (world, planned) in self.worlds.iter().enumerate() {
+            let proposals = planned.iter().flat_map(Planned::proposals);
+            for (option, proposal) in proposals.enumerate() {
+                let of_option = s![world, option, ..];
+                features
+                    .slice_mut(of_option)
+                    .assign(&ArrayView1::from(&proposal.features));
+                let moves = path_to_bytes(&proposal.plan.moves);
+                paths.slice_mut(of_option).assign(&ArrayView1::from(&moves));
+            }
+        }
+        (features, paths)
+    }
+
+    /// Which of so many worlds are to be shown now.
+    fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
+        let begun = self.worlds.iter().flatten().next();
+        let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
+            return Vec::new();
+        };
+        let belief = || begun.agent().belief();
+        let feed = watched
+            .feed
+            .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
+        if n_worlds == 0 {
+            Vec::new()
+        } else {
+            feed.turn(n_worlds)
+        }
+    }
+
+    fn show(&mut self, outlooks: impl Iterator<Item = Outlook>) {
+        let Some(watched) = &mut self.watched else {
+            return;
+        };
+        for outlook in outlooks {
+            let world = watched.first_world + outlook.index as u32;
+            let view = View {
+                world,
+                robots: world..world + 1,
+                result: &outlook.world,
+                belief: &outlook.belief,
+                intent: outlook.intent,
+            };
+            if let Some(feed) = &mut watched.feed {
+                feed.show(&view);
+            }
+        }
+    }
+}
+
+impl Task<'_> {
+    fn done(self, crew: &Crew) -> Result<Option<Outlook>> {
+        let planned = self.planned;
+        let mut outlook = None;
+        if let Some(frame) = self.frame {
+            let intent = self.is_shown.then(|| planned.intent(self.flown));
+            let n_observations = crew.model().n_observations();
+            planned.see(&Shown {
+                frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
+                reward: (self.world.step > 0).then_some(self.robot.reward),
+            })?;
+            outlook = intent.map(|intent| Outlook {
+                index: self.index,
+                world: self.world,
+                belief: planned.agent().belief().clone(),
+                intent,
+            });
+            planned.predict();
+        }
+        if self.plans {
+            planned.plan(self.robot.cell());
+        }
+        Ok(outlook)
+    }
+}
+
+/// The results in order. One task alone is done here: handing it to another thread costs more than it gains, but for
+/// networks, whose own threads must be among these.
+fn in_parallel<T: Send, U: Send>(
+    crew: &Crew,
+    threads: &mut Option<ThreadPool>,
+    tasks: Vec<T>,
+    work: impl Fn(T) -> U + Send + Sync,
+) -> Vec<U> {
+    if tasks.len() == 1 && crew.estimator() != EstimatorKind::Neural {
+        return tasks.into_iter().map(work).collect();
+    }
+    if threads.is_none() {
+        *threads = ThreadPoolBuilder::new().build().ok();
+    }
+    match threads {
+        Some(threads) => threads.install(|| tasks.into_par_iter().map(work).collect()),
+        // The system gives no threads.
+        None => tasks.into_iter().map(work).collect(),
+    }
+}
+
+/// The model that filters know, or what is known of the worlds in its place.
+fn model(py: Python<'_>, spec: &Spec<'_>, estimator: EstimatorKind) -> PyResult<Model> {
+    if let Some(model) = &spec.model {
+        return model_of(&model.toml);
+    }
+    if estimator.knows_model() {
+        let got = match spec.description {
+            Some(_) => "recorded worlds, which have none",
+            None => "a server that hides its own",
+        };
+        let expected = format!(
+            "one for the estimator '{}', or a checkpoint of a learned belief",
+            estimator.label()
+        );
+        return Err(invalid(py, "model", expected, got));
+    }
+    let model = match &spec.description {
+        Some(description) => Description::model_of(&description.toml),
+        None => spec.airspace.seen(spec.n_observations).unchanging(),
+    };
+    model.map_err(|error| refused(py, error.to_string()))
+}
+
+fn no_such_world(n_worlds: usize, got: usize) -> String {
+    format!("options: expected a world below {n_worlds}, got {got}")
+}
+
+fn refused(py: Python<'_>, problem: String) -> PyErr {
+    error(py, "InvalidArgumentError", (problem,))
+}
+
+fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
+    let is_impossible = matches!(
+        error.downcast_ref::<EstimatorError>(),
+        Some(EstimatorError::ZeroEvidence(_))
+    );
+    let code = if is_impossible {
+        "impossible_frame"
+    } else {
+        "program"
+    };
+    failed(py, &format!("{error:#}"), code)
+}

@@ -1,0 +1,15 @@
+"""A policy in Python on the benchmark's worlds, for the table of `emberwatch-agent compare`.
+
+    rows = evaluate(policy, name="ppo", seeds=range(32), csv="ppo.csv", model="wildfire-small", ...)
+
+`emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, adds them to its table,
+paired by world.
+"""
+
+from emberwatch.benchmark.evaluation import evaluate as evaluate
+from emberwatch.benchmark.evaluation import suite as suite
+from emberwatch.benchmark.policies import Policy as Policy
+from emberwatch.benchmark.report import summary as summary
+from emberwatch.benchmark.rows import Row as Row
+from emberwatch.benchmark.rows import read as read
+from emberwatch.tasks import FIRST_TRAINING_SEED as FIRST_TRAINING_SEED

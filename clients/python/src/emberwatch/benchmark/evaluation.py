@@ -1,0 +1,422 @@
+"""Policies in Python on the benchmark's worlds."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, TextIO, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from emberwatch import _native, wire
+from emberwatch.arguments import as_integer, as_seed, told
+from emberwatch.benchmark.digest import digest
+from emberwatch.benchmark.policies import Actor, Policy, statistics
+from emberwatch.benchmark.report import Progress
+from emberwatch.benchmark.row_file import Kind, Mark, RowFile
+from emberwatch.benchmark.rows import Row
+from emberwatch.benchmark.tally import Tally
+from emberwatch.client import Client
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.merit import RECENT_STEPS
+from emberwatch.model import Model
+from emberwatch.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.release import VERSION
+from emberwatch.replies import ServerInfo
+from emberwatch.settings import Settings, WorldArguments
+from emberwatch.tasks import Task, built_in_tasks
+
+_MOVES: Final = "emberwatch/WildfireMoves-v0"
+_PATHS: Final = "emberwatch/Wildfire-v0"
+
+#: Of `emberwatch-agent compare`.
+_BURN_IN: Final = 25_000
+_SEEDS: Final = range(8)
+_STEPS: Final = 1500
+
+#: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
+_TIMEOUT: Final = 30.0
+
+#: Keywords of the environment that an evaluation sets itself.
+_SET: Final = ("reward", "num_envs", "max_episode_steps", "autoreset_mode")
+
+
+def evaluate(
+    policy: Policy | Any,
+    *,
+    name: str,
+    seeds: Iterable[int] | None = None,
+    steps: int | None = None,
+    burn_in: int | None = None,
+    env: str = _MOVES,
+    estimator: str | None = None,
+    deterministic: bool = True,
+    batch: int = 32,
+    recent_steps: int = RECENT_STEPS,
+    wrap: Callable[[Any], Any] | None = None,
+    csv: str | os.PathLike[str] | RowFile | None = None,
+    progress: TextIO | None = sys.stderr,
+    **keywords: Any,
+) -> list[Row]:
+    """Scores a policy; defaults are those of `emberwatch-agent compare`.
+
+    Args:
+        policy: A function from the stacked observations of some worlds to their actions, or a model
+            of Stable-Baselines3 or another object with its `predict`. Models with a memory get
+            their state back; `episode_start` is true in the first step of a world only. A function
+            or `predict` with a parameter `action_masks` gets the masks of the worlds,
+            `(n_worlds, 4)` booleans. Observations are normalized for a model that was trained
+            behind `VecNormalize` and still has it (`get_vec_normalize_env`). If the policy has a
+            method `begin(n_worlds)`, that is called whenever other worlds begin.
+        name: What the table calls it.
+        seeds: The worlds; None: those to test the task on, or 0 to 7. Those below 1000 are test
+            worlds.
+        steps: Scored steps, thus paths, of each world; None: those of the task, or 1,500.
+        burn_in: Steps before the first scored one; None: 25,000, or as the task or the running
+            server has it. Recorded worlds have none.
+        env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
+        estimator: What the table says of its belief; None: `known_model` where `observation` has
+            a belief, else `none`.
+        deterministic: Passed on to `predict`.
+        batch: Worlds at a time, in the order of the seeds.
+        recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
+            Those that need the hidden states are None with `truth=False`, and where a running
+            server does not publish them, or hides its model or the description of recorded
+            worlds.
+        wrap: Wraps the worlds, a `VecEnv` of Stable-Baselines3, as the training of the policy did:
+            `lambda worlds: VecFrameStack(worlds, 4)`, or for a saved model
+            `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`, of which the statistics
+            stay as they are.
+        csv: A file to write rows to; several processes may. Rows of this policy that it has
+            already are kept, and not run again, if the worlds, the settings and, as far as can be
+            seen, the policy are the same: the weights of a model, the code and the values that
+            functions refer to. Otherwise they are run again and replaced. Rows of other policies
+            are kept. A file with rows of other worlds is refused.
+        progress: Where to write how far it is, and which rows are kept; None: nowhere.
+        keywords: Of the environment: `task`, `model`, `height`, `n_moves`, `observation`, ...
+            With `robots` the policy acts for all robots of each world: rows are robots.
+
+    Returns:
+        A row for each seed, in order.
+    """
+    task = None if keywords.get("task") is None else Task.named(keywords["task"])
+    seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
+    steps = (task.max_steps if task else _STEPS) if steps is None else steps
+    chosen = _check(name, estimator, seeds, steps, batch, recent_steps, env, keywords)
+    actor = Actor(policy, deterministic=deterministic, is_wrapped=wrap is not None)
+    if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
+        burn_in = _BURN_IN
+    keywords["burn_in"] = burn_in
+    keywords.setdefault("timeout", _TIMEOUT)
+    served = _served(keywords.get("instance"))
+    # A private server publishes hidden states.
+    if keywords.setdefault("truth", served is None or served.publish_truth):
+        batch = min(batch, wire.TRUTH_BUFFER)
+    parts = set(names_of(keywords.get("observation")))
+    if estimator is None:
+        estimator = "known_model" if OF_BELIEF & parts else "none"
+    robots = task.robots if task else keywords.get("robots") or 1
+    if served is not None and served.n_robots != robots:
+        raise invalid("robots", f"{served.n_robots}, as the server's worlds have", robots)
+    setting = _Setting(env, keywords, robots, wrap)
+    normalizers = _check_policy(setting, actor)
+    fingerprint = _policy_fingerprint(setting, policy, estimator, deterministic, normalizers)
+    common: dict[str, Any] = {
+        "policy": name,
+        "estimator": estimator,
+        "robots": robots,
+        "team": "shared" if robots > 1 and OF_TEAM & parts else "alone",
+        "steps": steps,
+        "recent_steps": recent_steps,
+        "policy_fingerprint": fingerprint,
+    }
+    report = Progress(progress, name, chosen)
+    if csv is None:
+        return _score(setting, actor, chosen, batch, common, report)
+    with csv if isinstance(csv, RowFile) else RowFile(csv) as file:
+        setting = replace(setting, fingerprint=_worlds_fingerprint(keywords, served))
+        done = _kept(file, setting, common, chosen, report)
+        missing = [seed for seed in chosen if seed not in done]
+        made = _score(setting, actor, missing, batch, common, report, file)
+        done |= {row.world_seed: row for row in made}
+    return [done[seed] for seed in chosen]
+
+
+def suite(
+    policy: Policy | Any,
+    *,
+    name: str,
+    folder: str | os.PathLike[str] = "suite",
+    tasks: Iterable[str | os.PathLike[str]] | None = None,
+    worlds: int | None = None,
+    **keywords: Any,
+) -> dict[str, list[Row]]:
+    """Scores a policy on the test worlds of tasks, for `emberwatch-agent suite --out FOLDER`.
+
+    Args:
+        policy: As of `evaluate`, for all tasks; or a mapping from the name of each task to one.
+        name: What tables call it.
+        folder: Where rows are kept, a CSV file a task. Rows of this policy that are there are kept
+            and not run again, as by `evaluate`; rows of worlds that the task has no longer are run
+            again. Such rows of other policies stay there and do not count; a warning names them.
+        tasks: Names of tasks or task files; None: all that have names, or those of the mapping.
+        worlds: Worlds of each task, the first of its test seeds; None: all of them.
+        keywords: As of `evaluate`, but for `task`, `seeds`, `steps` and `csv`.
+
+    Returns:
+        A row for each world, by the name of its task.
+    """
+    for keyword in ("task", "seeds", "steps", "csv"):
+        if keyword in keywords:
+            raise InvalidArgumentError(f"{keyword}: expected none, as suite sets it")
+    if worlds is not None and (as_integer(worlds) or 0) < 1:
+        raise invalid("worlds", "at least 1", told(worlds))
+    by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
+    sources = list(tasks or by_task or built_in_tasks())
+    chosen = [(source, Task.named(source)) for source in sources]
+    names = [task.name for _, task in chosen]
+    if len(set(names)) < len(names):
+        raise invalid("tasks", "tasks of different names", ", ".join(names))
+    for task_name in names:
+        if by_task is not None and task_name not in by_task:
+            raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
+    rows: dict[str, list[Row]] = {}
+    for source, task in chosen:
+        rows[task.name] = evaluate(
+            cast("Any", policy) if by_task is None else by_task[task.name],
+            name=name,
+            task=source,
+            seeds=task.test_seeds[:worlds],
+            csv=RowFile(Path(folder) / f"{task.name}.csv", is_cache=True),
+            **keywords,
+        )
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _Setting:
+    """The worlds that a policy acts in, and what is around them."""
+
+    env: str
+    keywords: dict[str, Any]
+    n_robots: int
+    wrap: Callable[[Any], Any] | None
+    #: Identifies the worlds; None: not known before they are there.
+    fingerprint: str | None = None
+
+    @contextmanager
+    def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
+        """The worlds as they are, and as the policy sees them."""
+        worlds = _make(self.env, self.keywords, self.n_robots, n_worlds)
+        worlds.unwrapped.allow_test_worlds()
+        try:
+            yield worlds.unwrapped, worlds if self.wrap is None else _wrapped(worlds, self.wrap)
+        finally:
+            worlds.close()
+
+
+def _make(env: str, keywords: dict[str, Any], n_robots: int, n_worlds: int) -> Any:
+    make: Any = {"num_envs": n_worlds * n_robots, "max_episode_steps": -1, **keywords}
+    return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+
+
+def _wrapped(worlds: Any, wrap: Callable[[Any], Any]) -> Any:
+    try:
+        from emberwatch.benchmark.wrapped import Wrapped
+    except ModuleNotFoundError as error:
+        needed = "expected Stable-Baselines3: pip install stable-baselines3"
+        raise ModuleNotFoundError(f"wrap: {needed}; got: {error}") from None
+    return Wrapped(worlds, wrap)
+
+
+def _served(instance: str | None) -> ServerInfo | None:
+    """What a running server says of itself."""
+    if instance is None:
+        return None
+    with Client(instance) as client:
+        return client.info
+
+
+def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
+    """Refuses worlds that a policy cannot act in; starts no server.
+
+    Returns:
+        The statistics with which observations are normalized.
+    """
+    with setting.made(1) as (worlds, shown):
+        normalizers = actor.normalizers if setting.wrap is None else shown.normalizers
+        if actor.normalizers and not normalizers:
+            raise InvalidArgumentError(
+                "wrap: expected VecNormalize in it, as the policy was trained behind one, got none"
+            )
+        actor.check(worlds, shown.single_observation_space)
+        return [statistics(normalizer) for normalizer in normalizers]
+
+
+def _policy_fingerprint(setting: _Setting, *acts_on: object) -> str:
+    """Identifies all that the actions depend on besides the worlds."""
+    keywords = setting.keywords
+    others = {it: keywords[it] for it in keywords if it not in WorldArguments.__annotations__}
+    # The model of the belief, where a running server hides its own.
+    model = keywords.get("model") if keywords.get("instance") is not None else None
+    known = None if model is None else Model.named(model).toml
+    return digest((VERSION, setting.env, others, known, setting.wrap, acts_on))
+
+
+def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:
+    """Identifies the worlds, whatever their seed; none is simulated for it."""
+    if served is None:
+        world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
+        return _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
+    if served.worlds_fingerprint is None:
+        raise invalid("instance", "a server of this release, for csv", f"one of {served.build}")
+    return served.worlds_fingerprint
+
+
+def _kept(
+    file: RowFile,
+    setting: _Setting,
+    common: Mapping[str, Any],
+    chosen: Sequence[int],
+    report: Progress,
+) -> dict[int, Row]:
+    """The rows of a file that need not be made again, by seed."""
+    mark = Mark(
+        setting.fingerprint or "",
+        common["policy_fingerprint"],
+        common["steps"],
+        common["recent_steps"],
+    )
+    kind = Kind(*(common[name] for name in Kind._fields))
+    found = file.find(kind, mark)
+    if found.elsewhere:
+        warnings.warn(
+            f"{file.path} has rows of {', '.join(found.elsewhere)} on other worlds, or of an older "
+            "release, which does not say on which: they stay there, and do not count",
+            stacklevel=4,
+        )
+    kept = {seed: row for seed, row in found.kept.items() if seed in chosen}
+    n_again = sum(row.world_seed in chosen for row in found.stale)
+    n_dropped = len(found.stale) - n_again
+    report.found(file.path, n_kept=len(kept), n_again=n_again, n_dropped=n_dropped)
+    return kept
+
+
+def _score(
+    setting: _Setting,
+    actor: Actor,
+    seeds: Sequence[int],
+    batch: int,
+    common: Mapping[str, Any],
+    report: Progress,
+    file: RowFile | None = None,
+) -> list[Row]:
+    """Scores a policy on the worlds of these seeds, and writes their rows to a file."""
+    report.begin(len(seeds) * common["steps"])
+    rows: list[Row] = []
+    for first in range(0, len(seeds), batch):
+        part = seeds[first : first + batch]
+        made = _play(setting, actor, part, common, report)
+        rows += made
+        if file is not None:
+            file.add(made)
+    report.end()
+    return rows
+
+
+def _play(
+    setting: _Setting,
+    actor: Actor,
+    seeds: Sequence[int],
+    common: Mapping[str, Any],
+    report: Progress,
+) -> list[Row]:
+    """Flies the paths of all steps in the worlds of these seeds, at the same time."""
+    steps, n_robots = common["steps"], setting.n_robots
+    with setting.made(len(seeds)) as (worlds, shown):
+        tally = Tally(worlds.world_spec, len(seeds), common["recent_steps"])
+        actor.begin(len(seeds), worlds.num_envs)
+        seen, _ = shown.reset(seed=np.repeat(seeds, n_robots).tolist())
+        fingerprint = worlds.lease.client.info.worlds_fingerprint
+        if setting.fingerprint not in (None, fingerprint):
+            raise InvalidArgumentError(
+                "worlds: they have changed since the evaluation began: did the file of their task, "
+                "model or states change, or another server take the instance?"
+            )
+        n_actions = tally.n_moves if setting.env == _MOVES else 1
+        truncated = np.zeros(worlds.num_envs, np.bool_)
+        for step in range(1, steps + 1):
+            flown: list[NDArray[np.integer]] = []
+            for _ in range(n_actions):
+                begin = time.perf_counter()
+                flown.append(actor.act(seen, worlds))
+                tally.seconds += time.perf_counter() - begin
+                seen, _, _, truncated, _ = shown.step(flown[-1])
+            if truncated.any() and step < steps:
+                raise invalid("steps", f"at most {step}, as episodes of these worlds have", steps)
+            paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
+            tally.add(worlds.results, paths, worlds.truths)
+            report.add(len(seeds))
+    return _rows(tally, seeds, {**common, "worlds_fingerprint": fingerprint or ""})
+
+
+def _rows(tally: Tally, seeds: Sequence[int], common: Mapping[str, Any]) -> list[Row]:
+    steps = common["steps"]
+    return [
+        Row(
+            **common,
+            world_seed=seed,
+            mean_reward=float(tally.reward[index]) / steps,
+            mean_distinct_cells=int(tally.n_visited[index]) / steps,
+            hit_rate=int(tally.n_hits[index]) / max(int(tally.n_visited[index]), 1),
+            mean_fire_cells=int(tally.n_fire[index]) / steps,
+            mean_plan_millis=1e3 * tally.seconds / steps / len(seeds),
+            brier="",
+            moves=tally.n_moves,
+            mean_repeated=1.0 - int(tally.n_visited[index]) / int(tally.n_visits[index]),
+            **asdict(tally.merit.merit(index)),
+        )
+        for index, seed in enumerate(seeds)
+    ]
+
+
+def _check(
+    name: str,
+    estimator: str | None,
+    seeds: Iterable[int],
+    steps: int,
+    batch: int,
+    recent_steps: int,
+    env: str,
+    keywords: dict[str, Any],
+) -> list[int]:
+    """The seeds as a list; refuses what no worlds can be made of."""
+    if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise invalid("name", "a name for the table", repr(name))
+    if estimator is not None and (not isinstance(estimator, str) or not estimator.isprintable()):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise invalid("estimator", "a word for the table, or None", repr(estimator))
+    if env not in (_MOVES, _PATHS):
+        raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr(env))
+    numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
+    for what, number in numbers.items():
+        if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise invalid(what, "at least 1", repr(number))
+    for what in _SET:
+        if what in keywords:
+            raise InvalidArgumentError(f"{what}: expected none, as evaluate sets it")
+    if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise invalid("seeds", "some, such as range(8)", repr(seeds))
+    chosen = [as_seed(seed) for seed in seeds]
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise invalid("seeds", "some, each once", chosen)
+    return chosen

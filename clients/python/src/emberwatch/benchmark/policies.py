@@ -1,0 +1,160 @@
+"""How a policy acts: functions of observations, and models with the `predict` of SB3.
+
+SB3 is Stable-Baselines3. Its models may have a memory (RecurrentPPO), take action masks
+(MaskablePPO), and expect observations as the wrappers of their training made them.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, Final, Protocol, TypeAlias, cast
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch.arguments import as_array, told
+from emberwatch.benchmark.fitting import fits, misfit, shapes
+from emberwatch.errors import InvalidArgumentError, invalid
+
+#: Returns the actions of some worlds for their stacked observations, or is a model of SB3.
+Policy: TypeAlias = Callable[..., Any]
+
+#: Parameters that a policy is given if it has them.
+_STATE: Final = "state"
+_STARTS: Final = "episode_start"
+_DETERMINISTIC: Final = "deterministic"
+_MASKS: Final = "action_masks"
+
+#: What SB3 before 1.4 called `episode_start`, and what its `predict` has; elsewhere the word may
+#: mean anything.
+_OLD_STARTS: Final = "mask"
+_OLD: Final = frozenset((_STATE, _OLD_STARTS, _DETERMINISTIC))
+
+
+class Normalizer(Protocol):
+    """What is used of SB3's `VecNormalize`."""
+
+    def normalize_obs(self, obs: Any) -> Any: ...
+
+
+class Actor:
+    """A policy in one batch of worlds after the other, with its memory of the present ones."""
+
+    def __init__(self, policy: object, *, deterministic: bool, is_wrapped: bool) -> None:
+        """Finds out what the policy takes.
+
+        Args:
+            policy: A function, or an object with `predict`.
+            deterministic: For `predict`.
+            is_wrapped: Whether observations come as the wrappers of the policy's training make
+                them. Otherwise they are normalized here if the model knows how.
+        """
+        predict = getattr(policy, "predict", None)
+        self._call: Any = policy if predict is None else predict
+        if not callable(self._call):
+            expected = "a function of observations, or a model of Stable-Baselines3"
+            raise invalid("policy", expected, told(policy))
+        # The model, also where the policy is a method of it.
+        self._model: Any = getattr(policy, "__self__", policy)
+        self._begin: Any = getattr(policy, "begin", None)
+        self._deterministic: Final = deterministic
+        self._takes, self._needs = _parameters(self._call, is_model=predict is not None)
+        known = getattr(self._model, "get_vec_normalize_env", None)
+        normalizer: Any = known() if callable(known) else None
+        has_one = normalizer is not None and getattr(normalizer, "norm_obs", True)
+        #: What the model's training normalized observations with, if anything.
+        self.normalizers = cast("list[Normalizer]", [normalizer] if has_one else [])
+        self._normalizer: Final = normalizer if has_one and not is_wrapped else None
+        self._state: Any = None
+        self._starts: NDArray[np.bool_] = np.empty(0, np.bool_)
+
+    def check(self, worlds: Any, seen: Any) -> None:
+        """Refuses worlds that the policy cannot act in.
+
+        Args:
+            worlds: A vector environment.
+            seen: The space of the observations that it, or a wrapper around it, gives.
+        """
+        if _MASKS in self._needs and not hasattr(worlds, _MASKS):
+            raise invalid("env", "one with action masks, which the policy takes", "one without")
+        if self._normalizer is not None:
+            inner = getattr(getattr(self._normalizer, "venv", None), "observation_space", seen)
+            if shapes(inner) != shapes(seen):
+                raise misfit(inner, seen)
+            seen = getattr(self._normalizer, "observation_space", seen)
+        expected: Any = getattr(self._model, "observation_space", None)
+        if isinstance(expected, spaces.Space) and not fits(expected, seen):
+            raise misfit(expected, seen)
+
+    def begin(self, n_worlds: int, n_rows: int) -> None:
+        """Forgets all, as other worlds begin, and tells a policy with a method `begin`."""
+        if self._begin is not None:
+            self._begin(n_worlds)
+        self._state, self._starts = None, np.ones(n_rows, np.bool_)
+
+    def act(self, seen: Any, worlds: Any) -> NDArray[Any]:
+        """Returns the actions for the observations of some worlds, a new array."""
+        if self._normalizer is not None:
+            seen = self._normalizer.normalize_obs(seen)
+        outcome = self._call(seen, **self._given(worlds)) if self._takes else self._call(seen)
+        actions = self._actions(outcome, worlds)
+        return np.array(as_array(actions, "policy", "actions"))  # a policy may use its array again
+
+    def _given(self, worlds: Any) -> dict[str, Any]:
+        given: dict[str, Any] = {}
+        if _STATE in self._takes:
+            given[_STATE] = self._state
+        for name in self._takes & {_STARTS, _OLD_STARTS}:
+            given[name], self._starts = self._starts, np.zeros_like(self._starts)
+        if _DETERMINISTIC in self._takes:
+            given[_DETERMINISTIC] = self._deterministic
+        if _MASKS in self._takes and hasattr(worlds, _MASKS):
+            given[_MASKS] = np.asarray(worlds.action_masks(), np.bool_)
+        return given
+
+    def _actions(self, outcome: Any, worlds: Any) -> Any:
+        """The actions of what a policy returned: these, or as `predict` a pair with a state."""
+        parts = cast("tuple[Any, ...]", outcome) if isinstance(outcome, tuple) else ()
+        if len(parts) != 2 or _shape(parts[0]) != worlds.action_space.shape:
+            self._state = None
+            return cast("Any", outcome)
+        actions, self._state = parts
+        if self._state is not None and _STATE not in self._takes:
+            raise InvalidArgumentError(
+                "policy: it returns a state with its actions, but has no parameter `state` to get "
+                "it back: pass the model itself, or return the actions alone"
+            )
+        return actions
+
+
+def statistics(normalizer: Normalizer) -> dict[str, Any]:
+    """Returns all that a normalization depends on."""
+    names = ("obs_rms", "clip_obs", "epsilon", "norm_obs", "norm_obs_keys")
+    return {name: getattr(normalizer, name, None) for name in names}
+
+
+def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
+    """Returns the known parameters that a policy has, and those without a default."""
+    try:
+        parameters = list(inspect.signature(call).parameters.values())
+    except (TypeError, ValueError):  # written in C
+        return set(), set()
+    # The first one is the observation, whatever its name.
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    known = {each.name: each for each in parameters[1:] if each.kind in kinds}
+    takes = known.keys() & {_STATE, _STARTS, _DETERMINISTIC, _MASKS}
+    if is_model and any(each.kind is each.VAR_KEYWORD for each in parameters):
+        takes |= {_STATE, _STARTS, _DETERMINISTIC}
+    if is_model and _OLD <= known.keys() and _STARTS not in takes:
+        takes.add(_OLD_STARTS)
+    needed = {name for name, each in known.items() if each.default is each.empty}
+    return takes, takes & needed
+
+
+def _shape(actions: Any) -> tuple[int, ...] | None:
+    try:
+        return tuple(np.shape(actions))
+    except Exception:  # of any kind, such as of lists of different lengths
+        return None

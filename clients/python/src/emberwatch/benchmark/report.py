@@ -1,0 +1,95 @@
+"""What an evaluation says: its progress, and a summary of its rows."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from emberwatch.benchmark.rows import Row
+from emberwatch.errors import invalid
+from emberwatch.tasks import FIRST_TRAINING_SEED
+
+
+class Progress:
+    """Says how far an evaluation is: each second on a terminal, otherwise once at its end."""
+
+    def __init__(self, out: TextIO | None, name: str, seeds: Sequence[int]) -> None:
+        n_test = sum(seed < FIRST_TRAINING_SEED for seed in seeds)
+        sort = {0: "", len(seeds): "test "}.get(n_test, f"({n_test} of them test) ")
+        self._out, self._name = out, name
+        self._title = f"{name}: {len(seeds)} {sort}{_plural('world', len(seeds))}"
+        self._n_steps = self._n_done = 0
+        self._begin = self._last = time.monotonic()
+
+    def begin(self, n_steps: int) -> None:
+        """Before so many steps, of all worlds together."""
+        self._n_steps, self._n_done = n_steps, 0
+        self._begin = self._last = time.monotonic()
+
+    def found(self, file: Path, *, n_kept: int, n_again: int, n_dropped: int) -> None:
+        """Says what becomes of the rows that the file has of the policy's name."""
+        if n_kept:
+            self._say(
+                f"{n_kept} {_plural('row', n_kept)} kept in {file}, not run again. What a policy "
+                "reads from elsewhere, such as files, is not compared: if that has changed, "
+                "choose another name"
+            )
+        if n_again + n_dropped:
+            dropped = f", {n_dropped} removed" if n_dropped else ""
+            self._say(
+                f"{n_again} {_plural('row', n_again)} already in {file} run again{dropped}: of "
+                "another policy or other settings"
+            )
+
+    def add(self, n_steps: int) -> None:
+        self._n_done += n_steps
+        now = time.monotonic()
+        if self._out is not None and self._out.isatty() and now - self._last > 1.0:
+            self._last = now
+            left = (now - self._begin) * (self._n_steps / self._n_done - 1.0)
+            share = 100 * self._n_done // self._n_steps
+            print(f"\r{self._title}, {share} %, {left:.0f} s left ", end="", file=self._out)
+
+    def end(self) -> None:
+        if self._out is not None:
+            start = "\r" if self._out.isatty() else ""
+            seconds = time.monotonic() - self._begin
+            print(f"{start}{self._title}, {seconds:.0f} s{' ' * 20}".rstrip(), file=self._out)
+
+    def _say(self, words: str) -> None:
+        if self._out is not None:
+            print(f"{self._name}: {words}", file=self._out)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Returns each policy's mean reward of a step and its standard error, a line each.
+
+    The standard error is that of a mean over worlds; one world has none.
+    """
+    if not rows:
+        raise invalid("rows", "at least one", "none")
+    groups: dict[tuple[str, str, int, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.policy, row.estimator, row.robots, row.team), []).append(row)
+    return "\n".join(map(_line, groups.values()))
+
+
+def _line(rows: Sequence[Row]) -> str:
+    """The summary of one policy."""
+    rewards = np.array([row.mean_reward for row in rows])
+    n_test = sum(row.world_seed < FIRST_TRAINING_SEED for row in rows)
+    sort = "test " if n_test == len(rows) else "" if n_test == 0 else f"({n_test} test) "
+    words = f"a step on {len(rows)} {sort}{_plural('world', len(rows))}"
+    if len(rows) == 1:
+        return f"{rows[0].policy}: {rewards[0]:.2f} {words}, too few for a standard error"
+    error = rewards.std(ddof=1) / math.sqrt(len(rows))
+    return f"{rows[0].policy}: {rewards.mean():.2f} +- {error:.2f} {words}"
+
+
+def _plural(word: str, number: int) -> str:
+    return word if number == 1 else f"{word}s"

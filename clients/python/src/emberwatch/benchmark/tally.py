@@ -1,0 +1,63 @@
+"""What the steps of some worlds add up to."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.merit import MeritTally
+from emberwatch.moves import fly
+from emberwatch.observations import cells_of
+from emberwatch.settings import WorldSpec
+
+
+class Tally:
+    """Sums over the steps of some worlds."""
+
+    def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
+        self._spec: Final = spec
+        self.n_moves: Final = spec.n_moves
+        self.n_robots: Final = spec.n_robots
+        self.recent_steps: Final = recent_steps
+        self._shape = (n_worlds, spec.height, spec.width)
+        described = spec.described
+        self._knows_target = described is not None
+        target = 0 if described is None else described.target_state
+        self.merit: Final = MeritTally(
+            n_worlds, self._shape[1:], target=target, recent_steps=recent_steps
+        )
+        self.reward = np.zeros(n_worlds)
+        self.n_visited, self.n_visits, self.n_hits, self.n_fire = np.zeros((4, n_worlds), np.int64)
+        #: What the policy has taken.
+        self.seconds = 0.0
+
+    def add(
+        self,
+        results: NDArray[np.void],
+        paths: NDArray[np.integer],
+        truths: NDArray[np.uint8] | None,
+    ) -> None:
+        """One step of all robots, and the hidden states of their worlds, where these are known."""
+        worlds = results["world"][:: self.n_robots]
+        self.reward += worlds["reward"]
+        self.n_visited += worlds["n_visited"]
+        self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(1, np.int64)
+        self.n_hits += worlds["n_hits"]
+        self.n_fire += worlds["n_target_cells"]
+        self.merit.update(
+            self._visited(results["robot"], paths),
+            cells_of(results["robot"]).reshape(-1, self.n_robots, 2),
+            n_hits=worlds["n_hits"],
+            n_burning=worlds["n_target_cells"],
+            states=None if truths is None or not self._knows_target else truths[:: self.n_robots],
+        )
+
+    def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
+        visited = np.zeros(self._shape, np.bool_)
+        worlds = np.arange(len(robots))[:, np.newaxis] // self.n_robots
+        cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
+        visited[worlds, cells[..., 0], cells[..., 1]] = True
+        return visited

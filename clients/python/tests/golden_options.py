@@ -1,0 +1,76 @@
+"""Episodes of `WildfireObjective-v1` that were recorded when a process of its own planned them.
+
+`data/options.npz` has them, and the checkpoints of the learned beliefs: two filters and a network,
+which learned 80 steps of such worlds; the network's weights are rounded to 16 bits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FILE = Path(__file__).with_name("data") / "options.npz"
+
+#: Of all of them.
+WORLD: dict[str, Any] = {
+    "model": "wildfire-small",
+    "height": 16,
+    "width": 16,
+    "n_moves": 16,
+    "burn_in": 100,
+}
+
+#: What keeps the belief, and how it begins.
+BELIEFS: dict[str, dict[str, Any]] = {
+    "known_model": {"estimator": "known_model"},
+    "known_model, initial": {"estimator": "known_model", "prior": "initial"},
+    "spatial_filter": {"estimator": "spatial_filter"},
+    "spatial_filter, initial": {"estimator": "spatial_filter", "prior": "initial"},
+    "learned_filter": {"checkpoint": "learned_filter"},
+    "learned_spatial_filter": {
+        "checkpoint": "learned_filter",
+        "estimator": "learned_spatial_filter",
+    },
+    "learned_own_filter": {"checkpoint": "learned_own_filter"},
+    "neural_belief": {"checkpoint": "neural_belief"},
+}
+
+N_STEPS = 12
+N_WORLDS = 3
+
+
+def episode(env: Any) -> dict[str, NDArray[Any]]:
+    """What one environment shows: a reset and some steps."""
+    choices = np.random.default_rng(46).integers(0, 8, N_STEPS)
+    observation, info = env.reset(seed=1000)
+    seen, told = [observation], [[info["step"], info["n_visited"], 0]]
+    for choice in choices:
+        observation, reward, _, _, info = env.step(choice)
+        seen.append(observation)
+        told.append([info["step"], info["n_visited"], reward])
+    return {"features": np.stack(seen), "told": np.array(told, np.float64)}
+
+
+def episodes(envs: Any) -> dict[str, NDArray[Any]]:
+    """What many show whose episodes last four steps, in mode `DISABLED`, with resets of some."""
+    choices = np.random.default_rng(47).integers(0, 8, (N_STEPS, N_WORLDS))
+    observations, infos = envs.reset(seed=[7, 1000, 12])
+    seen, told = [observations], [[infos["step"], infos["n_visited"], np.zeros(N_WORLDS)]]
+
+    def restart(mask: NDArray[np.bool_], seed: int) -> None:
+        observations, infos = envs.reset(seed=seed, options={"reset_mask": mask})
+        seen.append(observations)
+        told.append([infos["step"], infos["n_visited"], np.zeros(N_WORLDS)])
+
+    for step, chosen in enumerate(choices):
+        observations, rewards, _, over, infos = envs.step(chosen)
+        seen.append(observations)
+        told.append([infos["step"], infos["n_visited"], rewards])
+        if step == 1:
+            restart(np.array([False, True, False]), 50)
+        if over.any():
+            restart(over, 60 + step)
+    return {"features": np.stack(seen), "told": np.array(told, np.float64)}

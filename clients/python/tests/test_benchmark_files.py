@@ -1,0 +1,235 @@
+"""CSV files of rows that several processes write to, and those that cannot be written."""
+
+import fcntl
+import itertools
+import os
+import resource
+import signal
+import subprocess
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import LIVELY
+from failures import refuses
+from processes import script
+
+from emberwatch.benchmark import Row, evaluate, read, row_file
+from emberwatch.benchmark.row_file import Mark, RowFile
+from emberwatch.programs import find
+
+WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
+
+WRITER = """
+import sys, numpy as np
+from emberwatch.benchmark import evaluate
+name, csv, model = sys.argv[1:]
+sys.stdin.readline()  # so that both begin together
+evaluate(
+    lambda frames: np.ones(len(frames), int), name=name, csv=csv, seeds=range(20), batch=1, steps=3,
+    model=model, height=7, width=9, n_moves=4, burn_in=60, observation="frame", progress=None,
+    backend="embedded",
+)
+print("done")
+"""
+
+
+def row(policy: str, seed: int, **changes: Any) -> Row:
+    values: dict[str, Any] = {
+        **{"policy": policy, "estimator": "none", "world_seed": seed, "steps": 5},
+        **{"mean_reward": 0.5, "mean_distinct_cells": 4.0, "hit_rate": 0.1, "mean_fire_cells": 9.0},
+        **{"mean_plan_millis": 0.1, "brier": "", "moves": 4, "recent_steps": 10},
+        **{"worlds_fingerprint": "ab" * 8, "policy_fingerprint": "cd" * 8},
+    }
+    return Row(**values | changes)
+
+
+MARK = Mark.of(row("mine", 0))
+
+
+def opened(path: Path, policy: str = "mine", mark: Mark = MARK) -> RowFile:
+    """A file after it was looked through for a policy."""
+    file = RowFile(path)
+    with file:
+        file.find(policy, mark)
+    return file
+
+
+def calls_of(csv: object) -> int:
+    """How often a policy acts before a file is refused."""
+    calls = itertools.count()
+
+    def still(frames: Any) -> Any:
+        next(calls)
+        return np.zeros(len(frames), int)
+
+    keywords = {**WORLDS, "observation": "frame", "seeds": [3], "steps": 2, "progress": None}
+    with refuses("^csv: expected "):
+        evaluate(still, name="mine", csv=csv, **keywords)
+    return next(calls)
+
+
+def test_two_processes_that_write_to_one_file_lose_no_rows(tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    writers = [script(WRITER, name, file, LIVELY) for name in ("first", "second")]
+    for writer in writers:
+        writer.say()
+    assert [writer.line() for writer in writers] == ["done"] * 2
+    assert Counter(row.policy for row in read(file)) == {"first": 20, "second": 20}
+
+
+def test_threads_that_write_to_one_file_lose_no_rows(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    names = [f"policy {number}" for number in range(6)]
+
+    def write(name: str) -> None:
+        file = opened(path, name)
+        for seed in range(15):
+            file.add([row(name, seed)])
+
+    threads = [threading.Thread(target=write, args=(name,)) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    rows = [row(name, seed) for name in names for seed in range(15)]
+    assert read(path) == rows and list(tmp_path.iterdir()) == [path]
+
+
+def test_rows_of_the_agent_and_of_python_share_a_folder(tmp_path: Path) -> None:
+    file = tmp_path / "small.csv"
+    flags = ["--tasks=small", "--worlds=1", "--policies=random_walk", f"--out={tmp_path}"]
+    subprocess.run([find("emberwatch-agent"), "suite", *flags], check=True, capture_output=True)
+    theirs = {row.policy for row in read(file)}
+    with RowFile(file, is_cache=True) as opened:
+        opened.find("mine", MARK)
+        opened.add([row("mine", 0)])
+    assert {row.policy for row in read(file)} == {*theirs, "mine"}
+
+
+def test_another_policy_of_the_same_name_is_refused_while_it_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    first, second = opened(path), opened(path, mark=MARK._replace(policy_fingerprint="ef" * 8))
+    first.add([row("mine", 0)])
+    with refuses("csv: another process has written rows of 'mine' to .*, of another policy or"):
+        second.add([row("mine", 0, policy_fingerprint="ef" * 8)])
+    first.add([row("mine", 1)])
+    assert read(path) == [row("mine", 0), row("mine", 1)]
+
+
+def test_two_halves_of_an_evaluation_may_run_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    halves = opened(path), opened(path)
+    for seed, half in enumerate(halves * 2):
+        half.add([row("mine", seed)])
+    assert [row.world_seed for row in read(path)] == [0, 1, 2, 3]
+
+
+def test_rows_of_other_worlds_that_come_meanwhile_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    mine = opened(path)
+    other = MARK._replace(worlds_fingerprint="00" * 8)
+    opened(path, "other", other).add([row("other", 3, worlds_fingerprint="00" * 8)])
+    with refuses("has 1 rows of other worlds, of the policies 'other'"):
+        mine.add([row("mine", 0)])
+    assert [row.policy for row in read(path)] == ["other"]
+
+
+def test_a_file_that_another_process_holds_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(row_file, "_PATIENCE", 0.1)
+    path = tmp_path / "rows.csv"
+    with path.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with refuses("csv: another process has held .*rows.csv for 0.1 s"):
+            opened(path)
+    opened(path)
+
+
+def test_a_file_that_was_replaced_while_its_lock_was_awaited_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    mine = opened(path)
+    path.touch()
+    with path.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        thread = threading.Thread(target=mine.add, args=([row("mine", 0)],))
+        thread.start()
+        replacement = tmp_path / "replacement"
+        with replacement.open("w") as file:
+            row_file.write(file, [row("other", 0)])
+        replacement.replace(path)
+    thread.join()
+    assert [row.policy for row in read(path)] == ["mine", "other"]
+
+
+@pytest.mark.parametrize(
+    "csv", ["/proc/rows.csv", "/dev/full", "/dev/null", "a\x00b", 7, "FOLDER", "FILE/rows.csv"]
+)
+def test_what_cannot_be_written_is_refused_before_the_policy_acts(
+    tmp_path: Path, csv: object
+) -> None:
+    (tmp_path / "file").touch()
+    if isinstance(csv, str):
+        csv = csv.replace("FOLDER", str(tmp_path)).replace("FILE", str(tmp_path / "file"))
+    assert calls_of(csv) == 0
+
+
+def test_a_pipe_is_refused_and_waits_for_nobody(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert calls_of(tmp_path / "pipe") == 0
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_takes_no_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.touch()
+    tmp_path.chmod(0o500)
+    assert calls_of(path) == 0
+
+
+def test_a_name_that_leaves_no_place_for_a_second_file_is_refused(tmp_path: Path) -> None:
+    assert calls_of(tmp_path / ("x" * 251 + ".csv")) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_names_the_file_and_leaves_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    file = opened(path)
+    file.add([row("mine", 0)])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        with refuses("csv: expected a file that can be written, got .*rows.csv: File too large"):
+            file.add([row("mine", seed) for seed in range(1, 50)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert read(path) == [row("mine", 0)] and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_run_without_rows_leaves_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    keywords = {**WORLDS, "observation": "frame", "seeds": [3], "steps": 2, "progress": None}
+    with pytest.raises(ZeroDivisionError):
+        evaluate(lambda _: 1 / 0, name="mine", csv=path, **keywords)
+    assert not path.exists()
+    # An empty file that was there before has no rows, and stays.
+    path.touch()
+    assert read(path) == []
+    with pytest.raises(ZeroDivisionError):
+        evaluate(lambda _: 1 / 0, name="mine", csv=path, **keywords)
+    assert path.exists()
+
+
+def test_a_link_and_the_mode_of_a_file_stay(tmp_path: Path) -> None:
+    path, link = tmp_path / "rows.csv", tmp_path / "link.csv"
+    path.touch(0o640)
+    link.symlink_to(path)
+    opened(link).add([row("mine", 0)])
+    assert link.is_symlink() and read(path) == [row("mine", 0)]
+    assert path.stat().st_mode & 0o777 == 0o640

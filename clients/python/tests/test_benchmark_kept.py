@@ -1,0 +1,263 @@
+"""Which rows of a file `evaluate` and `suite` keep, run again, or refuse."""
+
+import contextvars
+import io
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES, WILDFIRE
+from failures import refuses
+from numpy.typing import NDArray
+from processes import server
+
+from emberwatch.benchmark import Row, evaluate, read, suite
+
+WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
+
+TASK = """
+name = "lab"
+model = "{model}"
+height = 7
+width = 9
+moves = 4
+burn_in = {burn_in}
+max_steps = {steps}
+test_seeds = {{ start = 3, end = 6 }}
+"""
+
+#: Of the actions of a world; no digest of a policy looks into it.
+SHAPE: contextvars.ContextVar[tuple[int, ...]] = contextvars.ContextVar("SHAPE", default=())
+
+
+def always(move: int) -> Callable[[Any], NDArray[np.int64]]:
+    return lambda frames: np.full((len(frames), *SHAPE.get()), move)
+
+
+def go(path: Path, move: int = 3, *, name: str = "mine", **changes: Any) -> tuple[list[Row], str]:
+    """The rows of a short evaluation, and what it said."""
+    said = io.StringIO()
+    keywords = {**WORLDS, "observation": "frame", "seeds": range(3, 6), "steps": 5, **changes}
+    rows = evaluate(always(move), name=name, csv=path, progress=said, **keywords)
+    return rows, said.getvalue()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "mine.csv"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"height": 8},
+        {"n_moves": 5},
+        {"model": "wildfire-small"},
+        {"burn_in": 61},
+        {"sensor_radius": 1},
+        {"start": "centre"},
+        {"start": "random"},
+        {"robots": 2},
+        {"seeds": range(6, 8), "width": 10},
+    ],
+    ids=str,
+)
+def test_rows_of_other_worlds_are_refused_by_name(file: Path, change: dict[str, Any]) -> None:
+    go(file)
+    kept = file.read_bytes()
+    for name in ("mine", "other"):
+        with refuses("csv: .*mine.csv has 3 rows of other worlds, of the policies 'mine': "):
+            go(file, name=name, **change)
+    assert file.read_bytes() == kept
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"move": 1},
+        {"deterministic": False},
+        {"estimator": "guess"},
+        {"observation": "image"},
+        {"observation": "local", "window": 5},
+        {"env": WILDFIRE},
+    ],
+    ids=str,
+)
+def test_another_policy_or_setting_runs_again_and_says_so(
+    file: Path, change: dict[str, Any]
+) -> None:
+    first, _ = go(file)
+    token = SHAPE.set((4,) if "env" in change else ())
+    rows, said = go(file, **change)
+    SHAPE.reset(token)
+    assert f"mine: 3 rows already in {file} run again: of another policy or other set" in said
+    assert [row.policy_fingerprint for row in rows] != [row.policy_fingerprint for row in first]
+    assert [row.worlds_fingerprint for row in rows] == [row.worlds_fingerprint for row in first]
+    assert read(file) == rows
+    _, said = go(file, **change)
+    assert f"mine: 3 rows kept in {file}, not run again. What a policy reads from else" in said
+
+
+def test_defaults_that_are_named_are_other_worlds_only_if_they_differ(file: Path) -> None:
+    rows, _ = go(file)
+    again, said = go(file, env=MOVES, start="corner", sensor_radius=0, backend="embedded", batch=2)
+    assert again == rows and "3 rows kept" in said
+
+
+def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
+    rows, _ = go(file)
+    flags = {"height": 7, "width": 9, "moves": 4, "model": LIVELY, "burn_in": 60}
+    running = server(worlds=4, publish_truth=True, **flags)
+    keywords = {"observation": "frame", "steps": 5, "instance": running.instance}
+    said = io.StringIO()
+    again = evaluate(always(3), name="mine", seeds=range(3, 6), csv=file, progress=said, **keywords)
+    assert again == rows and "3 rows kept" in said.getvalue()
+    other = server(worlds=4, **flags | {"burn_in": 61})
+    keywords["instance"] = other.instance
+    with refuses("rows of other worlds, of the policies 'mine'"):
+        evaluate(always(3), name="mine", seeds=range(3, 6), csv=file, **keywords)
+
+
+def test_rows_of_a_changed_policy_leave_none_of_the_old_one(file: Path) -> None:
+    go(file)
+    rows, said = go(file, 1, seeds=range(5, 7))
+    assert "1 row already in" in said and "run again, 2 removed" in said
+    assert read(file) == rows and [row.world_seed for row in rows] == [5, 6]
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"steps": 6}, "has steps 5 of 'mine' on world 3, expected 6: choose another"),
+        ({"recent_steps": 2}, "has recent_steps 10 of 'mine' on world 3, expected 2: choose"),
+    ],
+    ids=str,
+)
+def test_rows_of_other_steps_are_refused_by_name(
+    file: Path, change: dict[str, Any], problem: str
+) -> None:
+    go(file)
+    with refuses(problem):
+        go(file, **change)
+    # Those of another policy may have other steps.
+    go(file, name="other", **change)
+    assert len(read(file)) == 6
+
+
+def without_fingerprints(path: Path) -> None:
+    """Makes a file one of an older release."""
+    lines = path.read_text().splitlines()
+    path.write_text("".join(",".join(line.split(",")[:-2]) + "\n" for line in lines))
+
+
+def test_own_rows_of_an_older_release_are_refused(file: Path) -> None:
+    go(file)
+    without_fingerprints(file)
+    assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
+    with refuses("has rows of 'mine' without a fingerprint of their worlds, as older releases"):
+        go(file)
+
+
+@pytest.mark.parametrize("change", [{"burn_in": 61}, {"width": 8}], ids=str)
+def test_other_rows_of_an_older_release_stay_if_their_worlds_burn_alike(
+    file: Path, change: dict[str, Any]
+) -> None:
+    go(file)
+    without_fingerprints(file)
+    old = read(file)
+    with refuses(r"burning cells of world 3 \('mine'\), got"):
+        go(file, name="other", **change)
+    assert read(file) == old
+    rows, _ = go(file, name="other")
+    assert read(file) == old + rows
+
+
+def test_a_file_that_spreadsheets_have_saved_is_read(file: Path) -> None:
+    rows, _ = go(file)
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    again, said = go(file)
+    assert again == rows == read(file) and "3 rows kept" in said
+
+
+@pytest.mark.parametrize(
+    "line", ["mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20], ids=len
+)
+def test_a_row_of_other_values_is_refused(file: Path, line: str) -> None:
+    go(file)
+    file.write_text(file.read_text() + line + "\n")
+    with refuses("csv: expected .*mine.csv to have the columns policy,"):
+        go(file)
+
+
+def run_suite(folder: Path, move: int = 3, **changes: Any) -> tuple[list[Row], str]:
+    """The rows of a suite of one task, and what it said."""
+    values = {"model": LIVELY, "burn_in": 60, "steps": 5, **changes}
+    name = values.pop("name", "mine")
+    source = folder / "task.toml"
+    source.write_text(TASK.format(**values))
+    said = io.StringIO()
+    rows = suite(
+        always(move),
+        name=name,
+        folder=folder / "out",
+        tasks=[source],
+        observation="frame",
+        progress=said,
+    )
+    return rows["lab"], said.getvalue()
+
+
+def test_a_suite_keeps_rows_of_the_same_task(tmp_path: Path) -> None:
+    rows, _ = run_suite(tmp_path)
+    again, said = run_suite(tmp_path)
+    assert again == rows and "mine: 3 rows kept in " in said
+
+
+@pytest.mark.parametrize(
+    "change", [{"burn_in": 50}, {"model": "wildfire-small"}, {"steps": 6}, {"move": 1}], ids=str
+)
+def test_a_suite_runs_again_what_has_changed(tmp_path: Path, change: dict[str, Any]) -> None:
+    first, _ = run_suite(tmp_path)
+    rows, said = run_suite(tmp_path, **change)
+    assert "mine: 3 rows already in " in said and " run again: " in said
+    assert read(tmp_path / "out" / "lab.csv") == rows != first
+
+
+def test_a_suite_leaves_rows_of_other_policies_on_older_worlds(tmp_path: Path) -> None:
+    file = tmp_path / "out" / "lab.csv"
+    old, _ = run_suite(tmp_path, name="old")
+    with pytest.warns(UserWarning, match="lab.csv has rows of old on other worlds") as warned:
+        rows, _ = run_suite(tmp_path, burn_in=50)
+    assert warned[0].filename == __file__
+    assert read(file) == rows + old
+    without_fingerprints(file)
+    with pytest.warns(UserWarning, match="lab.csv has rows of old on other worlds"):
+        again, said = run_suite(tmp_path, burn_in=50)
+    assert read(file) == again + [
+        replace(row, worlds_fingerprint="", policy_fingerprint="") for row in old
+    ]
+    assert "3 rows already in" in said
+
+
+def test_a_suite_has_one_task_of_each_name(tmp_path: Path) -> None:
+    with refuses("tasks: expected tasks of different names, got small, small"):
+        suite(always(3), name="mine", folder=tmp_path, tasks=["small", "small"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_worlds_that_change_meanwhile_are_refused(file: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model.toml"
+    text = Path(LIVELY).read_text()
+    model.write_text(text)
+
+    def rewrites(frames: Any) -> NDArray[np.int64]:
+        model.write_text(text.replace("name = ", "name = 'other' # ", 1))
+        return np.zeros(len(frames), np.int64)
+
+    keywords = {**WORLDS, "model": model, "observation": "frame", "steps": 2, "progress": None}
+    with refuses("worlds: they have changed since the evaluation began"):
+        evaluate(rewrites, name="mine", seeds=range(3, 5), batch=1, csv=file, **keywords)
+    assert [row.world_seed for row in read(file)] == [3]

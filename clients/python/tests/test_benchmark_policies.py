@@ -1,0 +1,320 @@
+"""What `evaluate` gives to a policy, and takes from it."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES, WILDFIRE
+from failures import refuses
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch.benchmark import Row, evaluate
+from emberwatch.model import Model
+
+WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
+N_MOVES = 4
+
+
+def go(policy: Any, **changes: Any) -> list[Row]:
+    keywords = {**WORLDS, "observation": "frame", "seeds": range(3, 6), "steps": 3, **changes}
+    return evaluate(policy, name="mine", progress=None, **keywords)
+
+
+class Counter:
+    """A model with a memory: it counts its moves in each world, and flies in circles."""
+
+    def __init__(self) -> None:
+        self.counts: list[list[int]] = []
+        self.starts: list[list[bool]] = []
+        self.deterministic: set[bool] = set()
+
+    def step(self, seen: Any, state: Any, starts: Any) -> Any:
+        count = np.zeros(len(seen), int) if state is None else state[0]
+        if starts is not None:
+            self.starts.append(starts.tolist())
+            count = np.where(starts, 0, count)
+        self.counts.append(count.tolist())
+        return count % 4, (count + 1,)
+
+
+class Recurrent(Counter):
+    def predict(
+        self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        self.deterministic.add(deterministic)
+        return self.step(seen, state, episode_start)
+
+
+class Older(Counter):
+    """As Stable-Baselines3 before 1.4."""
+
+    def predict(
+        self, seen: Any, state: Any = None, mask: Any = None, deterministic: Any = 0
+    ) -> Any:
+        return self.step(seen, state, mask)
+
+
+class Short(Counter):
+    def predict(self, seen: Any, state: Any = None) -> Any:
+        return self.step(seen, state, None)
+
+
+class Forwarding(Recurrent):
+    """Hands on what it does not know."""
+
+    def predict(self, seen: Any, **others: Any) -> Any:  # type: ignore[override]
+        assert others.keys() == {"state", "episode_start", "deterministic"}
+        return super().predict(seen, **others)
+
+
+class OnlyKeywords(Counter):
+    def predict(self, seen: Any, *, episode_start: Any, state: Any) -> Any:
+        return self.step(seen, state, episode_start)
+
+
+@pytest.mark.parametrize("kind", [Recurrent, Older, Short, Forwarding, OnlyKeywords])
+def test_a_model_gets_its_state_back(kind: type[Counter]) -> None:
+    model = kind()
+    go(model, batch=2)
+    # Worlds 3 and 4 together, then world 5 from the start.
+    counts = list(range(3 * N_MOVES))
+    assert model.counts == [[n, n] for n in counts] + [[n] for n in counts]
+    if kind is not Short:
+        assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
+
+
+def test_a_memory_scores_as_the_moves_that_it_makes() -> None:
+    moves = iter([move for _ in range(3) for move in range(N_MOVES)])
+    rows = go(lambda frames: np.full(len(frames), next(moves)))
+    others = go(Recurrent())
+    assert [row.mean_reward for row in rows] == [row.mean_reward for row in others]
+    assert [row.mean_distinct_cells for row in rows] == [row.mean_distinct_cells for row in others]
+
+
+def test_the_method_of_a_model_acts_as_the_model() -> None:
+    model = Recurrent()
+    go(model.predict, deterministic=False)
+    assert model.counts[-1] == [3 * N_MOVES - 1] * 3 and model.deterministic == {False}
+
+
+def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
+    def act(state: Any, mask: Any = None) -> Any:
+        assert state.shape == (3, 7, 9, 1) and mask is None
+        return np.zeros(len(state), int)
+
+    go(act)
+    go(type("Named", (), {"predict": lambda self, state, mask=None: act(state, mask)})())
+
+
+def test_functions_may_have_a_memory() -> None:
+    counts = []
+
+    def act(frames: Any, state: Any) -> Any:
+        state = 0 if state is None else state
+        counts.append(state)
+        return np.full(len(frames), state % 4), state + 1
+
+    go(act)
+    assert counts == list(range(3 * N_MOVES))
+
+
+@pytest.mark.parametrize(
+    "predict",
+    [
+        lambda self, seen: np.ones(len(seen), int),
+        lambda self, seen: (np.ones(len(seen), int), None),
+        lambda self, seen, state: np.ones(len(seen), int),
+    ],
+)
+def test_a_model_may_return_actions_alone(predict: Callable[..., Any]) -> None:
+    model = type("Plain", (), {"predict": predict})()
+    assert [row.mean_reward for row in go(model)] == [
+        row.mean_reward for row in go(lambda frames: np.ones(len(frames), int))
+    ]
+
+
+@pytest.mark.parametrize("n_worlds", [1, 2, 3])
+@pytest.mark.parametrize("env", [MOVES, WILDFIRE])
+def test_a_pair_of_actions_and_no_state_is_taken(env: str, n_worlds: int) -> None:
+    shape = (n_worlds,) if env == MOVES else (n_worlds, N_MOVES)
+    options = {"env": env, "seeds": range(3, 3 + n_worlds)}
+    whole = go(lambda _: np.ones(shape, int), **options)
+    for outcome in (
+        (np.ones(shape, int), None),
+        np.ones(shape, int).tolist(),
+        tuple(np.ones(shape, int)),  # not a pair, but the actions of two worlds
+        tuple(np.ones(shape, int).tolist()),
+    ):
+        rows = go(lambda _, outcome=outcome: outcome, **options)
+        assert [row.mean_reward for row in rows] == [row.mean_reward for row in whole]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "problem"),
+    [
+        ((np.ones(3, int), np.zeros(3)), "policy: it returns a state with its actions, but has"),
+        (([1, 2], [1, 2, 3]), "policy: expected actions, got tuple: "),
+        (np.ones(4, int), r"action: expected integers of shape \(3,\), got int64 \(4,\)"),
+        (np.ones(3), r"action: expected integers of shape \(3,\), got float64 \(3,\)"),
+        (None, r"action: expected integers of shape \(3,\), got object \(\)"),
+    ],
+    ids=str,
+)
+def test_what_is_no_action_is_named(outcome: Any, problem: str) -> None:
+    with refuses(problem):
+        go(lambda _: outcome)
+
+
+@pytest.fixture
+def walled(tmp_path: Path) -> Path:
+    """A model with a wall in which there is one gap."""
+    wall = np.zeros((7, 9), int)
+    wall[:, 4], wall[3, 4] = 1, 0
+    path = tmp_path / "wall.toml"
+    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
+    return path
+
+
+class Masked:
+    """As MaskablePPO."""
+
+    def __init__(self) -> None:
+        self.masks: list[NDArray[np.bool_]] = []
+
+    def predict(
+        self,
+        seen: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> Any:
+        if action_masks is None:
+            return np.zeros((len(seen), N_MOVES), int), None
+        self.masks.append(action_masks)
+        return np.argmax(action_masks, axis=1), None
+
+
+def test_models_and_functions_get_masks(walled: Path) -> None:
+    model, masks = Masked(), []
+
+    def act(frames: Any, action_masks: NDArray[np.bool_]) -> Any:
+        masks.append(action_masks)
+        return np.argmax(action_masks, axis=1)
+
+    rows, others = go(model, model=walled), go(act, model=walled)
+    assert len(masks) == 3 * N_MOVES
+    assert all(mask.shape == (3, 4) and mask.dtype == np.bool_ for mask in masks)
+    assert np.array_equal(masks, model.masks) and not np.all(masks)
+    assert [row.mean_reward for row in rows] == [row.mean_reward for row in others]
+    # A mask takes every robot to another cell.
+    assert all(row.mean_distinct_cells > 1 for row in rows)
+
+
+def test_each_robot_has_its_mask(walled: Path) -> None:
+    shapes = set()
+
+    def act(frames: Any, action_masks: Any) -> Any:
+        shapes.add(action_masks.shape)
+        return np.argmax(action_masks, axis=1)
+
+    go(act, model=walled, robots=2)
+    assert shapes == {(6, 4)}
+
+
+def test_masks_of_whole_paths_are_refused_only_if_they_are_needed() -> None:
+    go(Masked(), env=WILDFIRE)
+    with refuses("env: expected one with action masks, which the policy takes, got one without"):
+        go(lambda frames, action_masks: 0, env=WILDFIRE)
+
+
+class Statistics:
+    """As VecNormalize."""
+
+    obs_rms, clip_obs = {"mean": 3.0}, 10.0
+
+    def normalize_obs(self, seen: Any) -> Any:
+        return seen * 0.0 + 7.0
+
+
+class Normalized:
+    def __init__(self) -> None:
+        self.seen: list[Any] = []
+
+    def get_vec_normalize_env(self) -> Statistics | None:
+        return Statistics()
+
+    def predict(self, seen: Any, deterministic: bool = False) -> Any:
+        self.seen.append(seen)
+        return np.zeros(len(seen), int), None
+
+
+def test_a_model_sees_normalized_observations() -> None:
+    for observation in ("local", "frame"):
+        model = Normalized()
+        go(model, observation=observation)
+        assert np.all(np.array(model.seen) == 7.0)
+
+
+def test_other_statistics_are_another_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = go(Normalized(), csv=tmp_path / "rows.csv")
+    monkeypatch.setattr(Statistics, "obs_rms", {"mean": 4.0})
+    rows = go(Normalized(), csv=tmp_path / "rows.csv")
+    assert rows[0].policy_fingerprint != first[0].policy_fingerprint
+
+
+@pytest.mark.parametrize(
+    ("space", "words"),
+    [
+        (spaces.Box(0, 255, (7, 9, 4), np.uint8), r"wrap=, such as lambda worlds: VecFrameStack\("),
+        (spaces.Box(-10, 10, (7, 9, 1), np.float32), r"wrap=.*: VecNormalize.load\('stat"),
+        (
+            spaces.Dict({"frame": spaces.Box(0, 255, (7, 9, 1), np.uint8)}),
+            "pass the observation= of",
+        ),
+        (spaces.Discrete(4), "on which it was trained, got Box"),
+    ],
+    ids=str,
+)
+def test_a_model_of_other_observations_is_refused(space: Any, words: str) -> None:
+    model = Recurrent()
+    model.observation_space = space  # type: ignore[attr-defined]
+    for policy in (model, model.predict):
+        with refuses("policy: expected observations .*" + words):
+            go(policy)
+    assert model.counts == []
+
+
+@pytest.mark.parametrize("shape", [(7, 9, 1), (1, 7, 9)])
+def test_a_model_may_have_channels_first(shape: tuple[int, ...]) -> None:
+    model = Recurrent()
+    model.observation_space = spaces.Box(0, 255, shape, np.uint8)  # type: ignore[attr-defined]
+    go(model)
+    assert model.counts
+
+
+def test_a_policy_hears_of_other_worlds() -> None:
+    begun: list[int] = []
+
+    class Begun(Recurrent):
+        def begin(self, n_worlds: int) -> None:
+            begun.append(n_worlds)
+
+    go(Begun(), batch=2)
+    assert begun == [2, 1]
+
+
+def test_wrapping_without_the_trainer_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "emberwatch.benchmark.wrapped", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="wrap: expected Stable-Baselines3: pip install"):
+        go(Recurrent(), wrap=lambda worlds: worlds)

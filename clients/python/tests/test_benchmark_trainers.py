@@ -1,0 +1,324 @@
+"""Models of Stable-Baselines3 score in `evaluate` what they score in their own evaluation."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES
+from failures import refuses
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+import sb3_contrib
+import stable_baselines3
+import torch
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
+from sb3_contrib.common.maskable.utils import get_action_masks
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import (
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+)
+
+from emberwatch.benchmark import evaluate, read
+from emberwatch.model import Model
+from emberwatch.sb3 import make_vec_env
+
+N_MOVES, N_STEPS, N_WORLDS, FIRST = 4, 10, 4, 1000
+
+SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 1, "learning_rate": 3e-3, "device": "cpu"}
+
+Wrap = Callable[[Any], Any]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """More would wait for each other in networks as small as these."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Worlds with a wall, so that masks matter."""
+    wall = np.zeros((7, 9), int)
+    wall[:, 4], wall[3, 4] = 1, 0
+    path = tmp_path_factory.mktemp("model") / "wall.toml"
+    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
+    return {"model": path, "height": 7, "width": 9, "n_moves": N_MOVES, "burn_in": 60}
+
+
+def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes: Any) -> Any:
+    """Worlds from this seed on, as a training or an evaluation has them."""
+    keywords = {"observation": "local", "max_episode_steps": N_MOVES * N_STEPS, **changes}
+    made = make_vec_env(MOVES, N_WORLDS, **world, **keywords)
+    made.seed(seed)
+    return made if wrap is None else wrap(made)
+
+
+def trained(
+    algorithm: Any,
+    policy: str,
+    world: dict[str, Any],
+    wrap: Wrap | None = None,
+    observation: Any = "local",
+    **changes: Any,
+) -> Any:
+    worlds = vector(world, 5000, wrap, reward="move", observation=observation)
+    model = algorithm(policy, VecMonitor(worlds), seed=3, **SMALL | changes)
+    return model.learn(128)
+
+
+def remembering(world: dict[str, Any]) -> Any:
+    """A model whose memory matters, which it hardly does after so short a training alone."""
+    small = {"lstm_hidden_size": 16, "net_arch": []}
+    model = trained(sb3_contrib.RecurrentPPO, "MlpLstmPolicy", world, policy_kwargs=small)
+    model.policy.lstm_actor.weight_hh_l0.data *= 20.0
+    weights = model.policy.action_net.weight
+    weights.data = torch.randn(weights.shape, generator=torch.Generator().manual_seed(2))
+    return model
+
+
+def own(model: Any, worlds: Any, *, deterministic: bool, evaluation: Any = evaluate_policy) -> Any:
+    """The model's own evaluation: the mean reward of a step, of each world."""
+    rewards, lengths = evaluation(
+        model,
+        worlds,
+        n_eval_episodes=N_WORLDS,
+        deterministic=deterministic,
+        return_episode_rewards=True,
+        warn=False,
+    )
+    worlds.close()
+    assert lengths == [N_MOVES * N_STEPS] * N_WORLDS
+    return [reward / N_STEPS for reward in rewards]
+
+
+def ours(model: Any, world: dict[str, Any], **changes: Any) -> list[float]:
+    keywords = {"observation": "local", "steps": N_STEPS, "progress": None, **world, **changes}
+    seeds = range(FIRST, FIRST + N_WORLDS)
+    return [row.mean_reward for row in evaluate(model, name="mine", seeds=seeds, **keywords)]
+
+
+def check(model: Any, expected: list[float], world: dict[str, Any], **changes: Any) -> None:
+    assert ours(model, world, **changes) == pytest.approx(expected, abs=1e-6)
+    assert len(set(expected)) > 1, "worlds that tell policies apart"
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any], deterministic: bool) -> None:
+    model = trained(stable_baselines3.PPO, "MlpPolicy", world)
+    stable_baselines3.common.utils.set_random_seed(7)
+    expected = own(model, vector(world, FIRST), deterministic=deterministic)
+    stable_baselines3.common.utils.set_random_seed(7)
+    check(model, expected, world, deterministic=deterministic)
+
+
+def test_dqn_scores_as_in_its_own_evaluation(world: dict[str, Any], tmp_path: Path) -> None:
+    worlds = vector(world, 5000, reward="move")
+    kind = stable_baselines3.DQN
+    model = kind("MlpPolicy", worlds, seed=3, learning_starts=64, buffer_size=512, device="cpu")
+    model.learn(256)
+    check(model, own(model, vector(world, FIRST), deterministic=True), world)
+
+
+def test_recurrent_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
+    model = remembering(world)
+    expected = own(model, vector(world, FIRST), deterministic=True)
+    check(model, expected, world)
+    # Without its memory it acts otherwise, so that the memory is what the test is about.
+    assert ours(lambda seen: model.predict(seen, deterministic=True)[0], world) != expected
+
+
+def test_a_recurrent_model_in_a_function_is_refused(world: dict[str, Any]) -> None:
+    model = remembering(world)
+    with refuses("policy: it returns a state with its actions, but has no parameter `state`"):
+        ours(lambda seen: model.predict(seen), world)
+
+
+def test_maskable_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
+    model = trained(sb3_contrib.MaskablePPO, "MlpPolicy", world)
+    worlds = vector(world, FIRST)
+    expected = own(model, worlds, deterministic=True, evaluation=evaluate_masked)
+    check(model, expected, world)
+    assert ours(lambda seen: model.predict(seen, deterministic=True)[0], world) != expected
+
+
+def test_masks_are_those_that_its_own_evaluation_gives(world: dict[str, Any]) -> None:
+    worlds = vector(world, FIRST)
+    worlds.reset()
+    theirs = []
+    for _ in range(N_MOVES):
+        theirs.append(get_action_masks(worlds).astype(bool))
+        worlds.step(np.argmax(theirs[-1], axis=1))
+    worlds.close()
+    masks = []
+
+    def act(seen: Any, action_masks: Any) -> Any:
+        masks.append(action_masks)
+        return np.argmax(action_masks, axis=1)
+
+    ours(act, world)
+    assert np.array_equal(masks[:N_MOVES], theirs)
+
+
+def normalized(worlds: Any) -> Any:
+    return VecNormalize(worlds, norm_reward=False)
+
+
+@pytest.fixture(params=["local", ("frame", "local")], ids=str)
+def behind_statistics(
+    world: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
+) -> tuple[Any, Path, list[float], Any]:
+    """A model trained behind VecNormalize, its statistics, and what it scores behind them."""
+    parts = request.param
+    policy = "MlpPolicy" if isinstance(parts, str) else "MultiInputPolicy"
+    model = trained(stable_baselines3.PPO, policy, world, normalized, observation=parts)
+    file = tmp_path / "statistics.pkl"
+    model.get_vec_normalize_env().save(str(file))
+    worlds = VecNormalize.load(str(file), vector(world, FIRST, observation=parts))
+    worlds.training = False
+    return model, file, own(model, worlds, deterministic=True), parts
+
+
+def test_a_model_behind_vec_normalize_scores_as_in_its_own_evaluation(
+    world: dict[str, Any], behind_statistics: Any, tmp_path: Path
+) -> None:
+    model, file, expected, parts = behind_statistics
+    before = file.read_bytes()
+    check(model, expected, world, observation=parts)
+    model.save(tmp_path / "model.zip")
+    loaded = stable_baselines3.PPO.load(tmp_path / "model.zip", device="cpu")
+    with refuses(r"policy: expected observations .*VecNormalize.load\('statistics.pkl', worlds\)"):
+        ours(loaded, world, observation=parts)
+    for policy in (model, loaded):
+        kept: list[Any] = []
+
+        def wrap(worlds: Any, kept: list[Any] = kept) -> Any:
+            kept.append(VecNormalize.load(str(file), worlds))
+            return kept[-1]
+
+        check(policy, expected, world, observation=parts, wrap=wrap)
+        kept[-1].save(str(tmp_path / "after.pkl"))
+        counts = [
+            VecNormalize.load(str(each), vector(world, 0, observation=parts)).obs_rms
+            for each in (file, tmp_path / "after.pkl")
+        ]
+        assert str(vars_of(counts[0])) == str(vars_of(counts[1]))
+    assert file.read_bytes() == before
+
+
+def vars_of(statistics: Any) -> Any:
+    if isinstance(statistics, dict):
+        return {name: vars(part) for name, part in statistics.items()}
+    return vars(statistics)
+
+
+def test_vec_normalize_without_statistics_is_refused(
+    world: dict[str, Any], behind_statistics: Any
+) -> None:
+    model, _, _, parts = behind_statistics
+    with refuses("wrap: VecNormalize has no statistics: save those of the training"):
+        ours(model, world, observation=parts, wrap=normalized)
+    with refuses("wrap: expected VecNormalize in it, as the policy was trained behind one"):
+        ours(model, world, observation=parts, wrap=VecMonitor)
+
+
+def test_a_model_of_stacked_frames_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
+    def stack(worlds: Any) -> Any:
+        return VecFrameStack(worlds, 3)
+
+    model = trained(stable_baselines3.PPO, "MlpPolicy", world, stack)
+    with refuses(r"policy: expected observations .*, wrap=, such as lambda worlds: VecFrameStack"):
+        ours(model, world)
+    check(model, own(model, vector(world, FIRST, stack), deterministic=True), world, wrap=stack)
+
+
+def test_normalized_and_stacked_frames_score_as_in_their_own_evaluation(
+    world: dict[str, Any], tmp_path: Path
+) -> None:
+    model = trained(
+        stable_baselines3.PPO,
+        "MlpPolicy",
+        world,
+        lambda worlds: normalized(VecFrameStack(VecTransposeImage(worlds), 2)),
+    )
+    with refuses("policy: expected observations .*, wrap="):
+        ours(model, world)
+    model.get_vec_normalize_env().save(str(tmp_path / "statistics.pkl"))
+
+    def wrap(worlds: Any) -> Any:
+        stacked = VecFrameStack(VecTransposeImage(worlds), 2)
+        loaded = VecNormalize.load(str(tmp_path / "statistics.pkl"), stacked)
+        loaded.training = False
+        return loaded
+
+    check(model, own(model, vector(world, FIRST, wrap), deterministic=True), world, wrap=wrap)
+
+
+def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
+    def stack(worlds: Any) -> Any:
+        return VecFrameStack(worlds, 2)
+
+    model = trained(sb3_contrib.MaskablePPO, "MlpPolicy", world, stack)
+    worlds = vector(world, FIRST, stack)
+    expected = own(model, worlds, deterministic=True, evaluation=evaluate_masked)
+    check(model, expected, world, wrap=stack)
+
+
+@pytest.mark.parametrize("wrap", [lambda worlds: None, lambda worlds: 7], ids=["None", "7"])
+def test_what_wraps_nothing_is_refused(world: dict[str, Any], wrap: Wrap) -> None:
+    with refuses("wrap: expected a function that returns its argument, a VecEnv of SB3, in wrap"):
+        ours(lambda seen: np.zeros(len(seen), int), world, wrap=wrap)
+
+
+def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
+    shapes = set()
+
+    def act(seen: Any) -> Any:
+        shapes.add(seen.shape)
+        return np.zeros(len(seen), int)
+
+    ours(act, world, wrap=lambda worlds: VecFrameStack(worlds, 2))
+    assert shapes == {(N_WORLDS, 15, 15, 10)}
+
+
+def test_a_retrained_model_runs_again(world: dict[str, Any], tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    model = trained(stable_baselines3.PPO, "MlpPolicy", world)
+    ours(model, world, csv=file)
+    rows = read(file)
+    model.save(tmp_path / "model.zip")
+    loaded = stable_baselines3.PPO.load(tmp_path / "model.zip", device="cpu")
+    ours(loaded, world, csv=file)
+    assert read(file) == rows, "the same weights"
+    model.learn(128)
+    ours(model, world, csv=file)
+    assert read(file)[0].policy_fingerprint != rows[0].policy_fingerprint
+    # So it does where a function hides the model.
+    ours(lambda seen: loaded.predict(seen)[0], world, csv=file)
+    rows = read(file)
+    loaded.set_env(vector(world, 5000))
+    loaded.learn(128)
+    ours(lambda seen: loaded.predict(seen)[0], world, csv=file)
+    assert len(read(file)) == N_WORLDS and read(file)[0] != rows[0]
+
+
+def test_more_or_other_statistics_run_again(
+    world: dict[str, Any], behind_statistics: Any, tmp_path: Path
+) -> None:
+    model, _, _, parts = behind_statistics
+    file = tmp_path / "rows.csv"
+    ours(model, world, observation=parts, csv=file)
+    rows = read(file)
+    statistics = model.get_vec_normalize_env().obs_rms
+    (statistics if parts == "local" else statistics["frame"]).mean += 1.0
+    ours(model, world, observation=parts, csv=file)
+    assert read(file)[0].policy_fingerprint != rows[0].policy_fingerprint

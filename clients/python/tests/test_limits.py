@@ -1,0 +1,295 @@
+"""Limits of the system: memory, threads, file descriptors, and calls that a container refuses.
+
+Each in a process of its own; what needs root or a kind of cgroup is skipped where there is none.
+"""
+
+import errno
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from failures import fails
+from processes import server, stopped
+
+import emberwatch
+from emberwatch.errors import EmberwatchError, NotEnoughMemoryError
+from emberwatch.programs import find, unused_instance
+
+#: Says what an error says.
+HEAD = """
+import ctypes, os, resource, struct, sys
+import emberwatch, gymnasium
+def tell(call):
+    try: print("made", call())
+    except emberwatch.EmberwatchError as error: print(type(error).__name__, error.code, error)
+def refuse(number, errno):  # a seccomp filter: this system call fails, all others pass
+    libc = ctypes.CDLL(None)
+    fails, passes = (6, 0, 0, 0x50000 | errno), (6, 0, 0, 0x7FFF0000)
+    lines = (0x20, 0, 0, 0), (0x15, 0, 1, number), fails, passes
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
+    program = ctypes.create_string_buffer(struct.pack("@HP", len(lines), ctypes.addressof(code)))
+    assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, program, 0, 0) == 0
+LARGE = {"worlds": 256, "height": 1024, "width": 1024, "burn_in": 0}
+"""
+
+LARGE = ["--worlds=64", "--height=1024", "--width=1024", "--burn-in=0"]
+
+#: Numbers of system calls of x86-64.
+CALLS = {"flock": 73, "fallocate": 285, "pidfd_open": 434, "socket": 41, "clone3": 435}
+
+as_root = pytest.mark.skipif(os.getuid() != 0, reason="needs root")
+on_x86 = pytest.mark.skipif(platform.machine() != "x86_64", reason="numbers of x86-64's calls")
+
+
+def run(*command: str | Path, limit: str = "true") -> subprocess.CompletedProcess[str]:
+    """Runs a program in a shell that first sets a limit on itself."""
+    shell = ["bash", "-c", f'ulimit -c 0; {limit} && exec "$@"', "bash", *map(str, command)]
+    few = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run(shell, capture_output=True, text=True, timeout=60, env=few)
+
+
+def python(code: str, *arguments: object, limit: str = "true") -> str:
+    """What Python code prints; it ends well."""
+    words = [sys.executable, "-W", "ignore", "-c", HEAD + code, *map(str, arguments)]
+    ended = run(*words, limit=limit)
+    assert ended.returncode == 0, ended
+    return ended.stdout
+
+
+class Group:
+    """A cgroup, and one in it, which a shell enters."""
+
+    def __init__(self, kind: str) -> None:
+        versions = [Path("/sys/fs/cgroup", kind), Path("/sys/fs/cgroup")]
+        base = next((it for it in versions if (it / "cgroup.procs").exists()), None)
+        if os.getuid() != 0 or base is None:
+            pytest.skip("needs root, and cgroups")
+        self.outer = base / f"emberwatch-test-{os.getpid()}"
+        self.inner = self.outer / "inner"
+        self.enter = f"echo $$ > {self.inner}/cgroup.procs"
+
+    def make(self, names: list[str], value: str) -> None:
+        """Makes it with a limit under one of the names, which versions of cgroups differ in."""
+        try:
+            self.inner.mkdir(parents=True)
+        except OSError as error:
+            pytest.skip(f"no cgroup can be made: {error}")
+        for name in names:
+            if (self.outer / name).exists():
+                (self.outer / name).write_text(value)
+                return
+        pytest.skip(f"the cgroup has none of {names}")
+
+    def remove(self) -> None:
+        for folder in (self.inner, self.outer):
+            for _ in range(100):  # its processes are just ending
+                try:
+                    folder.rmdir()
+                    break
+                except FileNotFoundError:
+                    break
+                except OSError:
+                    time.sleep(0.05)
+
+
+@pytest.fixture
+def memory() -> Iterator[Group]:
+    """A cgroup around another one that may have 400 MB of memory."""
+    group = Group("memory")
+    try:
+        group.make(["memory.limit_in_bytes", "memory.max"], "400M")
+        yield group
+    finally:
+        group.remove()
+
+
+@pytest.fixture
+def pids() -> Iterator[Group]:
+    """The same with six processes and threads."""
+    group = Group("pids")
+    try:
+        group.make(["pids.max"], "6")
+        yield group
+    finally:
+        group.remove()
+
+
+@pytest.mark.parametrize(
+    ("limit", "name"),
+    [("ulimit -v 1500000", "RLIMIT_AS"), ("ulimit -d 1200000", "RLIMIT_DATA")],
+)
+def test_worlds_beyond_a_ulimit_are_refused_with_numbers(limit: str, name: str) -> None:
+    said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=limit)
+    assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
+    assert "MiB for 256 worlds of 1024 x 1024 cells, got " in said, said
+    assert f"the limit {name}; raise it (`ulimit " in said, said
+
+
+def test_a_server_beyond_a_ulimit_says_so() -> None:
+    place = f"--instance={unused_instance()}"
+    ended = run(find("emberwatch-server"), place, *LARGE, limit="ulimit -v 800000")
+    assert ended.returncode == 1, ended
+    assert "memory: expected " in ended.stderr and "RLIMIT_AS" in ended.stderr, ended
+
+
+def test_worlds_beyond_a_cgroup_are_refused_with_its_limit(memory: Group) -> None:
+    said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=memory.enter)
+    assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
+    assert f"the limit of a cgroup ({memory.outer}/memory." in said, said
+    place = f"--instance={unused_instance()}"
+    ended = run(find("emberwatch-server"), place, *LARGE, limit=memory.enter)
+    assert ended.returncode == 1 and f"cgroup ({memory.outer}/memory." in ended.stderr, ended
+
+
+def test_worlds_within_a_limit_are_made_and_fly(memory: Group) -> None:
+    code = """
+client = emberwatch.embed(worlds=32, height=512, width=512, moves=4, burn_in=0)
+lease = client.acquire(0, 32)
+for _ in range(5): lease.step([[1] * 4] * 32)
+print(len(lease.reset(range(32))))
+"""
+    assert python(code, limit=memory.enter) == "32\n"
+
+
+def test_memory_errors_are_of_both_kinds() -> None:
+    with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells") as caught:
+        emberwatch.embed(worlds=1024, height=4096, width=4096)
+    assert isinstance(caught.value, NotEnoughMemoryError)
+    assert isinstance(caught.value, EmberwatchError) and caught.value.code == "no_memory"
+
+
+@as_root
+def test_a_user_who_may_start_no_thread_is_told_the_limit() -> None:
+    code = """
+make = lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0)
+make().close()
+resource.setrlimit(resource.RLIMIT_NPROC, (1, 1))
+os.setresuid(64321, 64321, 64321)
+tell(make)
+"""
+    said = python(code)
+    assert said.startswith("EmberwatchError threads threads: expected to start 1, got: "), said
+    assert "may have 1 processes and threads (RLIMIT_NPROC)" in said, said
+    assert said.count("Resource temporarily unavailable") == 1, said
+
+
+def test_a_cgroup_without_threads_is_named(pids: Group) -> None:
+    place = f"--instance={unused_instance()}"
+    flags = [place, "--threads=16", "--burn-in=0"]
+    ended = run(find("emberwatch-server"), *flags, limit=pids.enter)
+    assert ended.returncode == 1, ended
+    assert "threads: expected to start 16, got: Resource temporarily" in ended.stderr, ended
+    assert ended.stderr.count("Resource temporarily unavailable") == 1, ended
+    assert f"({pids.outer}/pids.max)" in ended.stderr and "--pids-limit" in ended.stderr, ended
+    said = python("tell(lambda: emberwatch.embed(threads=16, worlds=16))", limit=pids.enter)
+    assert f"({pids.outer}/pids.max)" in said, said
+
+
+@on_x86
+@pytest.mark.parametrize(
+    ("call", "number"),
+    [
+        ("pidfd_open", errno.EPERM),
+        ("pidfd_open", errno.ENOSYS),
+        ("pidfd_open", errno.EACCES),
+        ("flock", errno.EPERM),
+        ("fallocate", errno.EPERM),
+        ("socket", errno.EAFNOSUPPORT),
+    ],
+)
+def test_a_refused_call_is_named_and_not_taken_for_no_server(call: str, number: int) -> None:
+    running = server()
+    words = f"{call}: expected the system to allow this call, got: {os.strerror(number)}"
+    words = words.replace("socket:", "socket (AF_UNIX):")
+    code = """
+import time
+refuse(int(sys.argv[2]), int(sys.argv[3]))
+tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire().robots)
+start = time.monotonic()
+tell(lambda: emberwatch.connect(sys.argv[1], wait=20))
+assert time.monotonic() - start < 5, "it waited"
+"""
+    embedded, connected = python(code, running.instance, CALLS[call], number).splitlines()
+    assert embedded.startswith("made "), embedded
+    assert connected.startswith(f"EmberwatchError channel {words}"), connected
+    assert "--security-opt seccomp" in connected, connected
+    code = "refuse(int(sys.argv[1]), int(sys.argv[2])); os.execv(sys.argv[3], sys.argv[3:])"
+    program = str(find("emberwatch-server"))
+    for more in (["status", f"--instance={running.instance}"], [f"--instance={unused_instance()}"]):
+        start = time.monotonic()
+        wrapped = [sys.executable, "-c", HEAD + code, str(CALLS[call]), str(number), program]
+        ended = run(*wrapped, *more)
+        assert ended.returncode == 1 and words in ended.stderr, ended
+        assert time.monotonic() - start < 5, "it waited"
+
+
+@on_x86
+def test_threads_that_a_seccomp_profile_forbids_are_called_so() -> None:
+    code = """
+refuse(435, 1)
+tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
+"""
+    said = python(code)
+    assert said.startswith("EmberwatchError threads threads: ") and "`clone3`" in said, said
+
+
+@on_x86
+def test_a_process_to_end_with_that_cannot_be_watched_is_not_called_ended() -> None:
+    code = "refuse(434, 1); os.execv(sys.argv[1], sys.argv[1:])"
+    flags = [f"--instance={unused_instance()}", f"--exit-with={os.getpid()}"]
+    ended = run(sys.executable, "-c", HEAD + code, find("emberwatch-server"), *flags)
+    assert ended.returncode == 1, ended
+    assert f"--exit-with {os.getpid()}: pidfd_open: expected the system" in ended.stderr, ended
+
+
+#: Connects with ever more free file descriptors; says how many it takes.
+DESCRIPTORS = """
+import gc
+def count():
+    gc.collect()
+    return len(os.listdir("/proc/self/fd")) - 1
+open_one = {"connect": emberwatch.connect, "observe": emberwatch.observe}[sys.argv[2]]
+open_one(sys.argv[1], timeout=2.0).close()
+before = count()
+for free in range(60):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (before + free, 4096))
+    try: one, said = open_one(sys.argv[1], timeout=2.0), ""
+    except emberwatch.EmberwatchError as error: one, said = None, str(error)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 4096))
+    if one is not None: break
+    assert "file descriptors, got fewer of the limit of" in said, said
+    assert count() == before, f"{count() - before} left behind with {free} free: {said}"
+    needed = said.partition("expected ")[2].partition(" file")[0]
+one.close()
+print(free, needed, count() - before)
+"""
+
+
+@pytest.mark.parametrize(("kind", "within"), [("connect", 1), ("observe", 1)])
+def test_a_connection_takes_as_many_descriptors_as_it_says(kind: str, within: int) -> None:
+    said = python(DESCRIPTORS, server().instance, kind)
+    free, needed, left = map(int, said.split())
+    assert left == 0
+    assert needed <= free <= needed + within, said
+
+
+def test_attempts_that_time_out_leave_no_descriptor_and_no_place() -> None:
+    running = server()
+
+    def n_open() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    running.connect().close()
+    before = n_open()
+    with stopped(running.program.pid):
+        for _ in range(3):
+            with fails("timeout"):
+                emberwatch.connect(running.instance, timeout=0.1)
+        assert n_open() == before
+    clients = [running.connect() for _ in range(15)]  # the sixteenth is `running`'s own
+    assert len(clients) == 15

@@ -1,0 +1,216 @@
+//! The limits of the cgroups that this process is in, versions 1 and 2: a container's, and those around it.
+
+use std::path::{Path, PathBuf};
+
+/// Values of at least this many bytes or processes mean "no limit": version 1 writes the largest multiple of a page.
+const UNLIMITED: u64 = 1 << 60;
+
+/// A controller of cgroups: the names of its files in versions 1 and 2.
+pub(super) struct Controller {
+    pub(super) name: &'static str,
+    /// What the cgroup may have.
+    pub(super) limit: [&'static str; 2],
+    /// What it has.
+    pub(super) used: [&'static str; 2],
+    /// Counts in `memory.stat` that the kernel can take back, such as cached files.
+    pub(super) reclaimable: [&'static [&'static str]; 2],
+}
+
+/// The limit of one cgroup.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct CgroupLimit {
+    /// The file that has it.
+    pub(super) file: PathBuf,
+    pub(super) limit: u64,
+    pub(super) free: u64,
+}
+
+/// A hierarchy that is mounted: its version less one, the cgroup at its top, and where that is.
+struct Mount {
+    version: usize,
+    top: PathBuf,
+    folder: PathBuf,
+}
+
+/// The limits of a controller on this process, by the files below `root`.
+pub(super) fn limits(root: &Path, controller: &Controller) -> Vec<CgroupLimit> {
+    let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap_or_default();
+    let (own, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));
+    let mounts = mounts.lines().filter_map(|line| mount(line, controller));
+    let limits = mounts.flat_map(|mount| {
+        let group = own_group(&own, &mount, controller).unwrap_or_default();
+        let bottom = root.join(relative(&mount.folder)).join(group);
+        let top = root.join(relative(&mount.folder));
+        let folders = bottom.ancestors().take_while(|it| it.starts_with(&top));
+        let limits = folders.filter_map(|folder| limit(folder, mount.version, controller));
+        limits.collect::<Vec<_>>()
+    });
+    limits.collect()
+}
+
+/// A line of `mountinfo`, such as `35 31 0:32 / /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory`.
+fn mount(line: &str, controller: &Controller) -> Option<Mount> {
+    let (place, kind) = line.split_once(" - ")?;
+    let mut place = place.split(' ').skip(3);
+    let (top, folder) = (place.next()?, place.next()?);
+    let mut kind = kind.split(' ');
+    let version = match kind.next()? {
+        "cgroup" => 0,
+        "cgroup2" => 1,
+        _ => return None,
+    };
+    let mut options = kind.nth(1)?.split(',');
+    let is_of = version == 1 || options.any(|option| option == controller.name);
+    is_of.then(|| Mount {
+        version,
+        top: top.into(),
+        folder: folder.into(),
+    })
+}
+
+/// The cgroup of this process, relative to the top of a mount, by the lines of `/proc/self/cgroup`, such as
+/// `4:memory:/docker/id` or, in version 2, `0::/user.slice`.
+fn own_group(own: &str, mount: &Mount, controller: &Controller) -> Option<PathBuf> {
+    let path = own.lines().find_map(|line| {
+        let mut words = line.splitn(3, ':').skip(1);
+        let (controllers, path) = (words.next()?, words.next()?);
+        let is_of = match mount.version {
+            0 => controllers.split(',').any(|name| name == controller.name),
+            _ => controllers.is_empty(),
+        };
+        is_of.then_some(path)
+    })?;
+    // In a container, the mount may show a part of the hierarchy alone.
+    let below = Path::new(path).strip_prefix(&mount.top).ok()?;
+    let is_plain = !below.components().any(|it| it.as_os_str() == "..");
+    is_plain.then(|| below.to_owned())
+}
+
+/// The limit of one cgroup, if it has one.
+fn limit(folder: &Path, version: usize, controller: &Controller) -> Option<CgroupLimit> {
+    let number = |name: &str| {
+        let text = std::fs::read_to_string(folder.join(name)).ok()?;
+        text.trim().parse::<u64>().ok()
+    };
+    let file = folder.join(controller.limit[version]);
+    let limit = number(controller.limit[version]).filter(|&limit| limit < UNLIMITED)?;
+    let used = number(controller.used[version])?;
+    let counts = std::fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();
+    let counts = counts.lines().filter_map(|line| line.split_once(' '));
+    let reclaimable: u64 = counts
+        .filter(|(name, _)| controller.reclaimable[version].contains(name))
+        .filter_map(|(_, count)| count.trim().parse::<u64>().ok())
+        .sum();
+    Some(CgroupLimit {
+        file,
+        limit,
+        free: limit.saturating_sub(used.saturating_sub(reclaimable)),
+    })
+}
+
+fn relative(path: &Path) -> &Path {
+    path.strip_prefix("/").unwrap_or(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::{create_dir_all, remove_dir_all, write};
+
+    const MEMORY: Controller = Controller {
+        name: "memory",
+        limit: ["memory.limit_in_bytes", "memory.max"],
+        used: ["memory.usage_in_bytes", "memory.current"],
+        reclaimable: [&["total_inactive_file"], &["inactive_file"]],
+    };
+
+    /// What is read where the system has these files: the folder, the limit and what is free, the innermost first.
+    fn check(name: &str, files: &[(&str, &str)], expected: &[(&str, u64, u64)]) {
+        let root = std::env::temp_dir().join(format!("emberwatch-{name}-{}", std::process::id()));
+        for (path, text) in files {
+            let path = root.join(path);
+            create_dir_all(path.parent().expect("a folder")).expect("make it");
+            write(path, text).expect("write a file");
+        }
+        let found = limits(&root, &MEMORY);
+        let found = found.iter().map(|it| {
+            let folder = it.file.parent().expect("a folder").strip_prefix(&root);
+            let folder = folder.expect("below the root").to_string_lossy();
+            (folder.into_owned(), it.limit, it.free)
+        });
+        let found: Vec<_> = found.collect();
+        let expected = expected.iter();
+        let expected: Vec<_> = expected.map(|it| (it.0.to_owned(), it.1, it.2)).collect();
+        assert_eq!(found, expected);
+        remove_dir_all(&root).expect("clean up");
+    }
+
+    #[test]
+    fn all_groups_around_a_process_count_in_version_2() {
+        let mount = "30 23 0:26 / /sys/fs/cgroup rw,nosuid - cgroup2 cgroup2 rw,nsdelegate";
+        let own = ("proc/self/cgroup", "0::/outer/inner\n");
+        let files = [
+            own,
+            ("proc/self/mountinfo", mount),
+            ("sys/fs/cgroup/outer/memory.max", "1000\n"),
+            ("sys/fs/cgroup/outer/memory.current", "900\n"),
+            (
+                "sys/fs/cgroup/outer/memory.stat",
+                "anon 1\ninactive_file 300\nslab 2\n",
+            ),
+            ("sys/fs/cgroup/outer/inner/memory.max", "max\n"),
+            ("sys/fs/cgroup/outer/inner/memory.current", "500\n"),
+        ];
+        check("v2", &files, &[("sys/fs/cgroup/outer", 1000, 400)]);
+        let mut both = files.to_vec();
+        both[5].1 = "600\n";
+        let inner = ("sys/fs/cgroup/outer/inner", 600, 100);
+        check(
+            "v2-both",
+            &both,
+            &[inner, ("sys/fs/cgroup/outer", 1000, 400)],
+        );
+        // In a namespace of its own, a process sees its group as the top, or its parent as "..".
+        for own in ["0::/", "0::/../other"] {
+            let files = [
+                ("proc/self/cgroup", own),
+                ("proc/self/mountinfo", mount),
+                ("sys/fs/cgroup/memory.max", "1000"),
+                ("sys/fs/cgroup/memory.current", "1500"),
+            ];
+            check("v2-top", &files, &[("sys/fs/cgroup", 1000, 0)]);
+        }
+    }
+
+    #[test]
+    fn a_group_is_found_below_the_top_of_a_mount_in_version_1() {
+        let mounts = "\
+            34 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset\n\
+            35 31 0:32 /docker/id /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory\n\
+            41 31 0:38 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw";
+        let files = [
+            (
+                "proc/self/cgroup",
+                "5:cpuset:/\n4:memory:/docker/id/job\n0::/\n",
+            ),
+            ("proc/self/mountinfo", mounts),
+            ("sys/fs/cgroup/memory/job/memory.limit_in_bytes", "800"),
+            ("sys/fs/cgroup/memory/job/memory.usage_in_bytes", "300"),
+            (
+                "sys/fs/cgroup/memory/job/memory.stat",
+                "total_inactive_file 100\ninactive_file 7",
+            ),
+            (
+                "sys/fs/cgroup/memory/memory.limit_in_bytes",
+                "9223372036854771712",
+            ),
+            ("sys/fs/cgroup/memory/memory.usage_in_bytes", "5"),
+        ];
+        check("v1", &files, &[("sys/fs/cgroup/memory/job", 800, 600)]);
+    }
+
+    #[test]
+    fn without_cgroups_there_is_no_limit() {
+        check("none", &[("proc/self/cgroup", "garbage")], &[]);
+    }
+}
