@@ -76,8 +76,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._every = np.ones(num_envs, np.bool_)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
-        # Robots that completed a path in this step.
-        self._exchanged = np.zeros(num_envs, np.bool_)
+        #: Robots that completed a path in this step; None: none of them.
+        self._exchanged: NDArray[np.bool_] | None = None
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
@@ -140,7 +140,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
                 )
             self._session.begin_step()
             flown = ~over
-            self._exchanged = np.zeros_like(flown)
+            self._exchanged = None
             rewards = self._fly(chosen, flown)
             self._elapsed += flown
             if has_ended:
@@ -268,9 +268,11 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """What `step` returns."""
-        worlds = self._results["world"]
-        terminations = self._exchanged & (worlds["terminated"] != 0)
-        truncations = self._exchanged & (worlds["truncated"] != 0)
+        terminations, truncations = np.zeros((2, self.num_envs), np.bool_)
+        if self._exchanged is not None:
+            worlds = self._results["world"]
+            terminations = self._exchanged & (worlds["terminated"] != 0)
+            truncations = self._exchanged & (worlds["truncated"] != 0)
         if self._max_steps is not None:
             truncations |= flown & (self._elapsed >= self._max_steps)
         over = terminations | truncations
