@@ -18,7 +18,7 @@ from failures import refuses
 from processes import script
 
 from emberwatch.benchmark import Row, evaluate, read, row_file
-from emberwatch.benchmark.row_file import Mark, RowFile
+from emberwatch.benchmark.row_file import Kind, Mark, RowFile
 from emberwatch.programs import find
 
 WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
@@ -54,7 +54,7 @@ def opened(path: Path, policy: str = "mine", mark: Mark = MARK) -> RowFile:
     """A file after it was looked through for a policy."""
     file = RowFile(path)
     with file:
-        file.find(policy, mark)
+        file.find(Kind(policy, 1, "alone"), mark)
     return file
 
 
@@ -105,7 +105,7 @@ def test_rows_of_the_agent_and_of_python_share_a_folder(tmp_path: Path) -> None:
     subprocess.run([find("emberwatch-agent"), "suite", *flags], check=True, capture_output=True)
     theirs = {row.policy for row in read(file)}
     with RowFile(file, is_cache=True) as opened:
-        opened.find("mine", MARK)
+        opened.find(Kind("mine", 1, "alone"), MARK)
         opened.add([row("mine", 0)])
     assert {row.policy for row in read(file)} == {*theirs, "mine"}
 

@@ -39,17 +39,16 @@ class Mark(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A policy with its estimator and team: one group of rows in a table."""
+    """A policy in one kind of team, of which a file has one row for each world."""
 
     policy: str
-    estimator: str
     robots: int
     team: str
 
     @classmethod
     def of(cls, row: Row) -> Self:
         """Returns the kind of a row."""
-        return cls(row.policy, row.estimator, row.robots, row.team)
+        return cls(row.policy, row.robots, row.team)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +135,7 @@ class RowFile:
         return Found(kept, stale, tuple(sorted(elsewhere)))
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Adds rows, in the place of all rows of the policy with another mark.
+        """Adds rows, and drops all rows of the policy with another mark.
 
         Raises:
             InvalidArgumentError: If another process has written rows meanwhile that do not go
