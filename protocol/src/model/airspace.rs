@@ -120,11 +120,6 @@ impl Airspace {
         }
     }
 
-    /// Whether any move leads out of a cell: where none does, no robot may start.
-    pub fn has_way_out(&self, cell: Cell) -> bool {
-        Move::ALL.iter().any(|step| self.after(*step, cell) != cell)
-    }
-
     /// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, unless that is off the grid or a no-fly cell).
     pub fn fly(&self, start: Cell, path: &[Move]) -> Flight {
         let mut visited = Vec::new();

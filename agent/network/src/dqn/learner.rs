@@ -259,7 +259,7 @@ impl Dqn {
     }
 
     /// Factor on the value of what follows one step: nothing follows the end of an episode that terminated. What
-    /// follows a truncated episode counts, because the world goes on.
+    /// follows a truncated episode counts, because the world continues.
     pub fn discount(&self, is_terminated: bool) -> f32 {
         if is_terminated {
             0.0
