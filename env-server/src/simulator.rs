@@ -1,6 +1,7 @@
 //! All worlds and leases of a server: requests in, answers out, no I/O and no clock.
 
 mod advance;
+mod answer;
 mod barrier;
 #[cfg(test)]
 mod barrier_tests;
@@ -10,6 +11,7 @@ mod lease;
 #[cfg(test)]
 mod lease_tests;
 mod outcome;
+mod share;
 mod state;
 mod step;
 #[cfg(test)]

@@ -27,7 +27,7 @@ pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, control, failed_connections, interrupt, message, observer,
-    payload, recording, responder, shared_memory, turn, wait,
+    payload, recording, resend, responder, shared_memory, turn, wait,
 };
 
 #[cfg(doctest)]

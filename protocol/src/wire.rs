@@ -28,6 +28,7 @@ pub mod payload;
 mod poll;
 pub(crate) mod process;
 pub mod recording;
+pub mod resend;
 mod resources;
 pub mod responder;
 pub mod shared_memory;

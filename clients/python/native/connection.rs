@@ -1,23 +1,25 @@
 //! Connections, to a server or to embedded worlds.
 
+use crate::answer::Answer;
 use crate::backend::{Backend, embedded};
 use crate::errors::{raise, raise_of_channel};
+use crate::model::shape_of;
 use crate::owned::Owned;
 use crate::refusal::invalid;
 use crate::samples::{Truth, truth_of};
+use emberwatch_protocol::Shape;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::{StepReply, StepRequest, WorldResult};
 use emberwatch_server::embedded::INSTANCE;
 use emberwatch_server::world::Episode;
-use numpy::PyArray1;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
 use std::time::Duration;
 
-/// How long the server worked on a step, and what it answered: results of the worlds, of the robots, frames.
-pub type Answer<'py> = (u64, Bound<'py, PyArray1<u8>>);
+/// Cells and moves that are stepped in less than about 1 ms.
+const BRIEF_CELLS: usize = 1 << 19;
 
 /// A connection to a server, or worlds in this process. Threads may share it: they take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -28,6 +30,11 @@ pub struct Server {
     info: String,
     pub team: u32,
     pub n_moves: usize,
+    /// Height and width of the grid.
+    pub shape: Shape,
+    /// How long a step waits for teammates.
+    pub deadline: Duration,
+    is_embedded: bool,
 }
 
 #[pymethods]
@@ -37,7 +44,7 @@ impl Server {
         let name = checked(py, instance)?;
         let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
         let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
-        Ok(Self::of(instance, Backend::Server(Box::new(wire))))
+        Self::of(py, instance, Backend::Server(Box::new(wire)))
     }
 
     /// Worlds in this process, of these settings of `config/server.toml`, as JSON. `warns`: of starts that no-fly cells
@@ -46,7 +53,7 @@ impl Server {
     #[pyo3(name = "embedded")]
     fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
         let worlds = Backend::Embedded(Box::new(embedded(py, settings, warns)?));
-        Ok(Self::of(INSTANCE, worlds))
+        Self::of(py, INSTANCE, worlds)
     }
 
     /// Hidden states of consecutive embedded worlds that publish them, as the fields of `Truth`.
@@ -86,9 +93,9 @@ impl Server {
 
     /// Sends a request on `step` as it is.
     #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
-    fn step<'py>(
+    fn step(
         &self,
-        py: Python<'py>,
+        py: Python<'_>,
         operation: u32,
         lease: u64,
         first_robot: u32,
@@ -97,7 +104,7 @@ impl Server {
         flags: u32,
         body: &[u8],
         seconds: f64,
-    ) -> PyResult<Answer<'py>> {
+    ) -> PyResult<Answer> {
         let request = StepRequest {
             operation,
             lease,
@@ -109,7 +116,7 @@ impl Server {
         };
         let step = |to: &mut Backend| to.step_payload(request, body, duration(seconds));
         let answer = self.backend.with(py, step)?;
-        answered(py, answer, seconds)
+        self.answered(py, answer, seconds)
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
@@ -118,30 +125,40 @@ impl Server {
 }
 
 impl Server {
-    fn of(instance: &str, backend: Backend) -> Self {
+    fn of(py: Python<'_>, instance: &str, backend: Backend) -> PyResult<Self> {
         let info: ServerInfo = backend.info();
-        Self {
+        Ok(Self {
+            shape: shape_of(py, info.height as usize, info.width as usize)?,
+            deadline: Duration::from_millis(info.deadline_millis),
+            is_embedded: matches!(backend, Backend::Embedded(_)),
             info: serde_json::to_string(&info).expect("invariant: replies serialise"),
             team: info.n_robots.max(1),
             n_moves: info.n_moves,
             backend: Owned::new(instance, backend),
-        }
+        })
+    }
+
+    /// What Python gets of an answer.
+    pub fn answered(
+        &self,
+        py: Python<'_>,
+        answer: Result<(StepReply, Vec<u8>), ConnectionError>,
+        seconds: f64,
+    ) -> PyResult<Answer> {
+        let (reply, payload) = answer.map_err(|error| raise(py, error, "a step", seconds))?;
+        Ok(Answer::of(py, self.team, self.shape, &reply, payload))
+    }
+
+    /// Whether a step of so many robots is over so soon that other Python threads need not get the interpreter: to get
+    /// it back from a busy one takes 5 ms.
+    pub fn is_brief(&self, n_robots: u32) -> bool {
+        self.is_embedded && n_robots as usize * (self.shape.n_cells() + self.n_moves) < BRIEF_CELLS
     }
 }
 
 /// A world's present, without the interpreter.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
     (world, *episode.result(), episode.states().to_owned())
-}
-
-/// What Python gets of an answer.
-pub fn answered(
-    py: Python<'_>,
-    answer: Result<(StepReply, Vec<u8>), ConnectionError>,
-    seconds: f64,
-) -> PyResult<Answer<'_>> {
-    let (reply, payload) = answer.map_err(|error| raise(py, error, "a step", seconds))?;
-    Ok((reply.simulation_nanos, PyArray1::from_vec(py, payload)))
 }
 
 /// Checks an instance's name.

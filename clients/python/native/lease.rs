@@ -1,15 +1,18 @@
 //! A lease: the right to fly consecutive robots, and the step k for which each world's next path is.
 
+use crate::answer::Answer;
 use crate::backend::Backend;
-use crate::connection::{Answer, Server, answered, duration};
+use crate::connection::{Server, duration};
 use crate::moves;
 use crate::refusal::invalid;
 use emberwatch_protocol::connection::{ConnectionError, worlds_of};
-use emberwatch_protocol::message::{Operation, StepReply, StepRequest, WorldResult};
+use emberwatch_protocol::message::{Operation, Status, StepReply, StepRequest, WorldResult};
 use emberwatch_protocol::payload::{WORLD_BYTES, write_step_body};
+use emberwatch_protocol::resend::{Flown, until_moved};
 use pyo3::prelude::*;
 use std::ops::Range;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// The steps of a lease's worlds.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -34,50 +37,88 @@ impl Lease {
     }
 
     /// Flies a path with each robot.
-    fn step<'py>(
+    fn step(
         &self,
-        py: Python<'py>,
-        paths: &Bound<'py, PyAny>,
+        py: Python<'_>,
+        paths: &Bound<'_, PyAny>,
         first_robot: u32,
         n_robots: u32,
         flags: u32,
         seconds: f64,
-    ) -> PyResult<Answer<'py>> {
+    ) -> PyResult<Answer> {
+        let moves = self.moves(paths, first_robot, n_robots)?;
+        let request = self.step_request(first_robot, n_robots, flags);
+        let answer = self.ask(py, request, &moves, duration(seconds))?;
+        self.server.get().answered(py, answer, seconds)
+    }
+
+    /// Flies a path with each robot, and sends it again until the worlds have moved. Returns how the worlds stand, and
+    /// how many of their steps passed unseen before that. `accepts_late`: where a world moved on without these paths,
+    /// that is no error.
+    fn fly(
+        &self,
+        py: Python<'_>,
+        paths: &Bound<'_, PyAny>,
+        first_robot: u32,
+        n_robots: u32,
+        accepts_late: bool,
+        seconds: f64,
+    ) -> PyResult<(Answer, u64)> {
         let server = self.server.get();
-        let worlds = worlds_of(first_robot, n_robots, server.team);
-        if worlds.start < self.worlds.start || worlds.end > self.worlds.end {
-            let expected = format!("robots of worlds {:?}", self.worlds);
-            let got = format!("{n_robots} from {first_robot} on");
-            return Err(invalid(py, "step", expected, got));
-        }
-        let n_moves = server.n_moves;
-        let moves = moves::paths(paths, n_robots as usize, n_moves)?;
-        let request = self.request(Operation::Step, first_robot, n_robots, flags);
-        let request = StepRequest {
-            n_moves: n_moves as u32,
-            ..request
+        let moves = self.moves(paths, first_robot, n_robots)?;
+        let request = self.step_request(first_robot, n_robots, 0);
+        let first_world = worlds_of(first_robot, 1, server.team).start;
+        let before = self.step_of(first_world);
+        // Sooner would take back the path with which the deadline began.
+        let timeout = duration(seconds).saturating_add(server.deadline);
+        let send = |it: &mut &Self| match it.ask(py, request, &moves, timeout)? {
+            Err(ConnectionError::Timeout { .. }) => Ok(None),
+            Err(ConnectionError::Refused { status, .. })
+                if accepts_late && status == Status::Late =>
+            {
+                Ok(None)
+            }
+            answer => server.answered(py, answer, seconds).map(Some),
         };
-        self.ask(py, request, &moves, seconds)
+        let look = |it: &mut &Self| {
+            let request = it.request(Operation::Observe, first_robot, n_robots, 0);
+            let seen = it.ask(py, request, &[], duration(seconds))?;
+            let seen = server.answered(py, seen, seconds)?;
+            if seen.step(py)? > before {
+                return Ok(Some(seen));
+            }
+            warn_of_wait(py, first_world)?;
+            Ok(None)
+        };
+        let mut lease = self;
+        match until_moved(&mut lease, send, look, || false)? {
+            Flown::Answered(answer) => Ok((answer, 0)),
+            Flown::Observed(seen) => {
+                let n_moved = seen.step(py)? - before;
+                Ok((seen, n_moved - 1))
+            }
+            Flown::GivenUp => unreachable!("invariant: it is never given up"),
+        }
     }
 
     /// The last results and frames again; steps go on from there.
-    fn observe<'py>(
+    fn observe(
         &self,
-        py: Python<'py>,
+        py: Python<'_>,
         first_robot: u32,
         n_robots: u32,
         flags: u32,
         seconds: f64,
-    ) -> PyResult<Answer<'py>> {
+    ) -> PyResult<Answer> {
         let request = self.request(Operation::Observe, first_robot, n_robots, flags);
-        self.ask(py, request, &[], seconds)
+        let answer = self.ask(py, request, &[], duration(seconds))?;
+        self.server.get().answered(py, answer, seconds)
     }
 
     /// From here on a world of the lease is at this step.
     fn note(&self, world: u32, step: u64) {
-        let mut steps = self.steps.lock().unwrap_or_else(PoisonError::into_inner);
-        let index = world.checked_sub(self.worlds.start);
-        if let Some(noted) = index.and_then(|index| steps.get_mut(index as usize)) {
+        let (index, mut noted) = (world.checked_sub(self.worlds.start), self.noted());
+        if let Some(noted) = index.and_then(|index| noted.get_mut(index as usize)) {
             *noted = step;
         }
     }
@@ -85,8 +126,7 @@ impl Lease {
     /// The step of each world.
     #[getter]
     fn steps(&self) -> Vec<u64> {
-        let steps = self.steps.lock();
-        steps.unwrap_or_else(PoisonError::into_inner).clone()
+        self.noted().clone()
     }
 }
 
@@ -108,42 +148,100 @@ impl Lease {
         }
     }
 
-    fn ask<'py>(
+    fn step_request(&self, first_robot: u32, n_robots: u32, flags: u32) -> StepRequest {
+        let n_moves = self.server.get().n_moves as u32;
+        let request = self.request(Operation::Step, first_robot, n_robots, flags);
+        StepRequest { n_moves, ..request }
+    }
+
+    /// Checks paths of robots of the lease.
+    fn moves(
         &self,
-        py: Python<'py>,
+        paths: &Bound<'_, PyAny>,
+        first_robot: u32,
+        n_robots: u32,
+    ) -> PyResult<Vec<u8>> {
+        let server = self.server.get();
+        let worlds = worlds_of(first_robot, n_robots, server.team);
+        if worlds.start < self.worlds.start || worlds.end > self.worlds.end {
+            let expected = format!("robots of worlds {:?}", self.worlds);
+            let got = format!("{n_robots} from {first_robot} on");
+            return Err(invalid(paths.py(), "step", expected, got));
+        }
+        moves::paths(paths, n_robots as usize, server.n_moves)
+    }
+
+    fn ask(
+        &self,
+        py: Python<'_>,
         request: StepRequest,
         moves: &[u8],
-        seconds: f64,
-    ) -> PyResult<Answer<'py>> {
+        timeout: Duration,
+    ) -> PyResult<Result<(StepReply, Vec<u8>), ConnectionError>> {
         let server = self.server.get();
         // Within the connection's turn: each thread's path is for a step of its own.
-        let answer = server.backend.with(py, |backend| {
+        let exchange = |backend: &mut Backend| {
             let worlds = worlds_of(request.first_robot, request.n_robots, server.team);
-            self.exchange(backend, &worlds, request, moves, seconds)
-        })?;
-        answered(py, answer, seconds)
+            self.exchange(backend, worlds, request, moves, timeout)
+        };
+        if server.is_brief(request.n_robots) {
+            server.backend.with_briefly(py, exchange)
+        } else {
+            server.backend.with(py, exchange)
+        }
     }
 
     fn exchange(
         &self,
         backend: &mut Backend,
-        worlds: &Range<u32>,
+        worlds: Range<u32>,
         request: StepRequest,
         moves: &[u8],
-        seconds: f64,
+        timeout: Duration,
     ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
         let mut body = Vec::new();
         if request.operation == Operation::Step as u32 {
-            let steps = self.steps();
-            let of = |world| steps[(world - self.worlds.start) as usize];
-            let steps: Vec<u64> = worlds.clone().map(of).collect();
-            write_step_body(&steps, moves, &mut body);
+            let noted = self.noted();
+            write_step_body(&noted[self.indices(&worlds)], moves, &mut body);
         }
-        let (reply, payload) = backend.step_payload(request, &body, duration(seconds))?;
-        for (world, result) in worlds.clone().zip(payload.chunks_exact(WORLD_BYTES)) {
-            let result: WorldResult = bytemuck::pod_read_unaligned(result);
-            self.note(world, result.step);
+        let (reply, payload) = backend.step_payload(request, &body, timeout)?;
+        // Robots outside the lease may be observed, too.
+        let own = worlds.start.max(self.worlds.start)..worlds.end.min(self.worlds.end);
+        if !own.is_empty() {
+            let skipped = (own.start - worlds.start) as usize;
+            let results = payload.chunks_exact(WORLD_BYTES).skip(skipped);
+            let mut noted = self.noted();
+            for (noted, result) in noted[self.indices(&own)].iter_mut().zip(results) {
+                let result: WorldResult = bytemuck::pod_read_unaligned(result);
+                *noted = result.step;
+            }
         }
         Ok((reply, payload))
     }
+
+    /// Where `steps` has these worlds of the lease.
+    fn indices(&self, worlds: &Range<u32>) -> Range<usize> {
+        (worlds.start - self.worlds.start) as usize..(worlds.end - self.worlds.start) as usize
+    }
+
+    fn step_of(&self, world: u32) -> u64 {
+        let index = world - self.worlds.start;
+        self.noted()[index as usize]
+    }
+
+    fn noted(&self) -> MutexGuard<'_, Vec<u64>> {
+        self.steps.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Logs that a step waits for other robots.
+fn warn_of_wait(py: Python<'_>, world: u32) -> PyResult<()> {
+    let text = format!(
+        "world {world} waits for the paths of other robots that are held; environments of one world need a thread or a \
+         process each"
+    );
+    let logger = py
+        .import("logging")?
+        .call_method1("getLogger", ("emberwatch",))?;
+    logger.call_method1("warning", (text,)).map(|_| ())
 }

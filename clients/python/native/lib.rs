@@ -1,6 +1,7 @@
 //! What Python calls of Rust: the module `emberwatch._native`, whose types are in `_native.pyi`.
 
 mod airspace;
+mod answer;
 mod backend;
 mod belief;
 mod connection;
@@ -47,6 +48,9 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let os = py.import("os")?;
     os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
+    module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
+    module.add_class::<answer::Answer>()?;
+    module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<connection::Server>()?;
     module.add_class::<flights::Flights>()?;
     module.add_class::<lease::Lease>()?;

@@ -1,7 +1,10 @@
 //! Moves that a caller hands in: arrays of integers, which become bytes.
 
 use emberwatch_protocol::path::check_moves;
-use numpy::{Element, PyArray1, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
+use numpy::{
+    Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray,
+    PyUntypedArrayMethods,
+};
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
@@ -19,6 +22,16 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyRes
     let module = given.py().import("emberwatch.arguments")?;
     let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
     Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
+}
+
+/// Paths as bytes, `[n_robots, n_moves]`, checked.
+#[pyfunction]
+pub fn moves<'py>(
+    given: &Bound<'py, PyAny>,
+    n_robots: usize,
+    n_moves: usize,
+) -> PyResult<Bound<'py, PyArray2<u8>>> {
+    PyArray1::from_vec(given.py(), paths(given, n_robots, n_moves)?).reshape([n_robots, n_moves])
 }
 
 /// Integers below `n_choices`, one for each row, as bytes; `None` if they are no plain array of that.

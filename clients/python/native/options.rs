@@ -1,6 +1,7 @@
 //! Options: beliefs about worlds of one robot each, and the plans among which a learner chooses.
 
 use crate::airspace::Given;
+use crate::answer::RESULT_BYTES;
 use crate::belief::first_belief;
 use crate::connection::checked;
 use crate::errors::error;
@@ -24,7 +25,7 @@ use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use emberwatch_protocol::model::Description;
 use emberwatch_protocol::path::path_to_bytes;
-use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use emberwatch_protocol::payload::WORLD_BYTES;
 use emberwatch_protocol::{Frame, Model};
 use numpy::ndarray::{Array3, ArrayView1, s};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
@@ -33,9 +34,6 @@ use rayon::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::path::PathBuf;
 use std::sync::OnceLock;
-
-/// Bytes of a world's result and of its robot's result.
-const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
 /// Features and paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);

@@ -65,6 +65,34 @@ impl<T: Send> Owned<T> {
         }
     }
 
+    /// As [`Self::with`], keeping the interpreter for what is over soon, unless another thread uses the value just now.
+    ///
+    /// # Errors
+    /// As [`Self::with`].
+    pub fn with_briefly<R: Send>(
+        &self,
+        py: Python<'_>,
+        act: impl FnOnce(&mut T) -> R + Send,
+    ) -> PyResult<R> {
+        self.check(py)?;
+        let taken = match &mut *self.lock() {
+            slot @ Slot::Free(_) => match std::mem::replace(slot, Slot::Taken) {
+                Slot::Free(value) => Some(value),
+                _ => None,
+            },
+            _ => None,
+        };
+        match taken {
+            Some(value) => {
+                let value = Some(value);
+                let mut taken = Taken { owner: self, value };
+                let value = taken.value.as_mut().expect("invariant: just taken");
+                Ok(act(value))
+            }
+            None => self.with(py, act),
+        }
+    }
+
     /// Drops it. In another process it stays as it is; it may be closed again.
     ///
     /// # Errors

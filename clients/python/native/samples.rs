@@ -10,8 +10,8 @@ use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 
-type World = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
-type Robot = (f64, f64, u32, u32, u32, u32, u32, u32, u32, u32);
+pub type World = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
+pub type Robot = (f64, f64, u32, u32, u32, u32, u32, u32, u32, u32);
 
 /// Its result, what it saw, and the path that it flew.
 type RobotFrame<'py> = (Robot, Bound<'py, PyArray2<u8>>, Bound<'py, PyArray1<u8>>);
@@ -180,7 +180,8 @@ pub fn outlook<'py>(
     })
 }
 
-fn of_world(it: &WorldResult) -> World {
+/// The fields of `WorldResult`.
+pub fn of_world(it: &WorldResult) -> World {
     (
         it.step,
         it.seed,
@@ -196,7 +197,8 @@ fn of_world(it: &WorldResult) -> World {
     )
 }
 
-fn of_robot(it: &RobotResult) -> Robot {
+/// The fields of `RobotResult`.
+pub fn of_robot(it: &RobotResult) -> Robot {
     (
         it.reward,
         it.marginal,

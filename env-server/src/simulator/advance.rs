@@ -1,22 +1,18 @@
-//! Moves worlds: at once for the request that completes them, or when a deadline passes or a holder leaves. Writes the
-//! answers to all requests.
+//! Moves worlds: at once for the request that completes them, or when a deadline passes or a holder leaves.
 
+use super::answer::Part;
 use super::barrier::{Barrier, Ticket, Waiter};
 use super::lease::Refusal;
-use super::state::{Place, Simulator, Slot, within};
-use super::step::numbers;
+use super::share::share;
+use super::state::{Place, Simulator, Slot};
 use crate::world::{Episode, Flown, Rules};
-use emberwatch_protocol::UNOBSERVED;
-use emberwatch_protocol::message::{
-    FLAG_TEAM_FRAMES, RobotResult, Status, StepReply, StepRequest, VERSION, WorldResult,
-};
-use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use emberwatch_protocol::message::{Status, StepReply};
 use std::ops::Range;
 use std::time::Instant;
 
-/// Batches of at least so many cells are stepped by several threads: for smaller ones, waking them (tens of
-/// microseconds) costs more than it saves at about 1 ns a cell.
-const PARALLEL_CELLS: usize = 1 << 17;
+/// Minimum number of cells in a batch that several threads step. For smaller batches, waking a thread (tens of
+/// microseconds) costs more than it saves at about 2 ns a cell.
+const PARALLEL_CELLS: usize = 1 << 15;
 
 impl Simulator {
     /// The next deadline of a world that waits for paths.
@@ -43,7 +39,10 @@ impl Simulator {
         let (waiter, outcome) = self.settled.pop_front()?;
         payload.clear();
         let reply = match outcome {
-            Ok(()) => self.write_present(&waiter.request, payload),
+            Ok(()) => {
+                self.fit(&waiter.request, payload);
+                self.write_present(&waiter.request, payload)
+            }
             Err(refusal) => self.refuse(&waiter.request, refusal),
         };
         Some((waiter.ticket, reply))
@@ -73,7 +72,7 @@ impl Simulator {
                 self.settle_waiter(now, waiter, Err(lost));
             }
             if self.is_complete(now, world) {
-                self.advance(now, world..world + 1);
+                self.advance(now, world..world + 1, None);
                 self.moved.push(world);
             }
         }
@@ -95,25 +94,35 @@ impl Simulator {
         self.places[world].barrier.is_complete(held, now)
     }
 
-    /// Moves worlds once, with the paths that they have.
-    pub(super) fn advance(&mut self, now: Instant, worlds: Range<usize>) {
+    /// Moves worlds once, with the paths that they have. `parts`: where each world's answer is written, by the thread
+    /// that stepped it.
+    pub(super) fn advance(
+        &mut self,
+        now: Instant,
+        worlds: Range<usize>,
+        parts: Option<Vec<Part<'_>>>,
+    ) {
         let (rules, leases) = (&self.spec.rules, &self.leases);
         let team = rules.n_robots;
-        let step = |(world, place): (usize, &mut Place)| {
+        let step = |(world, place, part): (usize, &mut Place, Option<Part<'_>>)| {
             let held = leases.held(world * team..(world + 1) * team);
             if let Slot::Ready(episode) = &mut place.slot {
                 step(rules, episode, &place.barrier, held);
+                if let Some(part) = part {
+                    part.write(episode);
+                }
             }
         };
         let n_cells = rules.shape.n_cells() + team * rules.n_moves;
-        let places = &mut self.places[worlds.clone()];
-        if places.len() > 1 && places.len() * n_cells >= PARALLEL_CELLS {
-            self.threads.install(|| {
-                let places = places.par_iter_mut().enumerate();
-                places.for_each(|(index, place)| step((worlds.start + index, place)));
-            });
+        let places = self.places[worlds.clone()].iter_mut();
+        let parts = parts.into_iter().flatten().map(Some);
+        let parts = parts.chain(std::iter::repeat_with(|| None));
+        let jobs = worlds.clone().zip(places).zip(parts);
+        let jobs = jobs.map(|((world, place), part)| (world, place, part));
+        if worlds.len() > 1 && worlds.len() * n_cells >= PARALLEL_CELLS {
+            share(&self.threads, worlds.len(), jobs, step);
         } else {
-            worlds.clone().zip(places).for_each(step);
+            jobs.for_each(step);
         }
         self.n_steps += worlds.len() as u64;
         for world in worlds {
@@ -139,110 +148,6 @@ impl Simulator {
         self.waiting_worlds
             .retain(|&world| !places[world].barrier.waiters.is_empty());
     }
-
-    pub(super) fn refuse(&mut self, request: &StepRequest, refusal: Refusal) -> StepReply {
-        self.n_refused += 1;
-        StepReply {
-            status: refusal.status as u32,
-            detail: refusal.detail,
-            ..self.header(request)
-        }
-    }
-
-    fn header(&self, request: &StepRequest) -> StepReply {
-        StepReply {
-            version: VERSION,
-            sequence: request.sequence,
-            first_robot: request.first_robot,
-            flags: request.flags,
-            height: self.spec.rules.shape.height() as u32,
-            width: self.spec.rules.shape.width() as u32,
-            ..StepReply::default()
-        }
-    }
-
-    /// The header of a good answer, and the robots that it is about.
-    fn answer(&self, request: &StepRequest) -> (StepReply, Range<usize>) {
-        let first = request.first_robot as usize;
-        let robots = first..first + request.n_robots as usize;
-        let reply = StepReply {
-            status: Status::Ok as u32,
-            n_robots: request.n_robots,
-            n_worlds: self.worlds_of(&robots).len() as u32,
-            ..self.header(request)
-        };
-        (reply, robots)
-    }
-
-    /// Writes robots as they are now.
-    pub(super) fn write_present(&self, request: &StepRequest, payload: &mut Vec<u8>) -> StepReply {
-        let (reply, robots) = self.answer(request);
-        let worlds = self.worlds_of(&robots);
-        let episodes = || worlds.clone().filter_map(|world| self.episode(world));
-        let own = || {
-            let (worlds, robots) = (worlds.clone(), robots.clone());
-            let all = worlds.filter_map(|world| Some((world, self.episode(world)?)));
-            all.flat_map(move |(world, episode)| {
-                &episode.robots()[within(&robots, self.robots_of(world))]
-            })
-        };
-        for episode in episodes() {
-            payload.extend_from_slice(bytemuck::bytes_of::<WorldResult>(episode.result()));
-        }
-        for robot in own() {
-            payload.extend_from_slice(bytemuck::bytes_of::<RobotResult>(robot.result()));
-        }
-        if request.flags & FLAG_TEAM_FRAMES == 0 {
-            own().for_each(|robot| payload.extend_from_slice(robot.frame().as_bytes()));
-            return reply;
-        }
-        for episode in episodes() {
-            let frame = blank(payload, self.spec.rules.shape.n_cells());
-            for robot in episode.robots() {
-                let seen = robot.frame().as_bytes();
-                // Two readings of one cell in one step are the same.
-                (frame.iter_mut().zip(seen)).for_each(|(to, &value)| *to = value.min(*to));
-            }
-        }
-        reply
-    }
-
-    /// Writes robots as they were at steps that are kept.
-    pub(super) fn write_past(
-        &self,
-        request: &StepRequest,
-        steps: &[u8],
-        payload: &mut Vec<u8>,
-    ) -> StepReply {
-        let (reply, robots) = self.answer(request);
-        let worlds = self.worlds_of(&robots).zip(numbers(steps));
-        let past = worlds.filter_map(|(world, step)| {
-            let past = self.episode(world)?.recall(step).ok()?;
-            Some((past, within(&robots, self.robots_of(world))))
-        });
-        let past: Vec<_> = past.collect();
-        for (past, _) in &past {
-            payload.extend_from_slice(bytemuck::bytes_of(&past.result));
-        }
-        for robot in past
-            .iter()
-            .flat_map(|(past, own)| &past.robots[own.clone()])
-        {
-            payload.extend_from_slice(bytemuck::bytes_of(&robot.result));
-        }
-        let n_cells = self.spec.rules.shape.n_cells();
-        for (past, own) in &past {
-            if request.flags & FLAG_TEAM_FRAMES == 0 {
-                for robot in &past.robots[own.clone()] {
-                    robot.write_over(blank(payload, n_cells));
-                }
-            } else {
-                let frame = blank(payload, n_cells);
-                past.robots.iter().for_each(|robot| robot.write_over(frame));
-            }
-        }
-        reply
-    }
 }
 
 fn step(rules: &Rules, episode: &mut Episode, barrier: &Barrier, held: u64) {
@@ -256,11 +161,4 @@ fn step(rules: &Rules, episode: &mut Episode, barrier: &Barrier, held: u64) {
         late: held & !ready,
     };
     episode.step(rules, &flown);
-}
-
-/// Appends a frame in which nothing was observed.
-fn blank(payload: &mut Vec<u8>, n_cells: usize) -> &mut [u8] {
-    let start = payload.len();
-    payload.resize(start + n_cells, UNOBSERVED);
-    &mut payload[start..]
 }

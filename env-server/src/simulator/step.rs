@@ -10,7 +10,6 @@ use emberwatch_protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION,
 };
 use emberwatch_protocol::path::{MoveError, check_moves};
-use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -25,6 +24,8 @@ pub enum Stepped {
 
 /// What a request that is granted leads to.
 enum Granted<'a> {
+    /// With the worlds as they are; the answer is written.
+    Written,
     /// With the worlds as they are.
     Present,
     /// With the worlds as they were at these steps.
@@ -43,12 +44,18 @@ impl Simulator {
         body: &[u8],
         payload: &mut Vec<u8>,
     ) -> Stepped {
-        payload.clear();
         match self.try_step(now, client, request, body, payload) {
-            Ok(Granted::Waits(ticket)) => Stepped::Waits(ticket),
+            Ok(Granted::Waits(ticket)) => {
+                payload.clear();
+                Stepped::Waits(ticket)
+            }
+            Ok(Granted::Written) => Stepped::Reply(self.answer(request).0),
             Ok(Granted::Present) => Stepped::Reply(self.write_present(request, payload)),
             Ok(Granted::Past(steps)) => Stepped::Reply(self.write_past(request, steps, payload)),
-            Err(refusal) => Stepped::Reply(self.refuse(request, refusal)),
+            Err(refusal) => {
+                payload.clear();
+                Stepped::Reply(self.refuse(request, refusal))
+            }
         }
     }
 
@@ -71,7 +78,7 @@ impl Simulator {
             Operation::Observe => {
                 check_length(body, 0)?;
                 self.check_present(&self.worlds_of(&robots))?;
-                self.reserve(&robots, request.flags, payload)?;
+                self.reserve(request, payload)?;
                 Ok(Granted::Present)
             }
             Operation::Recall => {
@@ -79,7 +86,7 @@ impl Simulator {
                 check_length(body, worlds.len() * size_of::<u64>())?;
                 self.check_present(&worlds)?;
                 self.check_kept(worlds, body)?;
-                self.reserve(&robots, request.flags, payload)?;
+                self.reserve(request, payload)?;
                 Ok(Granted::Past(body))
             }
             Operation::Step => {
@@ -88,14 +95,15 @@ impl Simulator {
                 self.check_whole(client, &robots)?;
                 self.check_ready(&robots, body)?;
                 self.check_new(client, &robots)?;
-                self.reserve(&robots, request.flags, payload)?;
-                let waiting = self.fly(now, client, request, body, coverage);
-                Ok(waiting.map_or(Granted::Present, Granted::Waits))
+                self.reserve(request, payload)?;
+                let waiting = self.fly(now, client, request, body, coverage, payload);
+                Ok(waiting.map_or(Granted::Written, Granted::Waits))
             }
         }
     }
 
     /// Puts the paths of a request that was checked, and moves its worlds, unless the only one waits for other paths.
+    /// Writes the answer of worlds that have moved.
     fn fly(
         &mut self,
         now: Instant,
@@ -103,6 +111,7 @@ impl Simulator {
         request: &StepRequest,
         body: &[u8],
         coverage: Coverage,
+        payload: &mut [u8],
     ) -> Option<Ticket> {
         let (first, n_robots) = (request.first_robot as usize, request.n_robots as usize);
         let worlds = self.worlds_of(&(first..first + n_robots));
@@ -118,7 +127,8 @@ impl Simulator {
         }
         // A request for several worlds has all their robots, so that none of them waits.
         if worlds.len() > 1 || self.is_complete(now, worlds.start) {
-            self.advance(now, worlds);
+            let parts = self.parts(request, payload);
+            self.advance(now, worlds, Some(parts));
             return None;
         }
         self.leases.begin_wait(request.lease);
@@ -153,24 +163,6 @@ impl Simulator {
             self.waiting_worlds.push(world);
         }
         ticket
-    }
-
-    /// Takes the memory for the answer, before anything changes.
-    fn reserve(
-        &self,
-        robots: &Range<usize>,
-        flags: u32,
-        payload: &mut Vec<u8>,
-    ) -> Result<(), Refusal> {
-        let (n_robots, n_worlds) = (robots.len(), self.worlds_of(robots).len());
-        let n_frames = match flags & FLAG_TEAM_FRAMES {
-            0 => n_robots,
-            _ => n_worlds,
-        };
-        let n_cells = self.spec.rules.shape.n_cells();
-        let n_bytes = n_worlds * WORLD_BYTES + n_robots * ROBOT_BYTES + n_frames * n_cells;
-        let reserved = payload.try_reserve_exact(n_bytes);
-        reserved.map_err(|_| Refusal::new(Status::NoMemory, n_bytes as u64))
     }
 
     /// Checks that worlds kept what steps showed.

@@ -7,6 +7,7 @@ use super::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepRequest, WorldResult,
 };
 use super::payload::write_step_body;
+use super::resend::{Flown, until_moved};
 use crate::model::frame::Frame;
 use crate::model::grid::Shape;
 use crate::model::path::{Move, path_to_bytes};
@@ -241,8 +242,7 @@ impl Client {
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
     }
 
-    /// Sends paths for the step at which their worlds were last seen, again after each timeout: a slow teammate is waited
-    /// for, a silent server is not.
+    /// Sends paths for the step at which their worlds were last seen, see [`until_moved`].
     fn step_unless(
         &mut self,
         robots: Range<u32>,
@@ -259,22 +259,22 @@ impl Client {
         let moves: Vec<u8> = paths.iter().flat_map(|path| path_to_bytes(path)).collect();
         write_step_body(&steps, &moves, &mut body);
         let timeout = STEP_TIMEOUT + Duration::from_millis(self.info().deadline_millis);
-        loop {
-            match self.connection.step(request, &body, timeout) {
-                Err(ConnectionError::Timeout { .. }) => {}
-                answer => {
-                    let answer = answer?;
-                    self.take_note(&answer);
-                    return self.observations(&answer).map(Some);
-                }
+        let send = |it: &mut Self| match it.connection.step(request, &body, timeout) {
+            Err(ConnectionError::Timeout { .. }) => Ok(None),
+            answer => {
+                let answer = answer?;
+                it.take_note(&answer);
+                it.observations(&answer).map(Some)
             }
-            let seen = self.observe(robots.clone())?;
-            if self.steps_of(&robots) != steps {
-                return self.flown(&robots, &steps, seen).map(Some);
-            }
-            if is_over() {
-                return Ok(None);
-            }
+        };
+        let look = |it: &mut Self| {
+            let seen = it.observe(robots.clone())?;
+            Ok((it.steps_of(&robots) != steps).then_some(seen))
+        };
+        match until_moved(self, send, look, is_over)? {
+            Flown::Answered(seen) => Ok(Some(seen)),
+            Flown::Observed(seen) => self.flown(&robots, &steps, seen).map(Some),
+            Flown::GivenUp => Ok(None),
         }
     }
 

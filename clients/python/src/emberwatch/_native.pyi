@@ -56,6 +56,83 @@ def check_settings(settings: str) -> str:
 def worlds_fingerprint(settings: str) -> str:
     """The `worlds_fingerprint` of a server with these settings, as JSON; simulates nothing."""
 
+_Numbers = tuple[float, bool, bool, int, int, tuple[int, int]]
+_Columns = tuple[
+    _Doubles,
+    NDArray[np.bool_],
+    NDArray[np.bool_],
+    NDArray[np.int64],
+    NDArray[np.int64],
+    NDArray[np.int64],
+    bool,
+]
+
+@final
+class Answer:
+    """The answer to a step or an observation, of consecutive robots.
+
+    Its memory is its own. Bytes of results are those of PROTOCOL.md.
+    """
+
+    def __new__(
+        cls,
+        team: int,
+        height: int,
+        width: int,
+        first_robot: int,
+        n_robots: int,
+        flags: int,
+        simulation_nanos: int,
+        payload: NDArray[np.uint8],
+    ) -> Answer:
+        """Presents a payload: results of the worlds, results of the robots, frames.
+
+        `team`: robots of each world.
+        """
+
+    @property
+    def first_robot(self) -> int: ...
+    @property
+    def simulation_nanos(self) -> int: ...
+    @property
+    def frames(self) -> NDArray[np.uint8]:
+        """A frame of each robot, or of each world's team, `(n, H, W)`; a view."""
+
+    @property
+    def worlds(self) -> NDArray[np.uint8]:
+        """Results of the worlds, bytes; a view."""
+
+    @property
+    def robots(self) -> NDArray[np.uint8]:
+        """Results of the robots, bytes; a view."""
+
+    @property
+    def results(self) -> NDArray[np.uint8]:
+        """Bytes of `wire.RESULT_DTYPE`, one for each robot; a new array."""
+
+    @property
+    def world_of_robots(self) -> NDArray[np.int64]:
+        """The position of each robot's world, `(n_robots,)`."""
+
+    def result(self, index: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """The fields of one robot's `WorldResult` and `RobotResult`."""
+
+    def numbers(self, pays: int) -> _Numbers:
+        """Reward, terminated, truncated, step, distinct cells visited and cell of the first robot.
+
+        `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
+        """
+
+def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
+    """The numbers of many robots, from bytes of `wire.RESULT_DTYPE`; new arrays.
+
+    Rewards, terminated, truncated, steps, distinct cells visited, `(n,)` each; cells, `(n, 2)`; and
+    whether any episode is over. `pays`: as of `Answer.numbers`.
+    """
+
+def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8]:
+    """Paths as bytes, `(n_robots, n_moves)`, checked as by `arguments.as_moves`."""
+
 class Server:
     """A connection to a server, or worlds in this process. Threads may share it, in turns."""
 
@@ -89,12 +166,8 @@ class Server:
         flags: int,
         body: bytes,
         seconds: float,
-    ) -> tuple[int, NDArray[np.uint8]]:
-        """Sends a request on `step` as it is.
-
-        Returns:
-            How long the server worked on it, nanoseconds, and the answer's payload.
-        """
+    ) -> Answer:
+        """Sends a request on `step` as it is."""
 
     def close(self) -> None:
         """Closes it. May be called again."""
@@ -213,12 +286,20 @@ class Lease:
     def __init__(self, server: Server, number: int, first_robot: int, n_robots: int) -> None: ...
     def step(
         self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
-    ) -> tuple[int, NDArray[np.uint8]]:
+    ) -> Answer:
         """Flies a path with each robot, for the next step of its world."""
 
-    def observe(
-        self, first_robot: int, n_robots: int, flags: int, seconds: float
-    ) -> tuple[int, NDArray[np.uint8]]:
+    def fly(
+        self,
+        paths: ArrayLike,
+        first_robot: int,
+        n_robots: int,
+        accepts_late: bool,
+        seconds: float,
+    ) -> tuple[Answer, int]:
+        """As `step`, sent again until the worlds have moved; see `lease.Lease.fly`."""
+
+    def observe(self, first_robot: int, n_robots: int, flags: int, seconds: float) -> Answer:
         """The last results and frames again; steps go on from there."""
 
     def note(self, world: int, step: int) -> None:

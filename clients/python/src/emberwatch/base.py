@@ -15,18 +15,14 @@ from emberwatch.owner import SessionOwner
 from emberwatch.session import Session
 from emberwatch.settings import draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
-from emberwatch.wire import UNOBSERVED, RobotResult, StepAnswer, StepResult
+from emberwatch.wire import UNOBSERVED, StepAnswer
 
 NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
-#: What a robot's step can pay, and the field of a result that says it.
-REWARDS: Final = {
-    "share": ("robot", "reward"),
-    "team": ("world", "reward"),
-    "marginal": ("robot", "marginal"),
-}
+#: Rewards of a robot's step, in the order of the native module's `pays`.
+REWARDS: Final = ("share", "team", "marginal")
 Reward: TypeAlias = Literal["share", "team", "marginal"]
 
 #: What moves in an environment of one robot.
@@ -34,7 +30,7 @@ ONE_ROW: Final = np.ones(1, np.bool_)
 
 
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """One robot of a private or a running server."""
+    """One robot, in a world of its own or of a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": list(RENDER_MODES),
@@ -95,17 +91,18 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         is_needed = self._robot is not None and observations.shows_team
         return self._session.teams(answer) if is_needed else None
 
-    def _trace(self, result: RobotResult, path: NDArray[np.uint8]) -> None:
+    def _trace(self, answer: StepAnswer, path: NDArray[np.uint8]) -> None:
         """Keeps the cells of a path for pictures, if it was flown."""
-        self._path = fly(result.start, path[: result.n_moves], self._spec)
+        robot = answer.result().robot
+        self._path = fly(robot.start, path[: robot.n_moves], self._spec)
 
-    def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
+    def _describe(self, answer: StepAnswer, step: int, n_visited: int) -> dict[str, Any]:
         """The info of a step: never the seed, which gives the hidden states away."""
-        world, robot = result.world, result.robot
-        info: dict[str, Any] = {"step": world.step, "n_visited": robot.n_visited}
+        info: dict[str, Any] = {"step": step, "n_visited": n_visited}
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
+            world, robot = answer.result()
             info |= {"n_target_cells": world.n_target_cells, "n_hits": robot.n_hits}
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
@@ -123,18 +120,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return self._answer.result().robot.cell
 
 
-def check_reward(reward: str, *more: str) -> tuple[str, str]:
-    """The field of a result that says what a step pays; `more` rewards are the share as well."""
+def check_reward(reward: str, *more: str) -> int:
+    """The index of a reward in `REWARDS`; `more` rewards have the share's."""
     if reward not in (*REWARDS, *more):
         expected = ", ".join(map(repr, (*REWARDS, *more)))
         raise invalid("reward", f"one of {expected}", repr(reward))
-    return REWARDS.get(reward, REWARDS["share"])
-
-
-def paid(result: StepResult, field: tuple[str, str]) -> float:
-    """What a step pays."""
-    part, name = field
-    return getattr(getattr(result, part), name)
+    return REWARDS.index(reward) if reward in REWARDS else 0
 
 
 def as_options(options: object) -> dict[str, Any]:

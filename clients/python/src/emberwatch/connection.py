@@ -96,8 +96,8 @@ class ServerConnection(Connection):
         """Sends one request on `step` as it is; `Lease.step` and `observe` are easier."""
         n_moves = self.info.n_moves if operation == wire.STEP else 0
         place = first_robot, n_robots
-        nanos, payload = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)
-        return StepAnswer(self.shape, *place, flags, nanos, payload)
+        answer = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)
+        return StepAnswer(answer)
 
     def truths(self, worlds: range) -> list[dict[str, Any]]:
         """The hidden states of embedded worlds, as the fields of `Truth`."""

@@ -8,13 +8,14 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from emberwatch import wire
+from emberwatch._native import moves
 from emberwatch.arguments import as_moves
-from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
+from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward
 from emberwatch.observations import Observations, Parts
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
-from emberwatch.wire import StepAnswer, StepResult
+from emberwatch.wire import StepAnswer
 
 
 class WildfireEnv(WorldEnv):
@@ -29,8 +30,8 @@ class WildfireEnv(WorldEnv):
     Planning of Exploration Over Grid Map Using A Spatiotemporal Model with Incomplete State
     Observations*, equations 2 to 4; any other model file runs as well.
 
-    The world is simulated by `emberwatch-server`: a private one, started at the first reset and
-    stopped with the environment, or with `instance` a running one, beside other agents.
+    The world is simulated in this process. With `instance`, the environment attaches to a running
+    `emberwatch-server` instead, whose worlds other agents and observers share.
 
     ## Action Space
 
@@ -101,13 +102,13 @@ class WildfireEnv(WorldEnv):
     All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`:
 
     * `observation`: parts of the observation; `("frame", "robot")` by default.
-    * `instance`: attach to this running server; None: worlds of its own.
-    * `backend`: where these are, at a private `"server"` (the default) or `"embedded"` in this
-      process, where nobody else can watch them or fly in them; the same bytes either way.
-    * `world`: which of its worlds (0).
-    * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
     * `reward`: `"share"`, `"team"` or `"marginal"`.
-    * `takeover`: take the world from its holder (False).
+    * `instance`: attach to this running server; None: worlds of its own, in this process. The
+      results are the same bytes either way.
+    * `world`: with `instance`, which of the server's worlds (0).
+    * `robot`: with `instance`, which of the world's robots, if others fly the rest (None: the world
+      has only one).
+    * `takeover`: with `instance`, take the world from its holder (False).
     * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"terrain"`,
       `"road-ice"`, `"team"`, `"jacksboro"` or the path of a task file
       (`docs/environments/index.md`), which decides all keywords from `model` to `states_offset`,
@@ -118,13 +119,13 @@ class WildfireEnv(WorldEnv):
       burnt doesn't burn again until it has regrown), `"wildfire-terrain"` (the same on real land),
       `"road-ice"` or the path of a model file;
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (0 to 8; None:
-      as the model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the
-      private server. With `instance` they may be left out, or must agree.
+      as the model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of
+      worlds of its own. With `instance` they may be left out, or must agree with the server.
     * `states`: recorded states in the place of a model (a `.npz` or `.npy` file or a folder, see
       `docs/recorded-worlds.md`, or `"jacksboro"`), which decide `height`, `width` and `burn_in`;
       `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
     * `truth`: reveal the hidden states in `info` and pictures (False).
-    * `timeout`: how long to wait for a step, or until the running server is there, seconds (5).
+    * `timeout`: how long to wait for a step of a running server, or until it is there, seconds (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.
 
     ## Vectorized environment
@@ -145,7 +146,7 @@ class WildfireEnv(WorldEnv):
         reward: Reward = "share",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
+        """See the class."""
         settings = Settings.of(WildfireEnv, world)
         self._pays = check_reward(reward)
         super().__init__(Session(settings))
@@ -163,7 +164,8 @@ class WildfireEnv(WorldEnv):
         with self._session.turn:
             self._answer = answer = self._begin(seed, options)
             self._observations.reset(ONE_ROW, answer.frames)
-            seen = self._seen(answer, answer.result())
+            _, _, _, step, n_visited, cell = answer.native.numbers(self._pays)
+            seen = self._seen(answer, step, n_visited, cell)
             self._session.finish()
         return seen
 
@@ -180,27 +182,28 @@ class WildfireEnv(WorldEnv):
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
                 as after Ctrl-C: reset or resume. Nothing is sent.
         """
-        with self._session.turn:
-            self._session.begin_step()
-            self._answer = answer = self._session.step(action)
+        session = self._session
+        with session.turn:
+            session.begin_step()
+            self._answer = answer = session.step(action)
             self._update(self._observations, answer)
-            result = answer.result()
+            reward, terminated, truncated, step, n_visited, cell = answer.native.numbers(self._pays)
             if self.render_mode is not None:
-                self._trace(result.robot, as_moves(action, 1, self._spec.n_moves).reshape(-1))
-            observation, info = self._seen(answer, result)
-            reward, world = paid(result, self._pays), result.world
-            self._session.finish()
-        return observation, reward, bool(world.terminated), bool(world.truncated), info
+                self._trace(answer, as_moves(action, 1, self._spec.n_moves).reshape(-1))
+            observation, info = self._seen(answer, step, n_visited, cell)
+            session.finish()
+        return observation, reward, terminated, truncated, info
 
-    def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:
-        info = self._describe(answer, result)
+    def _seen(
+        self, answer: StepAnswer, step: int, n_visited: int, cell: tuple[int, int]
+    ) -> tuple[Any, dict[str, Any]]:
+        info = self._describe(answer, step, n_visited)
         # The learner may write to its frame: pictures come from another.
         frames = answer.frames if self.render_mode is None else answer.frames.copy()
         if self.render_mode == "human":
             self._draw()
-        cells = np.array([result.robot.cell], np.int64)
         teams = self._teams(self._observations, answer)
-        return self._observations.one(frames, cells, teams), info
+        return self._observations.one(frames, np.array([cell], np.int64), teams), info
 
 
 class WildfireVectorEnv(WorldVectorEnv):
@@ -231,22 +234,22 @@ class WildfireVectorEnv(WorldVectorEnv):
         reward: Reward = "share",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
-        self._pays = check_reward(reward)
+        """See the class."""
+        pays = check_reward(reward)
         settings = Settings.of(WildfireVectorEnv, world)
         session = vector_session(settings, num_envs)
         super().__init__(
             session,
             Observations(observation, session.spec, session.n_rows),
             spaces.MultiDiscrete([wire.N_MOVES] * session.spec.n_moves),
+            pays=pays,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
-        return as_moves(actions, self.num_envs, self._spec.n_moves).reshape(self.num_envs, -1)
+        return moves(actions, self.num_envs, self._spec.n_moves)
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(actions, flown)
-        part, name = self._pays
-        return self._results[part][name].copy()  # later steps write to the results
+        return self._columns.rewards.copy()

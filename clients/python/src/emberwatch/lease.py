@@ -75,8 +75,38 @@ class Lease:
                 tells to where. With code `"episode_over"`: reset that world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
-        nanos, payload = self._native.step(paths, *place, timeout)
-        return StepAnswer(self.client.shape, *place, nanos, payload)
+        return StepAnswer(self._native.step(paths, *place, timeout))
+
+    def fly(
+        self,
+        paths: ArrayLike,
+        *,
+        robots: range | None = None,
+        accepts_late: bool = False,
+        timeout: float = STEP_TIMEOUT,
+    ) -> tuple[StepAnswer, int]:
+        """Flies one path with each robot, as `step`, however long teammates take.
+
+        After each timeout it looks whether the worlds have moved, and if not, sends the paths
+        again. It waits as long as the server answers.
+
+        Args:
+            paths: As for `step`.
+            robots: As for `step`.
+            accepts_late: If a world has moved on without these paths, return how it stands instead
+                of raising the error with code `"late"`.
+            timeout: Seconds until it looks; the server's own deadline for teammates comes on top.
+
+        Returns:
+            How the worlds stand, and how many of their steps passed unseen before.
+
+        Raises:
+            RequestTimeoutError: If the server answers no observation either.
+            EmberwatchError: As `step`.
+        """
+        place = self._all if robots is None else self._place(robots, 0)[:2]
+        answer, n_skipped = self._native.fly(paths, *place, accepts_late, timeout)
+        return StepAnswer(answer), n_skipped
 
     def observe(
         self,
@@ -87,8 +117,7 @@ class Lease:
     ) -> StepAnswer:
         """The last results and frames of its robots again, or of some; steps go on from there."""
         place = self._place(robots, team * wire.TEAM_FRAMES)
-        nanos, payload = self._native.observe(*place, timeout)
-        return StepAnswer(self.client.shape, *place, nanos, payload)
+        return StepAnswer(self._native.observe(*place, timeout))
 
     def reset(
         self,
@@ -192,11 +221,6 @@ class Lease:
     def _worlds_of(self, robots: range) -> range:
         n_robots = self.client.info.n_robots
         return range(robots.start // n_robots, (robots.stop - 1) // n_robots + 1)
-
-    def steps_of(self, robots: range) -> list[int]:
-        """The next step k of the worlds of some robots, as far as is known here."""
-        worlds = self._worlds_of(robots)
-        return self._native.steps[worlds.start - self.worlds.start :][: len(worlds)]
 
     def _note(self, worlds: tuple[WorldInfo, ...]) -> tuple[WorldInfo, ...]:
         for info in worlds:

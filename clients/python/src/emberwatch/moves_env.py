@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_choice, as_choices
-from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
+from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward
 from emberwatch.flights import flights_of
 from emberwatch.moves import fly
 from emberwatch.observations import WINDOW, MovesParts, Observations
 from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.vector_base import WorldVectorEnv, vector_session
-from emberwatch.wire import StepAnswer, StepResult
+from emberwatch.wire import StepAnswer
 
 MovesReward: TypeAlias = Literal[Reward, "move"]
 
@@ -72,7 +72,7 @@ class WildfireMovesEnv(WorldEnv):
     robot's share of the path's true reward, which is small for a lone robot, as one step changes
     few cells. So both sum to the same over each path, but the second says more about the hidden
     state, and earlier: results with the two are not comparable. The environment needs the `truth`
-    channel for it: a private server publishes it, a running one must.
+    channel for it: with `instance`, the server must publish it.
 
     ## Episode End
 
@@ -107,7 +107,7 @@ class WildfireMovesEnv(WorldEnv):
         window: int = WINDOW,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
+        """See the class."""
         self._pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
         super().__init__(Session(settings))
@@ -171,23 +171,22 @@ class WildfireMovesEnv(WorldEnv):
         answer = self._session.step(path)
         before = float(self._flights.paid[0])
         self._update(self._observations, answer)
-        result = self._begin_path(answer)
+        self._begin_path(answer)
         if self.render_mode is not None:
-            self._trace(result.robot, path[0])
+            self._trace(answer, path[0])
         observation, info = self._seen(answer)
-        reward, world = paid(result, self._pays) - before, result.world
-        return observation, reward, bool(world.terminated), bool(world.truncated), info
+        reward, terminated, truncated, *_ = answer.native.numbers(self._pays)
+        return observation, reward - before, terminated, truncated, info
 
-    def _begin_path(self, answer: StepAnswer) -> StepResult:
-        self._answer, self._result = answer, answer.result()
-        self._start = self._result.robot.cell
+    def _begin_path(self, answer: StepAnswer) -> None:
+        self._answer = answer
+        _, _, _, self._step, self._n_visited, self._start = answer.native.numbers(self._pays)
         self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
         self._flights.begin(ONE_ROW, np.array([self._start], np.int64), states)
-        return self._result
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
-        info = self._describe(answer, self._result)
+        info = self._describe(answer, self._step, self._n_visited)
         info["action_mask"] = self._flights.masks[0]
         if self.render_mode == "human":
             self._draw()
@@ -227,8 +226,8 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         window: int = WINDOW,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
-        self._pays = check_reward(reward, "move")
+        """See the class."""
+        pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
         session = vector_session(settings, num_envs)
         n_rows = session.n_rows
@@ -238,6 +237,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
             session,
             self._parts,
             spaces.Discrete(wire.N_MOVES),
+            pays=pays,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
@@ -256,8 +256,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         if not completed.any():
             return self._move(actions, flown)
         self._exchange(self._flights.paths(actions), completed)
-        part, name = self._pays
-        rewards = self._results[part][name] - self._flights.paid
+        rewards = self._columns.rewards - self._flights.paid
         others = flown & ~completed
         if others.any():
             rewards = np.where(others, self._move(actions, others), rewards)

@@ -88,7 +88,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
         prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
+        """See the class."""
         session = Session(Settings.of(WildfireObjectiveEnv, world))
         super().__init__(session)
         self._plans = Plans(session, estimator, checkpoint, prior)
@@ -120,13 +120,12 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
             path = self._plans.paths(choice)
             answer = self._session.step(path)
             self._plans.see(ONE_ROW, choice, answer.results, answer.frames)
-            result = answer.result()
             if self.render_mode is not None:
-                self._trace(result.robot, path[0])
+                self._trace(answer, path[0])
             observation, info = self._seen(answer)
-            world = result.world
+            reward, terminated, truncated, *_ = answer.native.numbers(1)
             self._session.finish()
-        return observation, world.reward, bool(world.terminated), bool(world.truncated), info
+        return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
         self._plans.close(None if self._answer is None else self._answer.results)
@@ -134,7 +133,8 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
         self._answer = answer
-        info = self._describe(answer, answer.result())
+        _, _, _, step, n_visited, _ = answer.native.numbers(1)
+        info = self._describe(answer, step, n_visited)
         if self.render_mode == "human":
             self._draw()
         return self._plans.features[0], info
@@ -159,13 +159,14 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
+        """See the class."""
         session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
         self._plans = Plans(session, estimator, checkpoint, prior)
         super().__init__(
             session,
             self._plans,
             self._plans.action_space,
+            pays=1,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
@@ -180,7 +181,7 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(self._plans.paths(actions), flown)
         self._plans.see(flown, actions, self._results, self._frames)
-        return self._results["world"]["reward"].copy()
+        return self._columns.rewards.copy()
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
         self._plans.begin(begun, self._results, self._frames)

@@ -87,7 +87,7 @@ class Plans:
         are kept. Results and frames are those of all worlds.
         """
         settings = self._session.settings
-        watched = None if settings.is_embedded else (self._session.instance, settings.world)
+        watched = None if settings.instance is None else (settings.instance, settings.world)
         native = self._native
         if native is None or watched != self._watched:
             self._native = native = self._made(watched)

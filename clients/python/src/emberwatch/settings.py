@@ -23,10 +23,6 @@ from emberwatch.wire import Shape
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
 
-#: Where the worlds are: at a server, or in this process.
-SERVER: Final = "server"
-EMBEDDED: Final = "embedded"
-
 #: Keywords whose settings of a server have other names.
 _KEYWORDS: Final = {
     "moves": "n_moves",
@@ -41,7 +37,6 @@ _Init = TypeVar("_Init")
 class WorldArguments(TypedDict, total=False):
     """The keywords, as type checkers see them; `Settings` has the defaults."""
 
-    backend: str
     instance: str | None
     world: int
     robot: int | None
@@ -67,7 +62,6 @@ class WorldArguments(TypedDict, total=False):
 class Settings:
     """The keywords; `WildfireEnv` explains them. None: as the server has it."""
 
-    backend: str = SERVER
     instance: str | None = None
     world: int = 0
     robot: int | None = None
@@ -101,10 +95,6 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise invalid(each.name, each.type, repr(value))
-        if self.backend not in (SERVER, EMBEDDED):
-            raise invalid("backend", f"{SERVER!r} or {EMBEDDED!r}", repr(self.backend))
-        if self.is_embedded and self.instance is not None:
-            raise invalid("backend", f"{SERVER!r} with instance=...", repr(self.backend))
         for name in ("task", "model", "states", "start"):
             if getattr(self, name) is not None:
                 utf8(name, getattr(self, name))
@@ -114,11 +104,6 @@ class Settings:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
             raise invalid("timeout", "seconds above 0", self.timeout)
-
-    @property
-    def is_embedded(self) -> bool:
-        """Whether the worlds are in this process."""
-        return self.backend == EMBEDDED
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
@@ -161,14 +146,6 @@ class Settings:
             "states_offset": self.states_offset or None,
         }
         return {name: as_setting(name, it) for name, it in given.items() if it is not None}
-
-    def server_flags(self, n_worlds: int) -> list[str]:
-        """The same as flags of `emberwatch-server`."""
-        settings = self.of_server(n_worlds).items()
-        return [
-            f"--{name.replace('_', '-')}={str(it).lower() if isinstance(it, bool) else it}"
-            for name, it in settings
-        ]
 
     def check(self, n_worlds: int) -> dict[str, Any]:
         """All settings of a server with these worlds. A refusal names the keyword."""
@@ -237,16 +214,18 @@ def draw_seed(generator: np.random.Generator) -> int:
     return int(generator.integers(SEEDS))
 
 
-def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
-    """The worlds that a private server will have, or this process, and the robots to fly.
+def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
+    """Describes the worlds that this process will simulate, and numbers the robots to fly.
 
-    `n_rows`: how many robots; None: those of one world. Settings are checked as a server does.
+    `n_rows`: number of robots; None: all robots of one world.
     """
-    if settings.takeover or settings.world != 0 or settings.robot is not None:
-        raise InvalidArgumentError(
-            "takeover, world, robot: expected instance=..., a running server to attach to, and no "
-            f"backend; without one, worlds are an environment's own, got world {settings.world}"
-        )
+    shared = ("takeover", False), ("world", 0), ("robot", None)
+    for name, default in shared:
+        if getattr(settings, name) != default:
+            raise InvalidArgumentError(
+                f"{name}: applies only with instance=..., the name of a running server; without "
+                "it, the environment simulates worlds of its own"
+            )
     task = None if settings.task is None else Task.named(settings.task)
     n_robots = settings.robots or (1 if task is None else task.robots)
     robots = _robots(settings, n_rows, n_robots)

@@ -5,7 +5,7 @@ their episodes together.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from emberwatch._native import columns
 from emberwatch.arguments import as_array, as_integer, as_seed, told
 from emberwatch.base import (
     NOTHING_TO_DRAW,
@@ -24,13 +25,27 @@ from emberwatch.base import (
 )
 from emberwatch.errors import invalid
 from emberwatch.moves import fly
-from emberwatch.observations import Observations, cells_of, of_row
+from emberwatch.observations import Observations, of_row
 from emberwatch.owner import SessionOwner
 from emberwatch.plans import Plans
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import View
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
+
+
+class Columns(NamedTuple):
+    """The numbers of all rows, `(n_rows,)` each."""
+
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    steps: NDArray[np.int64]
+    n_visited: NDArray[np.int64]
+    #: Row and column of each robot, `(n_rows, 2)`.
+    cells: NDArray[np.int64]
+    #: Whether any episode is over.
+    is_over: bool
 
 
 class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -47,9 +62,11 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         observations: Observations | Plans,
         action_space: spaces.Space[Any],
         *,
+        pays: int,
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
+        """`pays`: which of `base.REWARDS` a step pays."""
         if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -69,13 +86,15 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self.single_action_space = action_space
         self.action_space = batch_space(action_space, num_envs)
         self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
+        self._pays = pays
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
-        #: The numbers that infos have of the results, once they were asked for.
-        self._numbers: dict[str, NDArray[Any]] | None = None
+        #: The numbers of the results.
+        self._columns = self._columns_of(self._results)
         self._every = np.ones(num_envs, np.bool_)
+        self._none = np.zeros(num_envs, np.bool_)
         self._elapsed = np.zeros(num_envs, np.int64)
-        self._over = np.zeros(num_envs, np.bool_)
+        self._over, self._has_ended = self._none, False
         #: Robots that completed a path in this step; None: none of them.
         self._exchanged: NDArray[np.bool_] | None = None
         self._truths: NDArray[np.uint8] | None = None
@@ -132,14 +151,14 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """
         chosen = self._check_actions(actions)
         with self._session.turn:
-            over, has_ended = self._over, bool(self._over.any())
+            over, has_ended = self._over, self._has_ended
             if has_ended and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
                 raise gymnasium.error.ResetNeeded(
                     f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                     "options={'reset_mask': ...}"
                 )
             self._session.begin_step()
-            flown = ~over
+            flown = ~over if has_ended else self._every
             self._exchanged = None
             rewards = self._fly(chosen, flown)
             self._elapsed += flown
@@ -205,7 +224,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _robots(self) -> NDArray[np.int64]:
         """Row and column of each robot, a new array."""
-        return cells_of(self._results["robot"])
+        return self._columns.cells.copy()
 
     def _path(self, row: int) -> NDArray[np.intp] | None:
         """The cells of a robot's path, where there is a render mode."""
@@ -213,7 +232,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
         """Flies whole paths in some rows, in one message where they are consecutive."""
-        if moved.all():
+        if moved is self._every or moved.all():
             self._take(self._session.step(paths))
         elif moved.any():
             self._frames = self._frames.copy()  # the learner has the others
@@ -231,7 +250,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         chosen = slice(run.start, run.stop)
         answer = self._session.step(paths[chosen], run)
         self._frames[chosen], self._results[chosen] = answer.frames, answer.results
-        self._numbers = None
+        self._columns = self._columns_of(self._results)
         if self._truths is not None:
             self._truths[chosen] = self._session.truth(answer)
 
@@ -252,6 +271,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._elapsed[rows] = 0
         self._over = self._over.copy()
         self._over[rows] = False
+        self._has_ended = bool(self._over.any())
         begun = np.zeros(self.num_envs, np.bool_)
         begun[rows] = True
         self._observations.reset(begun, self._frames)
@@ -260,28 +280,35 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             self._paths[row] = None
 
     def _take(self, answer: StepAnswer) -> None:
-        self._frames, self._results, self._numbers = answer.frames, answer.results, None
+        self._frames, self._results = answer.frames, answer.results
+        self._columns = self._columns_of(self._results)
         if self._session.settings.truth:
             self._truths = self._session.truth(answer)
+
+    def _columns_of(self, results: NDArray[np.void]) -> Columns:
+        return Columns(*columns(results.view(np.uint8), self._pays))
 
     def _outcome(
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """What `step` returns."""
-        terminations, truncations = np.zeros((2, self.num_envs), np.bool_)
-        if self._exchanged is not None:
-            worlds = self._results["world"]
-            terminations = self._exchanged & (worlds["terminated"] != 0)
-            truncations = self._exchanged & (worlds["truncated"] != 0)
+        terminations, truncations, may_end = self._none, self._none, False
+        if self._exchanged is not None and self._columns.is_over:
+            terminations = self._exchanged & self._columns.terminated
+            truncations = self._exchanged & self._columns.truncated
+            may_end = True
         if self._max_steps is not None:
-            truncations |= flown & (self._elapsed >= self._max_steps)
-        over = terminations | truncations
+            truncations = truncations | (flown & (self._elapsed >= self._max_steps))
+            may_end = True
+        terminations, truncations = terminations.copy(), truncations.copy()
+        over = terminations | truncations if may_end else self._none
+        has_ended = may_end and bool(over.any())
         infos: dict[str, Any] = {}
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
+        if has_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = self._final(over)
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         else:
-            self._over = over
+            self._over, self._has_ended = over, has_ended
         infos |= self._infos(self._every)
         return self._seen(), rewards, terminations, truncations, infos
 
@@ -312,15 +339,14 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _reported(self) -> dict[str, NDArray[Any]]:
         """What the infos of `WorldEnv` report, of all rows."""
-        if self._numbers is None:
+        reported = {"step": self._columns.steps, "n_visited": self._columns.n_visited}
+        if self._reveals:
             world, robot = self._results["world"], self._results["robot"]
-            numbers = {"step": world["step"], "n_visited": robot["n_visited"]}
-            if self._reveals:
-                numbers |= {"n_target_cells": world["n_target_cells"], "n_hits": robot["n_hits"]}
-            self._numbers = {name: each.astype(np.int64) for name, each in numbers.items()}
-        if self._truths is not None and self._reveals:
-            return {**self._numbers, "truth": self._truths}
-        return self._numbers
+            reported["n_target_cells"] = world["n_target_cells"].astype(np.int64)
+            reported["n_hits"] = robot["n_hits"].astype(np.int64)
+            if self._truths is not None:
+                reported["truth"] = self._truths
+        return reported
 
     def _seen(self) -> Any:
         if self.render_mode == "human":

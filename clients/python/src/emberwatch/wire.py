@@ -6,6 +6,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch._native import Answer
+
 #: The protocol version that this package speaks.
 VERSION: Final = 2
 
@@ -137,40 +139,29 @@ class StepAnswer:
 
     Attributes:
         first_robot: The number of the first robot; robot r of world w has number w R + r.
-        simulation_nanos: How long the server worked on it, nanoseconds.
+        simulation_nanos: How long the simulation took, nanoseconds.
         frames: What each robot saw, `(n_robots, H, W)`: an observation, or 255 where nothing was
             seen. If team frames were asked for: what all robots of each world saw,
-            `(n_worlds, H, W)`. A copy of your own; write to it as you like.
+            `(n_worlds, H, W)`. They are your own; write to them as you like.
     """
 
-    __slots__ = ("_head", "_payload", "_shape", "first_robot", "frames", "simulation_nanos")
+    __slots__ = ("first_robot", "frames", "native", "simulation_nanos")
 
-    def __init__(
-        self,
-        shape: Shape,
-        first_robot: int,
-        n_robots: int,
-        flags: int,
-        simulation_nanos: int,
-        payload: NDArray[np.uint8],
-    ) -> None:
-        """Takes a payload as it is: results of the worlds, results of the robots, frames."""
-        n_worlds = 1 if n_robots == 1 else shape.n_worlds(first_robot, n_robots)
-        n_frames = n_worlds if flags & TEAM_FRAMES else n_robots
-        self._shape, self._payload, self._head = shape, payload, n_worlds * WORLD.size
-        self.first_robot, self.simulation_nanos = first_robot, simulation_nanos
-        frames = payload[self._head + n_robots * ROBOT.size :]
-        self.frames = frames.reshape(n_frames, shape.height, shape.width)
+    def __init__(self, native: Answer) -> None:
+        """Presents an answer of the native module."""
+        self.native: Final = native
+        self.first_robot, self.simulation_nanos = native.first_robot, native.simulation_nanos
+        self.frames = native.frames
 
     @property
     def worlds(self) -> NDArray[np.void]:
         """A `WorldResult` per world, `(n_worlds,)` of `WORLD_DTYPE`."""
-        return self._payload[: self._head].view(WORLD_DTYPE)
+        return self.native.worlds.view(WORLD_DTYPE)
 
     @property
     def robots(self) -> NDArray[np.void]:
         """A `RobotResult` per robot, `(n_robots,)` of `ROBOT_DTYPE`."""
-        return self._payload[self._head : -self.frames.size].view(ROBOT_DTYPE)
+        return self.native.robots.view(ROBOT_DTYPE)
 
     def __repr__(self) -> str:
         others = len(self.robots) - 1
@@ -181,24 +172,16 @@ class StepAnswer:
         )
 
     @property
-    def world_of(self) -> NDArray[np.intp]:
+    def world_of(self) -> NDArray[np.int64]:
         """The position in `worlds` of each robot's world, `(n_robots,)`."""
-        robots = np.arange(self.first_robot, self.first_robot + len(self.robots))
-        worlds = robots // self._shape.n_robots
-        return worlds - worlds[0]
+        return self.native.world_of_robots
 
     @property
     def results(self) -> NDArray[np.void]:
         """One `StepResult` per robot, `(n_robots,)` of `RESULT_DTYPE`; a new array."""
-        results = np.empty(len(self.robots), RESULT_DTYPE)
-        results["world"], results["robot"] = self.worlds[self.world_of], self.robots
-        return results
+        return self.native.results.view(RESULT_DTYPE)
 
     def result(self, index: int = 0) -> StepResult:
         """The results of one robot and its world; `index` counts from the first."""
-        world = self._shape.n_worlds(self.first_robot, index + 1) - 1 if index else 0
-        payload, offset = self._payload.data, self._head + index * ROBOT.size
-        return StepResult(
-            WorldResult._make(WORLD.unpack_from(payload, world * WORLD.size)),
-            RobotResult._make(ROBOT.unpack_from(payload, offset)),
-        )
+        world, robot = self.native.result(index)
+        return StepResult(WorldResult(*world), RobotResult(*robot))

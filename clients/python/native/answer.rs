@@ -1,0 +1,267 @@
+//! The answer to a step: results of the worlds, results of the robots, frames.
+
+use crate::refusal::invalid;
+use crate::samples::{Robot, World, of_robot, of_world};
+use emberwatch_protocol::Shape;
+use emberwatch_protocol::connection::worlds_of;
+use emberwatch_protocol::message::{FLAG_TEAM_FRAMES, RobotResult, StepReply, WorldResult};
+use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use numpy::{
+    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+use pyo3::types::PySlice;
+use std::ops::Range;
+
+/// Bytes of a world's result and of its robot's result.
+pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
+
+/// Numbers of one robot's step: reward, whether the episode terminated and was truncated, step, distinct cells visited,
+/// row and column.
+type Numbers = (f64, bool, bool, u64, u32, (u32, u32));
+
+/// Columns of many robots' steps, see `_native.pyi`.
+type Columns<'py> = (
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<bool>>,
+    Bound<'py, PyArray1<bool>>,
+    Bound<'py, PyArray1<i64>>,
+    Bound<'py, PyArray1<i64>>,
+    Bound<'py, PyArray2<i64>>,
+    bool,
+);
+
+/// The answer to a step or an observation, of consecutive robots.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Answer {
+    /// Robots of each world.
+    team: u32,
+    #[pyo3(get)]
+    first_robot: u32,
+    n_robots: u32,
+    /// How long the server worked on it, nanoseconds.
+    #[pyo3(get)]
+    simulation_nanos: u64,
+    /// Number of frames, height, width.
+    dim: [usize; 3],
+    payload: Py<PyArray1<u8>>,
+}
+
+#[pymethods]
+impl Answer {
+    #[new]
+    #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
+    fn new(
+        py: Python<'_>,
+        team: u32,
+        height: usize,
+        width: usize,
+        first_robot: u32,
+        n_robots: u32,
+        flags: u32,
+        simulation_nanos: u64,
+        payload: Bound<'_, PyArray1<u8>>,
+    ) -> PyResult<Self> {
+        let place = (team, first_robot, n_robots, flags);
+        let answer = Self::made(place, [height, width], simulation_nanos, payload.clone());
+        let (expected, got) = (answer.n_bytes(), payload.len());
+        if expected != got || n_robots == 0 {
+            return Err(invalid(py, "payload", format!("{expected} bytes"), got));
+        }
+        Ok(answer)
+    }
+
+    /// What each robot saw, or each world's team, `(n, H, W)`: a view of the answer's own memory.
+    #[getter]
+    fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        let frames = self.slice(py, self.head()..self.n_bytes())?;
+        frames.reshape(self.dim)
+    }
+
+    /// The results of the worlds, bytes.
+    #[getter]
+    fn worlds<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        self.slice(py, 0..self.n_worlds() * WORLD_BYTES)
+    }
+
+    /// The results of the robots, bytes.
+    #[getter]
+    fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        self.slice(py, self.n_worlds() * WORLD_BYTES..self.head())
+    }
+
+    /// A world's result and a robot's result for each robot, bytes; a new array.
+    #[getter]
+    fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let payload = self.bytes(py)?;
+        let (worlds, robots) = payload.as_slice()?[..self.head()].split_at(self.worlds_end());
+        let mut results = Vec::with_capacity(self.n_robots as usize * RESULT_BYTES);
+        for (index, robot) in robots.chunks_exact(ROBOT_BYTES).enumerate() {
+            results.extend_from_slice(&worlds[self.world_of(index) * WORLD_BYTES..][..WORLD_BYTES]);
+            results.extend_from_slice(robot);
+        }
+        Ok(PyArray1::from_vec(py, results))
+    }
+
+    /// The position of each robot's world among the worlds.
+    #[getter]
+    fn world_of_robots<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
+        let worlds = (0..self.n_robots as usize).map(|index| self.world_of(index) as i64);
+        PyArray1::from_iter(py, worlds)
+    }
+
+    /// The fields of one robot's `WorldResult` and `RobotResult`.
+    fn result(&self, py: Python<'_>, index: usize) -> PyResult<(World, Robot)> {
+        let (world, robot) = self.results_of(py, index)?;
+        Ok((of_world(&world), of_robot(&robot)))
+    }
+
+    /// The numbers of the first robot's step; `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
+    fn numbers(&self, py: Python<'_>, pays: u8) -> PyResult<Numbers> {
+        let (world, robot) = self.results_of(py, 0)?;
+        Ok((
+            paid(pays, &world, &robot),
+            world.terminated != 0,
+            world.truncated != 0,
+            world.step,
+            robot.n_visited,
+            (robot.row, robot.col),
+        ))
+    }
+}
+
+impl Answer {
+    /// `place`: robots of each world, the first robot, number of robots, flags.
+    fn made(
+        (team, first_robot, n_robots, flags): (u32, u32, u32, u32),
+        [height, width]: [usize; 2],
+        simulation_nanos: u64,
+        payload: Bound<'_, PyArray1<u8>>,
+    ) -> Self {
+        let n_frames = match flags & FLAG_TEAM_FRAMES {
+            0 => n_robots as usize,
+            _ => worlds_of(first_robot, n_robots, team).len(),
+        };
+        Self {
+            team: team.max(1),
+            first_robot,
+            n_robots,
+            simulation_nanos,
+            dim: [n_frames, height, width],
+            payload: payload.unbind(),
+        }
+    }
+
+    /// An answer that came with this header.
+    pub fn of(
+        py: Python<'_>,
+        team: u32,
+        shape: Shape,
+        reply: &StepReply,
+        payload: Vec<u8>,
+    ) -> Self {
+        let place = (team, reply.first_robot, reply.n_robots, reply.flags);
+        let payload = PyArray1::from_vec(py, payload);
+        Self::made(place, shape.dim().into(), reply.simulation_nanos, payload)
+    }
+
+    /// The step of its first world.
+    pub fn step(&self, py: Python<'_>) -> PyResult<u64> {
+        Ok(self.results_of(py, 0)?.0.step)
+    }
+
+    fn n_worlds(&self) -> usize {
+        worlds_of(self.first_robot, self.n_robots, self.team).len()
+    }
+
+    fn worlds_end(&self) -> usize {
+        self.n_worlds() * WORLD_BYTES
+    }
+
+    /// Number of bytes before the frames.
+    fn head(&self) -> usize {
+        self.worlds_end() + self.n_robots as usize * ROBOT_BYTES
+    }
+
+    fn n_bytes(&self) -> usize {
+        self.head() + self.dim.iter().product::<usize>()
+    }
+
+    /// The position of a robot's world; `index` counts robots from the first.
+    fn world_of(&self, index: usize) -> usize {
+        let first = self.first_robot / self.team;
+        ((self.first_robot + index as u32) / self.team - first) as usize
+    }
+
+    fn bytes<'py>(&self, py: Python<'py>) -> PyResult<PyReadonlyArray1<'py, u8>> {
+        Ok(self.payload.bind(py).try_readonly()?)
+    }
+
+    fn slice<'py>(
+        &self,
+        py: Python<'py>,
+        bytes: Range<usize>,
+    ) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let slice = PySlice::new(py, bytes.start as isize, bytes.end as isize, 1);
+        Ok(self.payload.bind(py).get_item(slice)?.cast_into()?)
+    }
+
+    fn results_of(&self, py: Python<'_>, index: usize) -> PyResult<(WorldResult, RobotResult)> {
+        if index >= self.n_robots as usize {
+            let expected = format!("0 to {}", self.n_robots - 1);
+            return Err(invalid(py, "index", expected, index));
+        }
+        let payload = self.bytes(py)?;
+        let payload = payload.as_slice()?;
+        let world = &payload[self.world_of(index) * WORLD_BYTES..][..WORLD_BYTES];
+        let robot = &payload[self.worlds_end() + index * ROBOT_BYTES..][..ROBOT_BYTES];
+        Ok((
+            bytemuck::pod_read_unaligned(world),
+            bytemuck::pod_read_unaligned(robot),
+        ))
+    }
+}
+
+/// The numbers of all robots' steps, from bytes of `wire.RESULT_DTYPE`; `pays` as of `Answer.numbers`.
+#[pyfunction]
+pub fn columns<'py>(
+    py: Python<'py>,
+    results: PyReadonlyArray1<'py, u8>,
+    pays: u8,
+) -> PyResult<Columns<'py>> {
+    let results = results.as_slice()?.chunks_exact(RESULT_BYTES);
+    let n = results.len();
+    let (mut rewards, mut cells) = (Vec::with_capacity(n), Vec::with_capacity(2 * n));
+    let (mut terminated, mut truncated) = (Vec::with_capacity(n), Vec::with_capacity(n));
+    let (mut steps, mut n_visited) = (Vec::with_capacity(n), Vec::with_capacity(n));
+    for result in results {
+        let (world, robot) = result.split_at(WORLD_BYTES);
+        let world: WorldResult = bytemuck::pod_read_unaligned(world);
+        let robot: RobotResult = bytemuck::pod_read_unaligned(robot);
+        rewards.push(paid(pays, &world, &robot));
+        terminated.push(world.terminated != 0);
+        truncated.push(world.truncated != 0);
+        steps.push(world.step as i64);
+        n_visited.push(robot.n_visited.into());
+        cells.extend([i64::from(robot.row), i64::from(robot.col)]);
+    }
+    let is_over = terminated.contains(&true) || truncated.contains(&true);
+    Ok((
+        PyArray1::from_vec(py, rewards),
+        PyArray1::from_vec(py, terminated),
+        PyArray1::from_vec(py, truncated),
+        PyArray1::from_vec(py, steps),
+        PyArray1::from_vec(py, n_visited),
+        PyArray1::from_vec(py, cells).reshape([n, 2])?,
+        is_over,
+    ))
+}
+
+/// What a step pays a robot.
+fn paid(pays: u8, world: &WorldResult, robot: &RobotResult) -> f64 {
+    match pays {
+        0 => robot.reward,
+        1 => world.reward,
+        _ => robot.marginal,
+    }
+}
