@@ -26,8 +26,8 @@ pub use model::{Airspace, Model, randomness, vectors};
 pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
-    agent_belief, channels, cleanup, control, failed_connections, interrupt, message, observer,
-    payload, recording, responder, shared_memory, turn, wait,
+    agent_belief, channels, cleanup, control, failed_connections, feed, interrupt, message,
+    observer, payload, recording, responder, shared_memory, turn, wait,
 };
 
 #[cfg(doctest)]

@@ -17,6 +17,7 @@ mod directory;
 mod error;
 mod exchange;
 pub mod failed_connections;
+pub mod feed;
 mod hello;
 pub mod interrupt;
 mod json;

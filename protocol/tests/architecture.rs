@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 11] = [
+const SOURCES: [&str; 12] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
     "agent/belief/src",
     "agent/figures/src",
+    "agent/learning/src",
     "agent/network/src",
     "clients/dashboard/src",
     "clients/dashboard/page",
@@ -21,12 +22,13 @@ const SOURCES: [&str; 11] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 9] = [
+const CRATES: [&str; 10] = [
     "protocol",
     "env-server",
     "agent",
     "agent/belief",
     "agent/figures",
+    "agent/learning",
     "agent/network",
     "clients/dashboard",
     "clients/python",
@@ -141,6 +143,7 @@ fn every_test_file_is_in_its_program() {
     for name in [
         "agent",
         "agent/belief",
+        "agent/learning",
         "clients/dashboard",
         "protocol",
         "tests",
@@ -174,7 +177,7 @@ fn the_readme_shows_the_example_of_the_crate() {
 #[test]
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
-    for name in ["agent", "env-server", "protocol"] {
+    for name in ["agent", "agent/learning", "env-server", "protocol"] {
         let place = |module: &[String]| {
             let room = format!("{name}/src/{}", module.first()?);
             rooms.iter().position(|name| *name == room)

@@ -8,19 +8,19 @@ use crate::model::{model_of, shape_of};
 use crate::owned::Owned;
 use crate::refusal::{failed, invalid};
 use anyhow::{Context, Result, ensure};
-use emberwatch_agent::acting::options::{Crew, Planned, Shown};
-use emberwatch_agent::client::feed::{Feed, View};
-use emberwatch_agent::config::{AgentConfig, PriorKind};
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::estimator::EstimatorError;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
+use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::options::{Crew, Planned, Shown};
+use emberwatch_learning::policy::EstimatorKind;
 use emberwatch_network::Device;
 use emberwatch_protocol::agent_belief::Intent;
 use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::feed::{Feed, View};
 use emberwatch_protocol::message::{RobotResult, WorldResult};
 use emberwatch_protocol::model::Description;
 use emberwatch_protocol::path::path_to_bytes;
@@ -345,7 +345,7 @@ impl State {
         let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
             return Vec::new();
         };
-        let belief = || begun.agent().belief();
+        let belief = || begun.agent().belief().probabilities();
         let feed = watched
             .feed
             .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
@@ -366,7 +366,7 @@ impl State {
                 world,
                 robots: world..world + 1,
                 result: &outlook.world,
-                belief: &outlook.belief,
+                belief: outlook.belief.probabilities(),
                 intent: outlook.intent,
             };
             if let Some(feed) = &mut watched.feed {
