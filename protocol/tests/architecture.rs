@@ -7,8 +7,10 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 12] = [
+const SOURCES: [&str; 14] = [
     "protocol/src",
+    "protocol/messages/src",
+    "protocol/model/src",
     "env-server/src",
     "agent/src",
     "agent/belief/src",
@@ -22,8 +24,10 @@ const SOURCES: [&str; 12] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 10] = [
+const CRATES: [&str; 12] = [
     "protocol",
+    "protocol/messages",
+    "protocol/model",
     "env-server",
     "agent",
     "agent/belief",
@@ -146,6 +150,8 @@ fn every_test_file_is_in_its_program() {
         "agent/learning",
         "clients/dashboard",
         "protocol",
+        "protocol/messages",
+        "protocol/model",
         "tests",
     ] {
         let folder = root()
@@ -177,7 +183,7 @@ fn the_readme_shows_the_example_of_the_crate() {
 #[test]
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
-    for name in ["agent", "agent/learning", "env-server", "protocol"] {
+    for name in ["agent", "agent/learning", "env-server"] {
         let place = |module: &[String]| {
             let room = format!("{name}/src/{}", module.first()?);
             rooms.iter().position(|name| *name == room)
@@ -199,7 +205,7 @@ fn no_crate_has_a_circle_of_files() {
         assert_eq!(circle(&graph), Vec::<Vec<String>>::new(), "{name}");
     }
     let n_edges: usize = graph_of("protocol").values().map(BTreeSet::len).sum();
-    assert!(n_edges > 100, "{n_edges}: paths are not read");
+    assert!(n_edges > 80, "{n_edges}: paths are not read");
 }
 
 #[test]

@@ -7,9 +7,9 @@ use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::filter::Optimiser;
 use emberwatch_learning::replay::Replay;
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_model::path::fly;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Frame, Model, Move, Shape};
 
 const N_MOVES: u64 = 64;
 

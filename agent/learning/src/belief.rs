@@ -7,8 +7,8 @@ use crate::learners::filter::model::{SavedModel, check_target};
 use crate::learners::neural::{NeuralModel, new_network};
 use anyhow::Result;
 use emberwatch_belief::estimation::Estimator;
+use emberwatch_model::Shape;
 use emberwatch_network::{Device, NamedTensor};
-use emberwatch_protocol::Shape;
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, PartialEq)]

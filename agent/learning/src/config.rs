@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn settings_of_the_objective_reach_the_policies() {
-        let model = emberwatch_protocol::Model::wildfire();
+        let model = emberwatch_model::Model::wildfire();
         let policy = |name| Policy::named(name, &model).expect("a known name");
         let mut config = AgentConfig::default();
         for policy in Policy::ladder(&model) {

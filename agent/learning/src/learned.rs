@@ -11,8 +11,8 @@ use crate::learners::neural::{self, NeuralModel};
 use crate::policy::{Choice, EstimatorKind, Policy};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_model::Model;
 use emberwatch_network::Device;
-use emberwatch_protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 

@@ -9,8 +9,8 @@ use crate::rollout::agent::Agent;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::{Proposal, Target};
-use emberwatch_protocol::agent_belief::Intent;
-use emberwatch_protocol::{Cell, Frame, Model, Shape};
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_model::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
 
 /// The planner settings of all options.

@@ -12,7 +12,7 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_belief::planning::{BasisKind, Objective, Target};
-use emberwatch_protocol::{Model, Shape};
+use emberwatch_model::{Model, Shape};
 use std::sync::Arc;
 
 /// What a misfit is told of.

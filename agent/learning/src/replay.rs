@@ -8,7 +8,7 @@
 use crate::checkpoint::{check, check_counts, check_numbers, wrong};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_protocol::{Frame, Probabilities, Shape};
+use emberwatch_model::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -204,7 +204,7 @@ impl Block {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Probabilities;
+    use emberwatch_model::Probabilities;
 
     fn frame(value: u8) -> Frame {
         let shape = Shape::new(1, 3).expect("test shape");

@@ -102,7 +102,7 @@ mod tests {
         assert_eq!(estimate.target(), None);
         for path in 0..200 {
             let cells =
-                |state: u64| (emberwatch_protocol::randomness::split_mix(path, state) % 20) as f64;
+                |state: u64| (emberwatch_model::randomness::split_mix(path, state) % 20) as f64;
             let met = [cells(0), cells(1), cells(2)];
             estimate.add(&met, 2.0 * met[1] - 0.5 * met[2]);
         }

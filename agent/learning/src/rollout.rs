@@ -6,9 +6,9 @@ use self::agent::Agent;
 use anyhow::Result;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::planning::Plan;
-use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::message::RobotResult;
-use emberwatch_protocol::{Cell, Grid, Move};
+use emberwatch_messages::message::RobotResult;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::{Cell, Grid, Move};
 use rayon::prelude::*;
 
 /// An agent and what its world shows it: it plans for one robot there, or for several on one belief.

@@ -6,8 +6,8 @@ use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::config::{AgentConfig, LearningConfig};
 use emberwatch_learning::filter::{Optimiser, Recursion, Update};
 use emberwatch_learning::replay::{Replay, Sighting};
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Grid, Model, Probabilities, Shape};
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Frame, Grid, Model, Probabilities, Shape};
 use std::sync::Arc;
 
 /// What a few cells of a made-up world show: no two frames see the same cells.

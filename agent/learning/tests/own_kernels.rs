@@ -5,9 +5,9 @@ use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learners::filter::fit::{FilterFit, LearnedModel};
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
+use emberwatch_model::path::fly;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
 
 const N_WORLDS: u32 = 4;
 const N_STEPS: u64 = 500;

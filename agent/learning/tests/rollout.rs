@@ -6,11 +6,11 @@ use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
 use emberwatch_learning::registry::{Task, agent};
 use emberwatch_learning::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
-use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::message::{RobotResult, WorldResult};
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Model, Move, Shape};
+use emberwatch_messages::message::{RobotResult, WorldResult};
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::path::fly;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Frame, Model, Move, Shape};
 
 const N_MOVES: usize = 6;
 

@@ -7,10 +7,10 @@ use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
-use emberwatch_protocol::limits::memory::with_capacity;
-use emberwatch_protocol::limits::threads::NoThreads;
-use emberwatch_protocol::model::{Model, ModelError};
-use emberwatch_protocol::{Shape, UNOBSERVED, transition};
+use emberwatch_messages::limits::memory::with_capacity;
+use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_model::{Model, ModelError};
+use emberwatch_model::{Shape, UNOBSERVED, transition};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{
     IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,

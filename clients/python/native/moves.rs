@@ -1,6 +1,6 @@
 //! Moves that a caller hands in: arrays of integers, which become bytes.
 
-use emberwatch_protocol::path::check_moves;
+use emberwatch_model::path::check_moves;
 use numpy::{Element, PyArray1, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;

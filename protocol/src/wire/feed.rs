@@ -2,8 +2,8 @@
 
 use super::agent_belief::{BeliefPublisher, Intent};
 use super::channels::{AGENT_BUFFER, Instance};
-use super::message::{AgentHeader, WorldResult};
-use crate::model::grid::Probabilities;
+use emberwatch_messages::message::{AgentHeader, WorldResult};
+use emberwatch_model::grid::Probabilities;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 

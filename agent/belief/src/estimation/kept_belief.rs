@@ -3,8 +3,8 @@
 
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
-use emberwatch_protocol::grid::{Probabilities, Shape};
-use emberwatch_protocol::model::{Model, ModelFile};
+use emberwatch_model::grid::{Probabilities, Shape};
+use emberwatch_model::{Model, ModelFile};
 use std::fs::OpenOptions;
 use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;

@@ -5,8 +5,8 @@ use crate::estimation::follower::Follower;
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
+use emberwatch_model::Frame;
 use emberwatch_network::{Autoencoder, NetworkError};
-use emberwatch_protocol::Frame;
 use ndarray::Array2;
 use std::borrow::Cow;
 

@@ -3,8 +3,8 @@
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::kept_belief::KeptBelief;
 use emberwatch_belief::estimation::prior::Prior;
-use emberwatch_protocol::model::ModelError;
-use emberwatch_protocol::{Model, Shape};
+use emberwatch_model::ModelError;
+use emberwatch_model::{Model, Shape};
 
 /// Cells that a core moves by one step in a second: 64 x 64 of the wildfire in 3.4 us.
 const CELLS_PER_SECOND: f64 = 1.2e9;

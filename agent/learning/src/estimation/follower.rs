@@ -1,8 +1,8 @@
 //! What the autoencoder knows of one world: its hidden vector and its predictor (paper eq. 9).
 
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_model::{Frame, Probabilities};
 use emberwatch_network::{Autoencoder, NetworkError, Window};
-use emberwatch_protocol::{Frame, Probabilities};
 use serde::{Deserialize, Serialize};
 
 /// What a network knows of one world. Every method takes the same network.

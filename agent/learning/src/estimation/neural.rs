@@ -6,9 +6,9 @@
 use emberwatch_belief::estimation::bayes::{correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{NetworkError, NeuralBelief, Sightings};
-use emberwatch_protocol::grid::Probabilities;
-use emberwatch_protocol::{Frame, Shape};
 use ndarray::Array2;
 use std::borrow::Cow;
 

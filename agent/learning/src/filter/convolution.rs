@@ -1,6 +1,6 @@
 //! Correlations of planes with dense kernels, and their derivatives by the weights.
 //!
-//! [`emberwatch_protocol::Transition`] computes the forward part too; it gains from weights that are zero or
+//! [`emberwatch_model::Transition`] computes the forward part too; it gains from weights that are zero or
 //! alike, of which a learned kernel has none, and does not know derivatives.
 
 use crate::filter::layout::{LANES, Layout};

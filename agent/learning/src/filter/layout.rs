@@ -1,6 +1,6 @@
 //! Where a cell of a state lies in planes with a margin of zeros, so that no cell is special.
 
-use emberwatch_protocol::Shape;
+use emberwatch_model::Shape;
 
 /// Cells that the widest vectors hold; those of each kind of processor divide it.
 pub(super) const LANES: usize = 16;

@@ -12,7 +12,7 @@ use crate::filter::operator::Operator;
 use crate::filter::zoned::ZonedOperator;
 use crate::replay::Sighting;
 use emberwatch_belief::estimation::parameters::Tables;
-use emberwatch_protocol::Shape;
+use emberwatch_model::Shape;
 use pulp::{Arch, Simd, WithSimd};
 
 #[derive(Debug, Clone, PartialEq)]

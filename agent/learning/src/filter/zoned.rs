@@ -6,7 +6,7 @@
 use crate::filter::layout::{LANES, Layout};
 use crate::filter::operator::{end_gradient, take_centres};
 use emberwatch_belief::estimation::parameters::n_zones;
-use emberwatch_protocol::Grid;
+use emberwatch_model::Grid;
 use std::ops::Range;
 
 /// Rows and columns of the parts of a grid whose cells come one after the other: many chunks owe nothing then.

@@ -21,8 +21,8 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{Plan, Target};
-use emberwatch_protocol::Move;
-use emberwatch_protocol::client::Observation;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 

@@ -21,9 +21,9 @@ use crate::reward::met;
 use crate::rollout::{Rollout, predict_all, see_all};
 use crate::update::{ModelUpdate, Tick};
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
 use emberwatch_network::{Transition, Window};
-use emberwatch_protocol::Move;
-use emberwatch_protocol::client::Observation;
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "autoencoder";

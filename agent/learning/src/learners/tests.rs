@@ -16,11 +16,11 @@ use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
     BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
 };
+use emberwatch_messages::message::{RobotResult, WorldResult};
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Airspace, Cell, Frame, Model, Move, Shape};
 use emberwatch_network::{Device, NeuralBelief, Transition};
-use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::message::{RobotResult, WorldResult};
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Airspace, Cell, Frame, Model, Move, Shape};
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 

@@ -3,7 +3,7 @@
 use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy};
 use emberwatch_belief::planning::objective::Target;
 use emberwatch_belief::planning::options::OPTIONS;
-use emberwatch_protocol::Model;
+use emberwatch_model::Model;
 
 /// All policies of a model, a line each: name, planner, objective, belief; those of single options together.
 pub fn list(model: &Model) -> String {

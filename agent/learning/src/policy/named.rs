@@ -4,7 +4,7 @@ use super::kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
 use anyhow::{Context, Result, bail};
 use emberwatch_belief::planning::objective::{Objective, Target};
 use emberwatch_belief::planning::options::OPTIONS;
-use emberwatch_protocol::Model;
+use emberwatch_model::Model;
 
 impl Policy {
     /// The policy of a name under a model.

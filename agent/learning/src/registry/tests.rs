@@ -7,9 +7,9 @@ use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::Progress;
 use crate::learners::neural::NeuralModel;
 use anyhow::Result;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Airspace, Cell, Frame, Grid};
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape, NeuralBelief};
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Airspace, Cell, Frame, Grid};
 use std::sync::Arc;
 
 const N_MOVES: usize = 6;

@@ -12,9 +12,9 @@ use emberwatch_belief::planning::{
     BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan,
     Planner, Proposal, RandomWalk,
 };
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_model::{Airspace, Cell, Frame, Grid};
 use emberwatch_network::Dqn;
-use emberwatch_protocol::agent_belief::Intent;
-use emberwatch_protocol::{Airspace, Cell, Frame, Grid};
 use std::sync::Arc;
 use std::time::Duration;
 

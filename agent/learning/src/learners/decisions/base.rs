@@ -7,8 +7,8 @@ use crate::learners::filter::form::WorldForm;
 use crate::policy::{EstimatorKind, numbered_states};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use emberwatch_model::{Model, Shape};
 use emberwatch_network::Device;
-use emberwatch_protocol::{Model, Shape};
 
 /// What keeps the beliefs that decisions are made on, before a world's first frame.
 pub struct Base {

@@ -6,8 +6,8 @@ use crate::learners::base::place;
 use crate::rollout::Rollout;
 use anyhow::Result;
 use emberwatch_belief::planning::Proposal;
+use emberwatch_model::Move;
 use emberwatch_network::{Dqn, Track, Transition};
-use emberwatch_protocol::Move;
 
 pub(super) struct Run {
     pub(super) rollout: Rollout,

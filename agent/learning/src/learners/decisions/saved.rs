@@ -8,9 +8,9 @@ use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_belief::planning::{BasisKind, Memory, OPTIONS};
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Shape;
 use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor, SavedDqn, Track};
-use emberwatch_protocol::Shape;
-use emberwatch_protocol::client::Observation;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -163,8 +163,8 @@ pub(super) fn belief_tensors(belief: &LearnedBelief) -> Result<Vec<NamedTensor>>
 mod tests {
     use super::*;
     use crate::config::AgentConfig;
-    use emberwatch_protocol::Frame;
-    use emberwatch_protocol::message::{RobotResult, WorldResult};
+    use emberwatch_messages::message::{RobotResult, WorldResult};
+    use emberwatch_model::Frame;
 
     #[test]
     fn what_is_wrong_with_a_checkpoint_is_named() {

@@ -15,8 +15,8 @@ use anyhow::Result;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_model::{Frame, Grid, Shape};
 use emberwatch_network::NamedTensor;
-use emberwatch_protocol::{Frame, Grid, Shape};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

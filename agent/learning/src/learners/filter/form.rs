@@ -4,8 +4,8 @@
 use crate::checkpoint::{Part, check, wrong};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables, n_zones};
+use emberwatch_model::{Grid, Shape};
 use emberwatch_network::NamedTensor;
-use emberwatch_protocol::{Grid, Shape};
 use std::sync::Arc;
 
 /// The name of the tensor that holds the zone of each cell.

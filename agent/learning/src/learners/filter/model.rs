@@ -6,8 +6,8 @@ use crate::learners::filter::form::{Form, WorldForm, named_tensors, zones_tensor
 use anyhow::Result;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use emberwatch_model::Shape;
 use emberwatch_network::NamedTensor;
-use emberwatch_protocol::Shape;
 use serde::{Deserialize, Serialize};
 
 /// Before the names of the tensors of the filter that a neural belief corrects.

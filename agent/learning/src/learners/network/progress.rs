@@ -10,11 +10,11 @@ use crate::rollout::Rollout;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::BasisKind;
+use emberwatch_model::MAX_VALUES;
+use emberwatch_model::{Airspace, Frame, Shape};
 use emberwatch_network::{
     Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
 };
-use emberwatch_protocol::model::MAX_VALUES;
-use emberwatch_protocol::{Airspace, Frame, Shape};
 use serde::{Deserialize, Serialize};
 
 /// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.

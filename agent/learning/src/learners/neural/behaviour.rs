@@ -2,8 +2,8 @@
 
 use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::planning::{CellValues, Objective};
+use emberwatch_model::{Airspace, Grid, Shape};
 use emberwatch_network::Sightings;
-use emberwatch_protocol::{Airspace, Grid, Shape};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
@@ -151,8 +151,8 @@ impl Behaviour {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Model;
-    use emberwatch_protocol::randomness::{Purpose, stream};
+    use emberwatch_model::Model;
+    use emberwatch_model::randomness::{Purpose, stream};
 
     fn shape() -> Shape {
         Shape::new(3, 4).expect("test shape")

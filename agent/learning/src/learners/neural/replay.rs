@@ -5,9 +5,9 @@
 
 use crate::checkpoint::{check, check_numbers};
 use anyhow::Result;
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{Lesson, Sightings};
-use emberwatch_protocol::grid::Probabilities;
-use emberwatch_protocol::{Frame, Shape};
 use ndarray::s;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
@@ -194,7 +194,7 @@ impl Block {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::randomness::{Purpose, stream};
+    use emberwatch_model::randomness::{Purpose, stream};
 
     fn shape() -> Shape {
         Shape::new(2, 2).expect("test shape")

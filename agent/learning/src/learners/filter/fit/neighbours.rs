@@ -4,7 +4,7 @@ use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::correlations::{Ages, Evidence};
 use emberwatch_belief::estimation::parameters::Tables;
-use emberwatch_protocol::Frame;
+use emberwatch_model::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
