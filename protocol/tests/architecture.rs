@@ -7,11 +7,12 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 14] = [
+const SOURCES: [&str; 15] = [
     "protocol/src",
     "protocol/messages/src",
     "protocol/model/src",
     "env-server/src",
+    "env-server/sim/src",
     "agent/src",
     "agent/belief/src",
     "agent/figures/src",
@@ -24,11 +25,12 @@ const SOURCES: [&str; 14] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 12] = [
+const CRATES: [&str; 13] = [
     "protocol",
     "protocol/messages",
     "protocol/model",
     "env-server",
+    "env-server/sim",
     "agent",
     "agent/belief",
     "agent/figures",
@@ -183,7 +185,7 @@ fn the_readme_shows_the_example_of_the_crate() {
 #[test]
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
-    for name in ["agent", "agent/learning", "env-server"] {
+    for name in ["agent", "agent/learning", "env-server", "env-server/sim"] {
         let place = |module: &[String]| {
             let room = format!("{name}/src/{}", module.first()?);
             rooms.iter().position(|name| *name == room)

@@ -340,7 +340,6 @@ pub fn check_belief(name: &str, belief: &Belief, n_states: usize, shape: Shape) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::os::unix::fs::PermissionsExt;
     use std::path::PathBuf;
 
     type State = (Vec<u64>, Option<String>);
@@ -372,8 +371,12 @@ mod tests {
         assert_eq!((kind, &read), ("tests", &contents()));
         assert_eq!(read.state::<State>().expect("its state"), state());
         assert_eq!(read.settings().expect("settings").seed, 3);
-        let mode = path.metadata().expect("the file").permissions().mode();
-        assert_eq!(mode & 0o777, 0o600);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            let mode = path.metadata().expect("the file").permissions().mode();
+            assert_eq!(mode & 0o777, 0o600);
+        }
         let files = std::fs::read_dir(folder.path()).expect("the folder");
         assert_eq!(files.count(), 1, "nothing left next to it");
     }

@@ -3,6 +3,7 @@
 use anyhow::{Context, Result};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
+#[cfg(unix)]
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
@@ -52,9 +53,12 @@ fn create_temporary(path: &Path, readers: Readers) -> Result<(PathBuf, File)> {
     let _ = std::fs::remove_file(&temporary);
     let mut options = OpenOptions::new();
     options.write(true).create_new(true);
+    #[cfg(unix)]
     if readers == Readers::Owner {
         options.mode(0o600);
     }
+    #[cfg(not(unix))]
+    let _ = readers; // A file has the readers of its folder.
     let file = options.open(&temporary)?;
     Ok((temporary, file))
 }

@@ -226,7 +226,7 @@ fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyRes
     let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
     let n_bytes = 2 * n_threads * of_thread;
     check_memory(py, "the worlds of a first belief", n_bytes)?;
-    let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = emberwatch_sim::limits::start(ThreadPoolBuilder::new(), n_threads);
     let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {
         let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));

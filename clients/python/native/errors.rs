@@ -4,7 +4,7 @@ use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::limits::memory::{self, NoMemory};
 use emberwatch_messages::limits::threads::NoThreads;
-use emberwatch_server::embedded::INSTANCE;
+use emberwatch_sim::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
 use pyo3::prelude::*;

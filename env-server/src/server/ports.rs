@@ -4,7 +4,6 @@ use super::descriptors::raise_limit;
 use super::memory::{Memory, PortIds, check_shared_memory};
 use super::port_config::{PortConfig, frame_bytes};
 use super::taken::{Taken, once_free};
-use crate::config::Checked;
 use anyhow::Result;
 use emberwatch_protocol::channels::{
     Channel, ChannelError, ControlService, Entries, FrameService, Ipc, Publications,
@@ -25,6 +24,7 @@ use emberwatch_protocol::shared_memory::fill_ports;
 use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::turn::Turn;
 use emberwatch_protocol::wait::{descriptor, drain};
+use emberwatch_sim::config::Checked;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;

@@ -2,8 +2,6 @@
 
 use super::ports::ActiveStep;
 use super::state::Server;
-use crate::config::Checked;
-use crate::simulator::{Outcome, ServerStats, Stepped};
 use anyhow::Result;
 use emberwatch_protocol::channels::ipc_error;
 use emberwatch_protocol::control::Reply;
@@ -11,6 +9,8 @@ use emberwatch_protocol::message::{Operation, StepReply};
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::responder::{ActiveControl, listener_id, wait_until_taken};
 use emberwatch_protocol::wait::sleep_until_event;
+use emberwatch_sim::config::Checked;
+use emberwatch_sim::simulator::{Outcome, ServerStats, Stepped};
 use iceoryx2::prelude::PayloadHeader;
 use std::cell::Cell;
 use std::os::fd::BorrowedFd;
