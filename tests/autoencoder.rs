@@ -2,8 +2,8 @@
 
 use crate::commands::{agent, check};
 use crate::trainings::Place;
-use emberwatch_agent::learning::checkpoint::{self, Contents};
-use emberwatch_agent::learning::learners::network::{KIND, SavedNetwork};
+use emberwatch_learning::checkpoint::{self, Contents};
+use emberwatch_learning::learners::network::{KIND, SavedNetwork};
 use emberwatch_protocol::Move;
 use std::path::Path;
 use tests::harness::{AGENT, Server, fly};

@@ -1,6 +1,6 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use emberwatch_agent::policy;
+use emberwatch_learning::policy;
 use emberwatch_protocol::Model;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, Program, SERVER, SMALL, Server, new_instance, run};

@@ -3,7 +3,7 @@
 use crate::commands::{TINY, agent, check};
 use emberwatch_agent::benchmark::report::RunsFile;
 use emberwatch_protocol::{Dynamics, Model, Shape};
-use emberwatch_server::world::{Source, World};
+use emberwatch_sim::world::{Source, World};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;

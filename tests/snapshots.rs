@@ -7,7 +7,7 @@ use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::observer::Observer;
-use emberwatch_server::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
+use emberwatch_sim::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tests::harness::{

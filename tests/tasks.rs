@@ -4,7 +4,7 @@ use crate::commands::{agent, check, check_table};
 use crate::recording::{read_whole, start_recorder, stop};
 use emberwatch_protocol::recording::Event;
 use emberwatch_protocol::task::Task;
-use emberwatch_server::snapshot::decode;
+use emberwatch_sim::snapshot::decode;
 use tempfile::TempDir;
 use tests::harness::{AGENT, Paths, Program, SERVER, Server, fly, repository, reset, seen_by};
 

@@ -3,8 +3,8 @@
 use crate::commands::check;
 use emberwatch_agent::acting::mission::{Company, Mission};
 use emberwatch_agent::acting::run::{Summary, run};
-use emberwatch_agent::config::AgentConfig;
-use emberwatch_agent::learning::learned::Learned;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
 use emberwatch_protocol::observer::Observer;
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;

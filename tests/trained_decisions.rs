@@ -2,8 +2,8 @@
 
 use crate::commands::{agent, check};
 use crate::trainings::Place;
-use emberwatch_agent::learning::checkpoint;
-use emberwatch_agent::learning::learners::decisions::{KIND, SavedDecisions};
+use emberwatch_learning::checkpoint;
+use emberwatch_learning::learners::decisions::{KIND, SavedDecisions};
 use tests::harness::{AGENT, SMALL, Server, repository};
 
 /// A private server with small worlds.

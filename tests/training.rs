@@ -2,10 +2,10 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::Place;
-use emberwatch_agent::learning::checkpoint::{self, Contents};
-use emberwatch_agent::learning::learners::filter::SavedFilter;
-use emberwatch_agent::learning::learners::filter::fit::FilterFit;
-use emberwatch_agent::learning::learners::filter::fit::KIND;
+use emberwatch_learning::checkpoint::{self, Contents};
+use emberwatch_learning::learners::filter::SavedFilter;
+use emberwatch_learning::learners::filter::fit::FilterFit;
+use emberwatch_learning::learners::filter::fit::KIND;
 use emberwatch_protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;

@@ -4,8 +4,8 @@
 //! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.png`
 
 use emberwatch_agent::benchmark::report::save;
-use emberwatch_agent::config::{AgentConfig, StepSize};
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
+use emberwatch_learning::config::{AgentConfig, StepSize};
 use std::path::Path;
 
 const ITERATIONS: u64 = 25_000;

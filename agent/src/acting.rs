@@ -1,8 +1,6 @@
-//! Acting on one world of a running server, and planning for a learner outside.
+//! Acting on one world of a running server.
 
 pub mod handover;
 pub mod mission;
-pub mod options;
 pub mod pilot;
-pub mod registry;
 pub mod run;

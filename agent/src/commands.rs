@@ -19,7 +19,7 @@ pub use suite::SuiteCommand;
 pub use train::TrainCommand;
 
 use emberwatch_agent::client::errors::refusal;
-use emberwatch_agent::policy;
+use emberwatch_learning::policy;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::message::Status;
 use std::process::ExitCode;

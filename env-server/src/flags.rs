@@ -1,9 +1,9 @@
 //! The server's settings as flags.
 
-use crate::config::{ConfigError, ServerConfig};
-use crate::given::start_of;
 use clap::{Args, ValueEnum};
 use emberwatch_protocol::task::Start;
+use emberwatch_sim::config::{ConfigError, ServerConfig};
+use emberwatch_sim::given::start_of;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::PathBuf;

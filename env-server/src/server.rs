@@ -19,4 +19,4 @@ pub use liveness::Clients;
 pub use port_config::PortConfig;
 pub use ports::Ports;
 pub use serve::serve;
-pub use state::{Rate, announce_reach};
+pub use state::announce_reach;

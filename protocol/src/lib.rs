@@ -1,33 +1,29 @@
-//! What the server and its clients agree on: the mathematics of the paper ([`model`], [`grid`], [`path`], [`frame`],
-//! [`dynamics`], [`transition`]), and messages and channels.
+//! The wire between the server and its clients: channels of shared memory by iceoryx2, connections, observers.
 //!
 //! A [`Client`] flies robots; `examples/random_robot.rs` is a whole program. Below it, a [`Connection`] takes the
 //! requests in [`control`] and [`message`]. An [`observer`] reads what a server publishes, a [`recording`] what a file
-//! holds of that. A [`responder`], [`channels`] and [`failed_connections`] are for those who serve worlds. A [`task`] is
-//! a world with a name. [`limits`] refuses more memory and threads than the system has.
+//! holds of that. A [`responder`], [`channels`] and [`failed_connections`] are for those who serve worlds.
 //!
-//! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
-//! flies one path with each robot and moves the world once; a *frame* holds the observations of a step; a *lease* is the
-//! right to fly robots.
+//! The messages are in the crate `emberwatch-messages`, the mathematics of the worlds in `emberwatch-model`; a client finds
+//! what it needs of both here. PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of
+//! one grid; a *step* `k` flies one path with each robot and moves the world once; a *frame* holds the observations of a
+//! step; a *lease* is the right to fly robots.
 
-pub mod limits;
-pub mod model;
 pub mod program;
-pub mod task;
 pub mod throttle;
 mod wire;
 
-pub use model::dynamics::{self, Dynamics};
-pub use model::frame::{self, Coverage, Frame, UNOBSERVED};
-pub use model::grid::{self, Cell, Grid, Probabilities, Shape};
-pub use model::path::{self, Move};
-pub use model::transition::{self, Transition};
-pub use model::{Airspace, Model, randomness, vectors};
+pub use emberwatch_messages::{control, interrupt, limits, message, payload, recording};
+pub use emberwatch_model as model;
+pub use emberwatch_model::{
+    Airspace, Cell, Coverage, Dynamics, Frame, Grid, Model, Move, Probabilities, Shape, Transition,
+    UNOBSERVED, dynamics, frame, grid, path, randomness, task, transition, vectors,
+};
 pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
-    agent_belief, channels, cleanup, control, failed_connections, interrupt, message, observer,
-    payload, recording, resend, responder, shared_memory, turn, wait,
+    agent_belief, channels, cleanup, failed_connections, feed, observer, responder, shared_memory,
+    turn, wait,
 };
 
 #[cfg(doctest)]

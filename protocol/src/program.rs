@@ -1,23 +1,18 @@
-//! What every program does when it starts: log to standard error, read settings and models, stop on signals or
-//! when another process ends.
+//! What every program does when it starts: log to standard error, stop on signals or when another process ends.
 
-use crate::limits::threads::spawn;
+use emberwatch_messages::limits::threads::spawn;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
-use std::fs::File;
-use std::io::{IsTerminal, Read};
-use std::path::Path;
+use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tracing_subscriber::EnvFilter;
 
-/// The name that `agent` uses.
-pub use crate::wire::process::{NotWatched, WatchedProcess, node_pid, pid_namespace};
-
-/// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
-pub const MAX_TEXT_BYTES: u64 = 16 << 20;
+pub use crate::wire::process::{NotWatched, WatchedProcess, node_pid};
+pub use emberwatch_messages::process::pid_namespace;
+pub use emberwatch_model::text::{MAX_TEXT_BYTES, read_text};
 
 const SAME_SIGNAL: Duration = Duration::from_millis(500);
 
@@ -30,41 +25,6 @@ pub fn start_logging() {
     log.with_target(false)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
-}
-
-/// The text of a settings or model file, which may be a pipe but not endless.
-///
-/// # Errors
-/// If the file cannot be read, is too long, or is not UTF-8.
-pub fn read_text(path: &Path) -> std::io::Result<String> {
-    let mut bytes = Vec::new();
-    let mut file = File::open(path)?.take(MAX_TEXT_BYTES + 1);
-    if file.read_to_end(&mut bytes)? as u64 > MAX_TEXT_BYTES {
-        let problem = format!("expected at most {MAX_TEXT_BYTES} bytes, got more");
-        return Err(std::io::Error::other(problem));
-    }
-    decoded(&bytes).map_err(std::io::Error::other)
-}
-
-/// Text without its byte order mark, which editors on Windows write.
-fn decoded(bytes: &[u8]) -> Result<String, String> {
-    let begins_wide = bytes
-        .iter()
-        .take(4)
-        .any(|byte| [0x00, 0xFE, 0xFF].contains(byte));
-    let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-    match std::str::from_utf8(bytes) {
-        Ok(text) if !begins_wide => Ok(text.into()),
-        Err(error) if !begins_wide => {
-            let line = bytes[..error.valid_up_to()]
-                .split(|byte| *byte == b'\n')
-                .count();
-            Err(format!(
-                "expected text in UTF-8, got other bytes in line {line}: save the file as UTF-8"
-            ))
-        }
-        _ => Err("expected text in UTF-8, got UTF-16 or UTF-32: save the file as UTF-8".into()),
-    }
 }
 
 /// A flag that SIGINT, SIGTERM or SIGHUP sets; another one ends the process at once. `timeout` and shells send a
@@ -87,49 +47,4 @@ pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     };
     spawn("signals", wait).map_err(std::io::Error::other)?;
     Ok(stop)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn text_is_utf_8_with_or_without_a_byte_order_mark() {
-        for bytes in [
-            &b"\xEF\xBB\xBFname = \"\xC3\xA9\""[..],
-            b"name = \"\xC3\xA9\"",
-        ] {
-            assert_eq!(decoded(bytes).as_deref(), Ok("name = \"\u{e9}\""));
-        }
-        assert_eq!(decoded(b""), Ok(String::new()));
-        assert_eq!(decoded(b"\xEF\xBB\xBF"), Ok(String::new()));
-    }
-
-    #[test]
-    fn other_encodings_are_named() {
-        let wide = |text: &str| text.encode_utf16().collect::<Vec<u16>>();
-        let little = |text: &str| {
-            wide(text)
-                .iter()
-                .flat_map(|it| it.to_le_bytes())
-                .collect::<Vec<u8>>()
-        };
-        let big = |text: &str| {
-            wide(text)
-                .iter()
-                .flat_map(|it| it.to_be_bytes())
-                .collect::<Vec<u8>>()
-        };
-        for text in ["a = 1", "\u{feff}a = 1"] {
-            for bytes in [little(text), big(text)] {
-                let error = decoded(&bytes).expect_err("no UTF-8");
-                assert!(
-                    error.contains("expected text in UTF-8, got UTF-16"),
-                    "{error}"
-                );
-            }
-        }
-        let error = decoded(b"# ash\nname = \"\xE9\"").expect_err("Latin-1");
-        assert!(error.contains("got other bytes in line 2: save"), "{error}");
-    }
 }

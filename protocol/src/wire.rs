@@ -1,34 +1,26 @@
-//! The wire: what travels between processes, and how.
+//! The wire: how messages travel between processes.
 //!
-//! [`message`], [`payload`] and [`control`] are the messages; [`channels`] the services that carry them;
-//! [`connection`] and [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
+//! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`; [`connection`] and
+//! [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
 //! [`node`], [`turn`] and [`cleanup`] create and remove channels, [`shared_memory`] gives them memory; [`wait`] is the
-//! bounded wait. [`recording`] keeps samples in a file.
+//! bounded wait.
 
 pub mod agent_belief;
 mod channel_files;
 pub mod channels;
 pub mod cleanup;
 pub mod client;
-mod codes;
 pub mod connection;
-pub mod control;
 mod directory;
-mod error;
 mod exchange;
 pub mod failed_connections;
-mod hello;
-pub mod interrupt;
-mod json;
-pub mod message;
+pub mod feed;
+mod ipc;
 mod node;
 pub mod observer;
 mod own_nodes;
-pub mod payload;
 mod poll;
 pub(crate) mod process;
-pub mod recording;
-pub mod resend;
 mod resources;
 pub mod responder;
 pub mod shared_memory;

@@ -7,12 +7,16 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 11] = [
+const SOURCES: [&str; 15] = [
     "protocol/src",
+    "protocol/messages/src",
+    "protocol/model/src",
     "env-server/src",
+    "env-server/sim/src",
     "agent/src",
     "agent/belief/src",
     "agent/figures/src",
+    "agent/learning/src",
     "agent/network/src",
     "clients/dashboard/src",
     "clients/dashboard/page",
@@ -21,12 +25,16 @@ const SOURCES: [&str; 11] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 9] = [
+const CRATES: [&str; 13] = [
     "protocol",
+    "protocol/messages",
+    "protocol/model",
     "env-server",
+    "env-server/sim",
     "agent",
     "agent/belief",
     "agent/figures",
+    "agent/learning",
     "agent/network",
     "clients/dashboard",
     "clients/python",
@@ -141,8 +149,11 @@ fn every_test_file_is_in_its_program() {
     for name in [
         "agent",
         "agent/belief",
+        "agent/learning",
         "clients/dashboard",
         "protocol",
+        "protocol/messages",
+        "protocol/model",
         "tests",
     ] {
         let folder = root()
@@ -174,7 +185,7 @@ fn the_readme_shows_the_example_of_the_crate() {
 #[test]
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
-    for name in ["agent", "env-server", "protocol"] {
+    for name in ["agent", "agent/learning", "env-server", "env-server/sim"] {
         let place = |module: &[String]| {
             let room = format!("{name}/src/{}", module.first()?);
             rooms.iter().position(|name| *name == room)
@@ -196,7 +207,7 @@ fn no_crate_has_a_circle_of_files() {
         assert_eq!(circle(&graph), Vec::<Vec<String>>::new(), "{name}");
     }
     let n_edges: usize = graph_of("protocol").values().map(BTreeSet::len).sum();
-    assert!(n_edges > 100, "{n_edges}: paths are not read");
+    assert!(n_edges > 80, "{n_edges}: paths are not read");
 }
 
 #[test]

@@ -6,12 +6,14 @@ use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
 use emberwatch_protocol::channels::{
     AGENT_BUFFER, Channel, FRAME_BUFFER, Instance, MAX_AGENT_READERS, MAX_CLIENTS, MAX_NODES,
     MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+    WireHeader, service_name,
 };
 use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
 use emberwatch_protocol::grid::MAX_SIDE;
 use emberwatch_protocol::message::{
     AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, FrameHeader,
-    Operation, RobotResult, Status, StepReply, StepRequest, TruthHeader, VERSION, WorldResult,
+    Header, Operation, RobotResult, Status, StepReply, StepRequest, TruthHeader, VERSION,
+    WorldResult,
 };
 use emberwatch_protocol::path::{MAX_MOVES, path_from_bytes};
 use emberwatch_protocol::payload::split_step_payload;
@@ -50,9 +52,9 @@ macro_rules! layout {
 }
 
 #[expect(unsafe_code, reason = "iceoryx2 marks the name unsafe to override")]
-fn type_name<T: ZeroCopySend>() -> &'static str {
+fn type_name<T: Header>() -> &'static str {
     // SAFETY: reads a constant.
-    unsafe { <T as ZeroCopySend>::type_name() }
+    unsafe { <WireHeader<T> as ZeroCopySend>::type_name() }
 }
 
 /// The type of a field as PROTOCOL.md writes it.
@@ -306,7 +308,7 @@ fn every_service_is_documented() {
         Channel::WakeServer,
         Channel::WakeClient,
     ];
-    let names = known.map(|channel| instance.service_name(channel).to_string());
+    let names = known.map(|channel| service_name(&instance, channel).to_string());
     let known = names.map(|name| name.replace("emberwatch/v2/x/", ""));
     assert_eq!(documented, BTreeSet::from(known));
 }

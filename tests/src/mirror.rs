@@ -9,9 +9,9 @@ use emberwatch_protocol::message::{FrameHeader, RobotResult, Status, WorldResult
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::{path_from_bytes, path_to_bytes};
 use emberwatch_protocol::{Client, Coverage, Move};
-use emberwatch_server::config::ServerConfig;
-use emberwatch_server::snapshot::WorldSpec;
-use emberwatch_server::world::{Episode, Flown, Robot, Rules};
+use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::snapshot::WorldSpec;
+use emberwatch_sim::world::{Episode, Flown, Robot, Rules};
 use std::time::{Duration, Instant};
 
 /// A lease that ends by nothing but what a test does.

@@ -3,7 +3,8 @@
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::channels::{
-    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
+    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, WireHeader, create_node,
+    ipc_error,
 };
 use emberwatch_protocol::control::{LeaseInfo, Reply, Request};
 use emberwatch_protocol::message::{
@@ -25,10 +26,10 @@ pub type StepAnswer = (StepReply, Vec<u8>);
 
 pub type ControlAnswer = (ControlReply, Vec<u8>);
 
-pub type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
+pub type Requests<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// A request that waits for its answer.
-pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+pub type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// Sends raw messages and waits for their answers: what the compliance suite asks of a client.
 pub trait RawClient {
@@ -214,7 +215,7 @@ pub fn answer_by<Q: Header, R: Header, E: Debug>(
 ) -> Option<(R, Vec<u8>)> {
     let poll = || {
         let response = pending.receive().expect("receive an answer");
-        Ok(response.map(|response| (*response.user_header(), response.payload().to_vec())))
+        Ok(response.map(|response| (response.user_header().0, response.payload().to_vec())))
     };
     waiter.wait(limit, poll, block).expect("wait")
 }
@@ -235,6 +236,6 @@ pub fn send<Q: Header, R: Header>(
     payload: &[u8],
 ) -> Result<Pending<Q, R>, RequestSendError> {
     let mut request = client.loan_slice_uninit(payload.len())?;
-    *request.user_header_mut() = header;
+    *request.user_header_mut() = WireHeader(header);
     request.write_from_slice(payload).send()
 }

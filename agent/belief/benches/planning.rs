@@ -9,11 +9,11 @@ use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
-use emberwatch_protocol::frame::Frame;
-use emberwatch_protocol::grid::{Cell, Shape};
-use emberwatch_protocol::model::Model;
-use emberwatch_protocol::path::{Move, fly};
-use emberwatch_protocol::randomness::split_mix;
+use emberwatch_model::Model;
+use emberwatch_model::frame::Frame;
+use emberwatch_model::grid::{Cell, Shape};
+use emberwatch_model::path::{Move, fly};
+use emberwatch_model::randomness::split_mix;
 use std::hint::black_box;
 
 const N_MOVES: usize = 64;

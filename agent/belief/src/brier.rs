@@ -1,7 +1,7 @@
 //! How well a belief fits the hidden states.
 
 use crate::estimation::belief::Belief;
-use emberwatch_protocol::Grid;
+use emberwatch_model::Grid;
 
 /// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
 /// probability of the state that pays most, which the belief numbers `own`. 0 is perfect; the share
@@ -18,7 +18,7 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Shape;
+    use emberwatch_model::Shape;
 
     #[test]
     fn a_brier_score_is_the_mean_squared_miss() {

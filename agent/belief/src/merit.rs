@@ -2,8 +2,8 @@
 //!
 //! They need no model: only which state is the target, and for two of them the hidden states.
 
-use emberwatch_protocol::path::Flight;
-use emberwatch_protocol::{Cell, Grid, Shape};
+use emberwatch_model::path::Flight;
+use emberwatch_model::{Cell, Grid, Shape};
 
 /// Steps for which a cell counts as seen after a visit, unless told otherwise.
 pub const RECENT_STEPS: u32 = 10;
@@ -321,8 +321,7 @@ mod tests {
     fn the_nearest_of_some_cells_is_that_of_a_plain_scan() {
         let shape = Shape::new(5, 7).expect("test shape");
         for seed in 0..500 {
-            let drawn =
-                |index: usize| emberwatch_protocol::randomness::split_mix(seed, index as u64);
+            let drawn = |index: usize| emberwatch_model::randomness::split_mix(seed, index as u64);
             let is_one = |cell: usize| drawn(cell) % (seed + 2) == 0;
             let from = shape.cell(drawn(99) as usize % shape.n_cells());
             let moves = |cell: Cell| from.row.abs_diff(cell.row) + from.col.abs_diff(cell.col);

@@ -15,10 +15,10 @@ mod golden_file;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{Integration, Objective, Target};
-use emberwatch_protocol::frame::Frame;
-use emberwatch_protocol::grid::{Cell, Shape};
-use emberwatch_protocol::model::Model;
-use emberwatch_protocol::path::{Move, fly};
+use emberwatch_model::Model;
+use emberwatch_model::frame::Frame;
+use emberwatch_model::grid::{Cell, Shape};
+use emberwatch_model::path::{Move, fly};
 use golden_file::{Golden, frame_from};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, s};
 

@@ -5,12 +5,12 @@
 
 use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;
+use emberwatch_model::{Frame, Shape};
 use emberwatch_network::variables::build;
 use emberwatch_network::{
     Adam, AdamSettings, Decoder, Device, Dropout, Encoder, Gru, NetworkShape, ObservationMatrix,
     Pass, Window,
 };
-use emberwatch_protocol::{Frame, Shape};
 
 struct TwoGrus {
     encoder: Encoder,

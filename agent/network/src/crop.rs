@@ -1,7 +1,7 @@
 //! Parts of grids, as the network that keeps space takes them.
 
 use crate::unet::ALIGNMENT;
-use emberwatch_protocol::grid::Shape;
+use emberwatch_model::grid::Shape;
 
 /// Cells that a crop has beyond those to predict, on both sides together: what lies further away says little of them.
 const MARGINS: usize = 24;

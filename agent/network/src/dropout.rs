@@ -5,7 +5,7 @@
 
 use crate::shape::{DECODER_CHANNELS, ENCODER_CHANNELS};
 use candle_core::{DType, Device, Result, Tensor};
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::sync::Arc;
 

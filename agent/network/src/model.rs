@@ -101,7 +101,7 @@ impl NetworkShape {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Shape;
+    use emberwatch_model::Shape;
 
     #[test]
     fn numbers_are_counted_before_they_are_made() {

@@ -13,7 +13,7 @@ use crate::unet::UNet;
 use crate::variables::{Variables, build};
 use candle_core::{D, DType, Device, Shape, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
-use emberwatch_protocol::grid::Probabilities;
+use emberwatch_model::grid::Probabilities;
 use std::fmt;
 use std::sync::Arc;
 

@@ -1,8 +1,8 @@
 //! The rolling memory of frames that the network learns from (paper section III.B).
 
 use crate::window::Window;
-use emberwatch_protocol::frame::Frame;
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::frame::Frame;
+use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -97,7 +97,7 @@ impl Replay {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::grid::Shape;
+    use emberwatch_model::grid::Shape;
 
     #[test]
     fn windows_are_consecutive_and_reach_every_frame() {

@@ -7,7 +7,7 @@
 //! - The encoder sees a grid of that padded size, unseen beyond the edge, and no kernel is larger than
 //!   its input.
 
-use emberwatch_protocol::grid::Shape;
+use emberwatch_model::grid::Shape;
 
 /// Channels after each convolution of the encoder.
 pub const ENCODER_CHANNELS: [usize; 3] = [32, 16, 8];

@@ -1,8 +1,8 @@
 //! What was last seen in each cell of a world and when: all that the neural belief is computed from.
 
 use crate::crop::Crop;
-use emberwatch_protocol::frame::{Frame, UNOBSERVED};
-use emberwatch_protocol::grid::Shape;
+use emberwatch_model::frame::{Frame, UNOBSERVED};
+use emberwatch_model::grid::Shape;
 use serde::{Deserialize, Serialize};
 
 /// Bytes of a [`Sighting`] in [`Sightings::to_bytes`].

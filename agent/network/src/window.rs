@@ -2,7 +2,7 @@
 
 use crate::shape::NetworkShape;
 use candle_core::{DType, Device, Result, Tensor};
-use emberwatch_protocol::frame::Frame;
+use emberwatch_model::frame::Frame;
 use std::sync::Arc;
 
 /// One visited cell of a frame.

@@ -2,8 +2,8 @@
 //! else from the frames that the server keeps.
 
 use crate::client::left_belief::{leave_belief, left_belief};
-use crate::rollout::{Rollout, Seen};
 use anyhow::Result;
+use emberwatch_learning::rollout::{Rollout, Seen};
 use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;

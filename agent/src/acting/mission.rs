@@ -2,9 +2,9 @@
 
 use crate::client::errors::refused;
 use crate::client::info::connect;
-use crate::config::AgentConfig;
-use crate::learning::learned::Learned;
 use anyhow::{Result, bail, ensure};
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Claim;

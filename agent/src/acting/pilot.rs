@@ -2,22 +2,23 @@
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
-use crate::acting::registry::{self, Task, needs_model};
 use crate::client::errors::is_late;
-use crate::client::feed::{Feed, View};
 use crate::client::info::{connect, is_belief_left};
 use crate::client::truth::TruthFeed;
-use crate::estimation::first_belief::first_belief;
-use crate::policy::{EstimatorKind, Policy};
-use crate::rollout::agent::Agent;
-use crate::rollout::{Rollout, Seen};
+use crate::client::view::view;
 use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_learning::estimation::first_belief::first_belief;
+use emberwatch_learning::policy::{EstimatorKind, Policy};
+use emberwatch_learning::registry::{self, Task, needs_model};
+use emberwatch_learning::rollout::agent::Agent;
+use emberwatch_learning::rollout::{Rollout, Seen};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{ServerInfo, WorldSeed};
+use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::{Cell, Client, Grid, Model, Move};
 use std::ops::Range;
@@ -152,7 +153,7 @@ impl Pilot {
         let agent = agent(mission, &client, parts, (seed, first))?;
         Ok(Self {
             truth,
-            feed: Feed::open(&mission.instance, agent.belief()),
+            feed: Feed::open(&mission.instance, agent.belief().probabilities()),
             rollout: Rollout::new(agent, seen),
             planning: Duration::ZERO,
             model: model.clone(),
@@ -264,7 +265,7 @@ impl Pilot {
         if self.feed.is_due() || in_any_case {
             let (robots, team) = (self.client.robots(), self.client.info().n_robots);
             let world = robots.start / team;
-            let view = View::of(&self.rollout, world, robots, self.planning);
+            let view = view(&self.rollout, world, robots, self.planning);
             self.feed.show(&view);
         }
     }

@@ -5,18 +5,18 @@
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
 use crate::acting::mission::recorded_states;
-use crate::acting::registry::{self, Task, needs_model};
 use crate::benchmark::team::Team;
 use crate::client::info::connect;
 use crate::client::truth::TruthFeed;
-use crate::config::AgentConfig;
-use crate::learning::learned::Learned;
-use crate::policy::Policy;
-use crate::rollout::Seen;
-use crate::rollout::agent::Agent;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::Policy;
+use emberwatch_learning::registry::{self, Task, needs_model};
+use emberwatch_learning::rollout::Seen;
+use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::control::{CoverageRule, ServerInfo, WorldSeed};

@@ -3,21 +3,22 @@
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
-use crate::client::feed::{Feed, View};
-use crate::config::AgentConfig;
-use crate::estimation::first_belief::first_belief;
-use crate::learning::learned::Learned;
-use crate::policy::{EstimatorKind, Policy};
-use crate::rollout::agent::Agent;
-use crate::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all};
+use crate::client::view::view;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::estimation::first_belief::first_belief;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::{EstimatorKind, Policy};
+use emberwatch_learning::rollout::agent::Agent;
+use emberwatch_learning::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all};
 use emberwatch_protocol::Model;
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::path::Flight;
 use sha2::{Digest, Sha256};
@@ -105,7 +106,7 @@ pub fn compare(
         fire_cells: Vec::new(),
         snapshot: None,
     };
-    let mut feed = Feed::open(arena.instance(), &prior);
+    let mut feed = Feed::open(arena.instance(), prior.probabilities());
     let contestants = comparison.contestants(arena.model());
     let game = |contestant, seeds| Match {
         comparison,
@@ -294,7 +295,7 @@ impl Match<'_> {
         for index in feed.turn(rollouts.len()) {
             let world = first_world + (index / n_agents) as u32;
             let robot = first_world * n_robots + index as u32 * crew;
-            let view = View::of(&rollouts[index], world, robot..robot + crew, times[index]);
+            let view = view(&rollouts[index], world, robot..robot + crew, times[index]);
             feed.show(&view);
         }
     }

@@ -4,15 +4,15 @@
 //! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
 
 use crate::benchmark::arena::Arena;
-use crate::config::AgentConfig;
-use crate::estimation::first_belief::first_belief;
-use crate::learning::learned::Learned;
-use crate::policy::Policy;
-use crate::rollout::agent::Agent;
-use crate::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::scoring::Score;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::estimation::first_belief::first_belief;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::Policy;
+use emberwatch_learning::rollout::agent::Agent;
+use emberwatch_learning::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
 use rayon::prelude::*;
 use std::ops::Range;
 

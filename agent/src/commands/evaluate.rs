@@ -10,11 +10,12 @@ use emberwatch_agent::benchmark::compare::Comparison;
 use emberwatch_agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
 use emberwatch_agent::benchmark::report::{RunsFile, render_table, statistics::Estimate};
 use emberwatch_agent::benchmark::team::Team;
-use emberwatch_agent::config::{AgentConfig, AgentFlags};
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::policy::Policy;
+use emberwatch_agent::flags::AgentFlags;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::Policy;
 use emberwatch_network::DeviceKind;
 use std::path::PathBuf;
 

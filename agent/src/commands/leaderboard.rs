@@ -8,7 +8,7 @@ use emberwatch_agent::benchmark::report::leaderboard::{
 };
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::benchmark::report::suite::TaskRuns;
-use emberwatch_agent::file::{Readers, replace_file};
+use emberwatch_learning::file::{Readers, replace_file};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

@@ -3,9 +3,9 @@
 use super::shared::model_named;
 use anyhow::{Result, ensure};
 use clap::Args;
-use emberwatch_agent::estimation::first_belief::first_belief;
-use emberwatch_agent::file::{Readers, replace_file};
 use emberwatch_belief::estimation::Prior;
+use emberwatch_learning::estimation::first_belief::first_belief;
+use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_protocol::Shape;
 use ndarray_npy::WriteNpyExt;
 use rustix::fs::{Access, access};

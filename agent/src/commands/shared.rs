@@ -4,7 +4,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::report::RunsFile;
 use emberwatch_agent::client::info::wait_for_server;
-use emberwatch_agent::file::check_replaceable;
+use emberwatch_learning::file::check_replaceable;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::task::Task;

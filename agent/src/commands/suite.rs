@@ -11,11 +11,12 @@ use emberwatch_agent::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, rende
 use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile};
 use emberwatch_agent::benchmark::team::Team;
 use emberwatch_agent::client::launch::OwnServer;
-use emberwatch_agent::config::{AgentConfig, AgentFlags};
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::learning::train::CHECKPOINT;
-use emberwatch_agent::policy::Policy;
+use emberwatch_agent::flags::AgentFlags;
+use emberwatch_agent::training::CHECKPOINT;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::Policy;
 use emberwatch_network::Device;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;

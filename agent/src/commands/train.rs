@@ -6,13 +6,14 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_agent::benchmark::report::training::draw_training;
 use emberwatch_agent::client::launch::OwnServer;
-use emberwatch_agent::config::{AgentConfig, AgentFlags, LearnerKind, Preset};
-use emberwatch_agent::learning::checkpoint::Contents;
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::learning::learners::decisions::SavedDecisions;
-use emberwatch_agent::learning::learners::neural::SavedNeural;
-use emberwatch_agent::learning::train::{CHECKPOINT, TrainingSpec, train};
-use emberwatch_agent::policy::EstimatorKind;
+use emberwatch_agent::flags::{AgentFlags, Preset, one_of};
+use emberwatch_agent::training::{CHECKPOINT, TrainingSpec, train};
+use emberwatch_learning::checkpoint::Contents;
+use emberwatch_learning::config::{AgentConfig, LearnerKind};
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::learners::decisions::SavedDecisions;
+use emberwatch_learning::learners::neural::SavedNeural;
+use emberwatch_learning::policy::EstimatorKind;
 use emberwatch_network::{Device, DeviceKind};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
@@ -39,7 +40,7 @@ pub struct TrainCommand {
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
     worlds: Option<u32>,
     /// What to learn [default: filter; of preset paper: autoencoder]
-    #[arg(long)]
+    #[arg(long, value_parser = one_of(&LearnerKind::ALL))]
     learner: Option<LearnerKind>,
     /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of neural and decisions: what
     /// is left of those of the settings]

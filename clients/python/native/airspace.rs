@@ -1,10 +1,10 @@
 //! Where robots may fly and what they see, as Python's `Airspace` says it.
 
 use crate::refusal::invalid;
-use emberwatch_protocol::model::{
+use emberwatch_model::{Airspace, Shape};
+use emberwatch_model::{
     CellMap, DescribedState, Description, ObservationEntry, Pays, RingEntry, SensorEntry,
 };
-use emberwatch_protocol::{Airspace, Shape};
 use numpy::PyReadonlyArray2;
 use pyo3::prelude::*;
 use std::sync::Arc;

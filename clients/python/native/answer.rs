@@ -2,10 +2,11 @@
 
 use crate::refusal::invalid;
 use crate::samples::{Robot, World, of_robot, of_world};
-use emberwatch_protocol::Shape;
-use emberwatch_protocol::connection::worlds_of;
-use emberwatch_protocol::message::{FLAG_TEAM_FRAMES, RobotResult, StepReply, WorldResult};
-use emberwatch_protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
+use emberwatch_messages::message::{
+    FLAG_TEAM_FRAMES, RobotResult, StepReply, WorldResult, worlds_of,
+};
+use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
+use emberwatch_model::Shape;
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
 };

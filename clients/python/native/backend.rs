@@ -2,13 +2,14 @@
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
-use emberwatch_protocol::connection::{Connection, ConnectionError};
-use emberwatch_protocol::control::ServerInfo;
-use emberwatch_protocol::limits::threads::spawn;
-use emberwatch_protocol::message::{StepReply, StepRequest};
-use emberwatch_server::config::{Checked, ServerConfig};
-use emberwatch_server::embedded::{Embedded, wait_for};
-use emberwatch_server::snapshot::Settings;
+use emberwatch_messages::control::ServerInfo;
+use emberwatch_messages::errors::ConnectionError;
+use emberwatch_messages::limits::threads::spawn;
+use emberwatch_messages::message::{StepReply, StepRequest};
+use emberwatch_protocol::connection::Connection;
+use emberwatch_sim::config::{Checked, ServerConfig};
+use emberwatch_sim::embedded::{Embedded, wait_for};
+use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::sync::mpsc::channel;

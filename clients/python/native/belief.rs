@@ -7,10 +7,10 @@ use crate::model::{model_of, shape_of};
 use crate::refusal::{failed, invalid};
 use emberwatch_belief::estimation::bayes::correct_cells;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
-use emberwatch_protocol::limits::memory::with_capacity;
-use emberwatch_protocol::limits::threads::NoThreads;
-use emberwatch_protocol::model::{Model, ModelError};
-use emberwatch_protocol::{Shape, UNOBSERVED, transition};
+use emberwatch_messages::limits::memory::with_capacity;
+use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_model::{Model, ModelError};
+use emberwatch_model::{Shape, UNOBSERVED, transition};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{
     IntoPyArray, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, ToPyArray,
@@ -226,7 +226,7 @@ fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyRes
     let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
     let n_bytes = 2 * n_threads * of_thread;
     check_memory(py, "the worlds of a first belief", n_bytes)?;
-    let pool = emberwatch_server::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = emberwatch_sim::limits::start(ThreadPoolBuilder::new(), n_threads);
     let pool = pool.map_err(|short| no_threads(py, &short))?;
     let simulated = std::thread::scope(|scope| {
         let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));

@@ -1,10 +1,10 @@
 //! From errors of the wire to those of Python, which `emberwatch/errors.py` defines; and Ctrl-C.
 
-use emberwatch_protocol::channels::ChannelError;
-use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::limits::memory::{self, NoMemory};
-use emberwatch_protocol::limits::threads::NoThreads;
-use emberwatch_server::embedded::INSTANCE;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::errors::ConnectionError;
+use emberwatch_messages::limits::memory::{self, NoMemory};
+use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_sim::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
 use pyo3::prelude::*;

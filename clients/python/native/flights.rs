@@ -4,9 +4,9 @@ use crate::airspace::Given;
 use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
-use emberwatch_protocol::model::{Pays, SeenCell};
-use emberwatch_protocol::path::{MAX_MOVES, Move};
-use emberwatch_protocol::{Airspace, Cell, Shape};
+use emberwatch_model::path::{MAX_MOVES, Move};
+use emberwatch_model::{Airspace, Cell, Shape};
+use emberwatch_model::{Pays, SeenCell};
 use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,

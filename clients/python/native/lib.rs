@@ -20,7 +20,7 @@ mod recording;
 mod refusal;
 mod samples;
 
-use emberwatch_protocol::interrupt::interrupt_when;
+use emberwatch_messages::interrupt::interrupt_when;
 use emberwatch_protocol::turn;
 use pyo3::prelude::*;
 use pyo3::types::IntoPyDict;

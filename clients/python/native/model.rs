@@ -1,8 +1,8 @@
 //! Model files: what Python's `Model` and `Description` hold.
 
 use crate::refusal::invalid;
-use emberwatch_protocol::grid::{MAX_SIDE, Shape};
-use emberwatch_protocol::model::{CellMap, Description, Model, ModelFile, Pays, parse_color};
+use emberwatch_model::grid::{MAX_SIDE, Shape};
+use emberwatch_model::{CellMap, Description, Model, ModelFile, Pays, parse_color};
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
 use pyo3::exceptions::PyValueError;

@@ -1,6 +1,6 @@
 //! Moves that a caller hands in: arrays of integers, which become bytes.
 
-use emberwatch_protocol::path::check_moves;
+use emberwatch_model::path::check_moves;
 use numpy::{
     Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray,
     PyUntypedArrayMethods,

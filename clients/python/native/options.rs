@@ -9,24 +9,24 @@ use crate::model::{model_of, shape_of};
 use crate::owned::Owned;
 use crate::refusal::{failed, invalid};
 use anyhow::{Context, Result, ensure};
-use emberwatch_agent::acting::options::{Crew, Planned, Shown};
-use emberwatch_agent::client::feed::{Feed, View};
-use emberwatch_agent::config::{AgentConfig, PriorKind};
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::estimator::EstimatorError;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
+use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::options::{Crew, Planned, Shown};
+use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_messages::instance::Instance;
+use emberwatch_messages::message::{RobotResult, WorldResult};
+use emberwatch_messages::payload::WORLD_BYTES;
+use emberwatch_model::Description;
+use emberwatch_model::path::path_to_bytes;
+use emberwatch_model::{Frame, Model};
 use emberwatch_network::Device;
-use emberwatch_protocol::agent_belief::Intent;
-use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::message::{RobotResult, WorldResult};
-use emberwatch_protocol::model::Description;
-use emberwatch_protocol::path::path_to_bytes;
-use emberwatch_protocol::payload::WORLD_BYTES;
-use emberwatch_protocol::{Frame, Model};
+use emberwatch_protocol::feed::{Feed, View};
 use numpy::ndarray::{Array3, ArrayView1, s};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -343,7 +343,7 @@ impl State {
         let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
             return Vec::new();
         };
-        let belief = || begun.agent().belief();
+        let belief = || begun.agent().belief().probabilities();
         let feed = watched
             .feed
             .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
@@ -364,7 +364,7 @@ impl State {
                 world,
                 robots: world..world + 1,
                 result: &outlook.world,
-                belief: &outlook.belief,
+                belief: outlook.belief.probabilities(),
                 intent: outlook.intent,
             };
             if let Some(feed) = &mut watched.feed {

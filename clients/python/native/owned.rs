@@ -1,7 +1,7 @@
 //! What belongs to the process that made it, and to one thread at a time.
 
 use crate::errors::{error, interrupted, raise_of_channel};
-use emberwatch_protocol::channels::ChannelError;
+use emberwatch_messages::errors::ChannelError;
 use pyo3::prelude::*;
 use std::mem::ManuallyDrop;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};

@@ -3,7 +3,7 @@
 use crate::errors::error;
 use crate::refusal::invalid;
 use crate::samples::{frame, truth};
-use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError};
+use emberwatch_messages::recording::{Event, Reader, Record, RecordingError};
 use pyo3::prelude::*;
 use std::fs::File;
 use std::io::BufReader;

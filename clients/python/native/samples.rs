@@ -1,11 +1,11 @@
 //! What servers and agents publish, as the fields of `Frame`, `Truth` and `Outlook` in `emberwatch/observer.py`.
 
-use emberwatch_protocol::agent_belief::AgentBelief;
-use emberwatch_protocol::message::{
+use emberwatch_messages::agent_belief::AgentBelief;
+use emberwatch_messages::message::{
     AgentHeader, FrameHeader, RobotResult, TruthHeader, VERSION, WorldResult,
 };
-use emberwatch_protocol::observer::Sample;
-use emberwatch_protocol::payload::split_frame_payload;
+use emberwatch_messages::payload::split_frame_payload;
+use emberwatch_messages::sample::Sample;
 use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;

@@ -21,7 +21,7 @@ WILDFIRE = Model.wildfire()
 
 def golden(name: str) -> dict[str, NDArray[np.generic]]:
     """Numbers of the authors' unmodified PyTorch code, where the Rust tests keep them."""
-    folders = *REPOSITORY.glob("*/tests/data"), *REPOSITORY.glob("agent/*/tests/data")
+    folders = *REPOSITORY.glob("protocol/*/tests/data"), *REPOSITORY.glob("agent/*/tests/data")
     (path,) = (folder / f"{name}.npz" for folder in folders if (folder / f"{name}.npz").exists())
     with np.load(path) as file:
         return dict(file)
@@ -81,7 +81,7 @@ def test_phi_is_the_authors_on_states_and_beliefs(size: str) -> None:
 
 
 def test_the_observation_matrix_is_the_authors() -> None:
-    text = (REPOSITORY / "protocol/tests/data/a2_observation.json").read_text()
+    text = (REPOSITORY / "protocol/model/tests/data/a2_observation.json").read_text()
     theirs = json.loads(text)["P_obs_given_state_rows_state"]
     assert_near(WILDFIRE.observation_matrix, theirs, 1e-7)
 
@@ -163,7 +163,7 @@ def test_phi_is_its_formula_for_any_model(model: Model, height: int, width: int,
 
 
 def test_phi_by_own_state_is_that_of_the_rust_filter() -> None:
-    file = json.loads((REPOSITORY / "protocol/tests/data/own_state.json").read_text())
+    file = json.loads((REPOSITORY / "protocol/model/tests/data/own_state.json").read_text())
     got = phi(Model.checked("wildfire-burnout"), np.array(file["belief"]))
     assert_near(got, file["prediction"], 1e-12)
 

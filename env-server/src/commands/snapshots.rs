@@ -6,7 +6,7 @@ use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Claim;
 use emberwatch_protocol::control::{Reply, Request, WorldInfo};
 use emberwatch_protocol::{Client, Connection};
-use emberwatch_server::snapshot::read;
+use emberwatch_sim::snapshot::read;
 use std::path::PathBuf;
 use std::time::Duration;
 

@@ -212,7 +212,7 @@ impl Replay<'_> {
         loop {
             self.ports.connect_observers();
             while let Some(request) = self.ports.receive_step() {
-                let asked = *request.user_header();
+                let asked = request.user_header().0;
                 let reply = StepReply {
                     version: VERSION,
                     status: self.state.refuse_step(asked.version) as u32,
@@ -250,7 +250,7 @@ impl Replay<'_> {
             n_clients: self.ports.n_clients(),
             n_observers: self.ports.observers().0,
         };
-        let version = request.user_header().version;
+        let version = request.user_header().0.version;
         let (reply, next) = self.state.answer(version, request.payload(), &counts);
         let reply = self.ports.with_memory(reply);
         self.send(&request, &reply);

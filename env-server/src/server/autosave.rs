@@ -1,13 +1,13 @@
 //! Snapshots that a server writes regularly, and starts with.
 
 use super::files::Files;
-use crate::config::Checked;
-use crate::snapshot::{
+use emberwatch_protocol::throttle::Throttle;
+use emberwatch_sim::config::Checked;
+use emberwatch_sim::snapshot::{
     Done, Durability, FileError, Folder, Job, SnapshotError, SnapshotWorld, WorldSpec, load,
     refused,
 };
-use crate::world::Episode;
-use emberwatch_protocol::throttle::Throttle;
+use emberwatch_sim::world::Episode;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

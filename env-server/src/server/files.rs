@@ -1,8 +1,8 @@
 //! Snapshot files are written and read on a thread of its own, so that no disk delays a step.
 
 use super::completions::{Completions, completions};
-use crate::snapshot::{Done, FileError, Job, WorldSpec};
 use emberwatch_protocol::limits::threads::spawn;
+use emberwatch_sim::snapshot::{Done, FileError, Job, WorldSpec};
 use std::os::fd::BorrowedFd;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};

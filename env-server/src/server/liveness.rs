@@ -1,11 +1,11 @@
 //! Which processes the clients and observers are, and whether they run; removes the files of dead ones.
 
-use crate::simulator::ClientId;
 use emberwatch_protocol::cleanup::remove_leftovers;
 use emberwatch_protocol::limits::threads::spawn;
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::wait::sleep_until_readable;
+use emberwatch_sim::simulator::ClientId;
 use rustix::io::Errno;
 use std::collections::{HashMap, HashSet};
 use std::os::fd::BorrowedFd;

@@ -1,12 +1,12 @@
 //! What is answered later: requests that wait for resets and files.
 
 use super::state::Server;
-use crate::simulator::PendingFile;
-use crate::snapshot::Job;
-use crate::world::Episode;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::responder::ActiveControl;
+use emberwatch_sim::simulator::PendingFile;
+use emberwatch_sim::snapshot::Job;
+use emberwatch_sim::world::Episode;
 use std::time::Instant;
 
 impl Server {

@@ -4,11 +4,11 @@ use super::descriptors::raise_limit;
 use super::memory::{Memory, PortIds, check_shared_memory};
 use super::port_config::{PortConfig, frame_bytes};
 use super::taken::{Taken, once_free};
-use crate::config::Checked;
 use anyhow::Result;
 use emberwatch_protocol::channels::{
-    Channel, ChannelError, ControlService, Entries, FrameService, Ipc, RequestResponse, Services,
-    StepService, TruthService, create_node, ipc_error, lives_elsewhere,
+    Channel, ChannelError, ControlService, Entries, FrameService, Ipc, Publications,
+    RequestResponse, Services, StepService, TruthService, WireHeader, create_node, ipc_error,
+    lives_elsewhere,
 };
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::failed_connections::FailedConnections;
@@ -24,6 +24,7 @@ use emberwatch_protocol::shared_memory::fill_ports;
 use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::turn::Turn;
 use emberwatch_protocol::wait::{descriptor, drain};
+use emberwatch_sim::config::Checked;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -32,7 +33,6 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
-use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use std::cell::RefCell;
 use std::collections::HashSet;
@@ -46,8 +46,8 @@ pub type ActiveStep = Active<StepRequest, StepReply>;
 pub struct Ports {
     step: StepServer,
     control: ControlServer,
-    frames: Publisher<Ipc, [u8], FrameHeader>,
-    truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
+    frames: Publisher<Ipc, [u8], WireHeader<FrameHeader>>,
+    truth: Option<Publisher<Ipc, [u8], WireHeader<TruthHeader>>>,
     listener: Listener<Ipc>,
     answers: Answers,
     memory: Memory,
@@ -290,7 +290,7 @@ impl Ports {
     }
 }
 
-type StepServer = Server<Ipc, [u8], StepRequest, [u8], StepReply>;
+type StepServer = Server<Ipc, [u8], WireHeader<StepRequest>, [u8], WireHeader<StepReply>>;
 
 fn step_server(
     service: &StepService,
@@ -307,10 +307,10 @@ fn step_server(
 }
 
 fn publisher<H: Header>(
-    service: &publish_subscribe::PortFactory<Ipc, [u8], H>,
+    service: &Publications<H>,
     sample_bytes: usize,
     failed: &FailedConnections,
-) -> Result<Publisher<Ipc, [u8], H>, ChannelError> {
+) -> Result<Publisher<Ipc, [u8], WireHeader<H>>, ChannelError> {
     service
         .publisher_builder()
         .initial_max_slice_len(sample_bytes)
@@ -321,14 +321,14 @@ fn publisher<H: Header>(
 }
 
 fn publish<H: Header>(
-    publisher: &Publisher<Ipc, [u8], H>,
+    publisher: &Publisher<Ipc, [u8], WireHeader<H>>,
     header: H,
     bytes: &[u8],
 ) -> Result<usize, String> {
     let mut sample = publisher
         .loan_slice_uninit(bytes.len())
         .map_err(|error| format!("{error:?}"))?;
-    *sample.user_header_mut() = header;
+    *sample.user_header_mut() = WireHeader(header);
     let sent = sample.write_from_slice(bytes).send();
     sent.map_err(|error| format!("{error:?}"))
 }

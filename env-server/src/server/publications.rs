@@ -1,10 +1,10 @@
 //! What observers get: every world after its step, and all worlds when they connect.
 
 use super::ports::Ports;
-use crate::simulator::Simulator;
-use crate::world::Episode;
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use emberwatch_protocol::message::{FrameHeader, TruthHeader, VERSION};
+use emberwatch_sim::simulator::Simulator;
+use emberwatch_sim::world::Episode;
 use std::ops::Range;
 
 /// What has been published, and to whom.

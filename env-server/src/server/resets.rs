@@ -2,9 +2,9 @@
 //! step.
 
 use super::completions::{CompletionSender, Completions, completions};
-use crate::simulator::ResetJob;
-use crate::world::{Episode, Rules};
 use emberwatch_protocol::channels::ChannelError;
+use emberwatch_sim::simulator::ResetJob;
+use emberwatch_sim::world::{Episode, Rules};
 use rayon::ThreadPool;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;

@@ -2,8 +2,6 @@
 
 use super::ports::ActiveStep;
 use super::state::Server;
-use crate::config::Checked;
-use crate::simulator::{Outcome, ServerStats, Stepped};
 use anyhow::Result;
 use emberwatch_protocol::channels::ipc_error;
 use emberwatch_protocol::control::Reply;
@@ -11,6 +9,8 @@ use emberwatch_protocol::message::{Operation, StepReply};
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::responder::{ActiveControl, listener_id, wait_until_taken};
 use emberwatch_protocol::wait::sleep_until_event;
+use emberwatch_sim::config::Checked;
+use emberwatch_sim::simulator::{Outcome, ServerStats, Stepped};
 use iceoryx2::prelude::PayloadHeader;
 use std::cell::Cell;
 use std::os::fd::BorrowedFd;
@@ -121,7 +121,7 @@ impl Server {
 
     fn answer_step(&mut self, now: Instant, request: ActiveStep) {
         let client = self.clients.identify(request.header().node_id().value());
-        let (header, body) = (*request.user_header(), request.payload());
+        let (header, body) = (request.user_header().0, request.payload());
         match self
             .simulator
             .step(now, client, &header, body, &mut self.payload)
@@ -161,7 +161,7 @@ impl Server {
     /// Sends the answer that is in `payload`.
     fn send_step(&mut self, now: Instant, request: &ActiveStep, mut reply: StepReply) {
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
-        let header = request.user_header();
+        let header = request.user_header().0;
         let listener = listener_id(header.listener_low, header.listener_high);
         self.ports
             .answers()
@@ -178,7 +178,7 @@ impl Server {
             n_clients: self.ports.n_clients(),
             n_observers: self.ports.observers().0,
         };
-        let version = request.user_header().version;
+        let version = request.user_header().0.version;
         match self
             .simulator
             .control(now, client, version, request.payload(), &stats)

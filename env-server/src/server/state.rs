@@ -6,10 +6,6 @@ use super::liveness::Clients;
 use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
-use crate::config::Checked;
-use crate::limits::{check_memory, n_threads, start};
-use crate::simulator::{PendingFile, PendingReply, ResetJob, Simulator, Ticket};
-use crate::world::Reach;
 use anyhow::Result;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
@@ -17,6 +13,11 @@ use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::responder::ActiveControl;
 use emberwatch_protocol::throttle::Throttle;
 use emberwatch_protocol::wait::Waiter;
+use emberwatch_sim::config::Checked;
+use emberwatch_sim::limits::{check_memory, n_threads, start};
+use emberwatch_sim::rate::Rate;
+use emberwatch_sim::simulator::{PendingFile, PendingReply, ResetJob, Simulator, Ticket};
+use emberwatch_sim::world::Reach;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -28,9 +29,6 @@ use std::time::{Duration, Instant};
 
 /// How long a server that ends waits for its files.
 const LAST_FILES: Duration = Duration::from_secs(10);
-
-/// Over how long the step rate is measured.
-const RATE_WINDOW: Duration = Duration::from_secs(1);
 
 pub(super) struct Server {
     pub(super) simulator: Simulator,
@@ -55,13 +53,6 @@ pub(super) struct Server {
     pub(super) last_tick: Instant,
     pub(super) n_rounds: u64,
     pub(super) is_over: bool,
-}
-
-/// World steps a second over the last window.
-pub struct Rate {
-    since: Instant,
-    n_steps: u64,
-    pub per_second: f64,
 }
 
 impl Server {
@@ -160,28 +151,6 @@ impl Server {
         match failed.last() {
             Some(error) if self.autosave.is_some() => Err(error.into()),
             _ => Ok(()),
-        }
-    }
-}
-
-impl Rate {
-    pub fn since(now: Instant) -> Self {
-        Self {
-            since: now,
-            n_steps: 0,
-            per_second: 0.0,
-        }
-    }
-
-    pub fn update(&mut self, now: Instant, n_steps: u64) {
-        let elapsed = now - self.since;
-        if elapsed >= RATE_WINDOW {
-            let per_second = (n_steps - self.n_steps) as f64 / elapsed.as_secs_f64();
-            *self = Self {
-                since: now,
-                n_steps,
-                per_second,
-            };
         }
     }
 }

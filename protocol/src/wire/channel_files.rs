@@ -5,10 +5,10 @@
 //! began it, and when.
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
-use super::error::Ipc;
-use super::message::VERSION;
+use super::ipc::Ipc;
 use super::own_nodes;
 use super::process::{if_there, node_pid, process_state};
+use emberwatch_messages::message::VERSION;
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use rustix::process::{Flock, FlockType, Pid, fcntl_getlk};

@@ -4,7 +4,7 @@
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
 
 use super::channel_files::other_version;
-use super::message::{
+use emberwatch_messages::message::{
     AgentHeader, ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest,
     TruthHeader,
 };
@@ -19,21 +19,14 @@ use std::sync::{Mutex, PoisonError};
 
 pub use super::channel_files::lives_elsewhere;
 pub use super::directory::{Entries, SHARED_MEMORY, channel_directory, node_config};
-pub use super::error::{ChannelError, Ipc};
+pub use super::ipc::{Ipc, WireHeader};
 pub use super::node::create_node;
 pub use super::resources::{call_error, check_room, ipc_error, limited_error};
-
-/// Most clients at a time on each of `step` and `control`.
-pub const MAX_CLIENTS: usize = 16;
-
-/// Most robots of a world.
-pub const MAX_ROBOTS: usize = 64;
-
-/// Most robots of a server, over all its worlds.
-pub const MAX_ROBOT_NUMBERS: usize = 4096;
-
-/// Most cells of the frames of one world's robots together.
-pub const MAX_TEAM_CELLS: usize = 1 << 24;
+pub use emberwatch_messages::capacity::{
+    MAX_CLIENTS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
+};
+pub use emberwatch_messages::errors::ChannelError;
+pub use emberwatch_messages::instance::Instance;
 
 /// Most observers of `frames` at a time.
 pub const MAX_OBSERVERS: usize = 16;
@@ -57,7 +50,8 @@ pub const AGENT_BUFFER: usize = 4;
 pub const MAX_NODES: usize = 64;
 
 /// A request-response service of bytes behind headers `Q` and `R`.
-pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8], R>;
+pub type RequestResponse<Q, R> =
+    request_response::PortFactory<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// The `step` service.
 pub type StepService = RequestResponse<StepRequest, StepReply>;
@@ -65,21 +59,20 @@ pub type StepService = RequestResponse<StepRequest, StepReply>;
 /// The `control` service.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
+/// A publish-subscribe service of bytes behind header `H`.
+pub type Publications<H> = publish_subscribe::PortFactory<Ipc, [u8], WireHeader<H>>;
+
 /// The `frames` service.
-pub type FrameService = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
+pub type FrameService = Publications<FrameHeader>;
 
 /// The `truth` service.
-pub type TruthService = publish_subscribe::PortFactory<Ipc, [u8], TruthHeader>;
+pub type TruthService = Publications<TruthHeader>;
 
 /// The `agent` service.
-pub type AgentService = publish_subscribe::PortFactory<Ipc, [u8], AgentHeader>;
+pub type AgentService = Publications<AgentHeader>;
 
 /// A wake service.
 pub type WakeService = event::PortFactory<Ipc>;
-
-/// The name of one running server.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Instance(String);
 
 /// A channel of an instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -100,54 +93,6 @@ pub enum Channel {
     WakeClient,
 }
 
-impl Instance {
-    /// Checks a name.
-    ///
-    /// # Errors
-    /// If it is not 1 to 64 letters, digits, `-` or `_`.
-    pub fn new(name: &str) -> Result<Self, ChannelError> {
-        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-        if (1..=64).contains(&name.len()) && name.chars().all(allowed) {
-            Ok(Self(name.into()))
-        } else {
-            Err(ChannelError::InstanceName(name.into()))
-        }
-    }
-
-    /// As users write it.
-    pub fn name(&self) -> &str {
-        &self.0
-    }
-
-    /// The service name of a channel.
-    pub fn service_name(&self, channel: Channel) -> ServiceName {
-        let name = format!("emberwatch/v2/{}/{}", self.0, channel.name());
-        ServiceName::new(&name).expect("invariant: instance names are short and plain")
-    }
-
-    /// The error for an instance without a server.
-    pub(crate) fn no_server(&self) -> ChannelError {
-        ChannelError::NoServer {
-            instance: self.0.clone(),
-        }
-    }
-
-    /// The error for an instance whose server is in another PID namespace.
-    pub(crate) fn elsewhere(&self) -> ChannelError {
-        ChannelError::OtherPidNamespace {
-            instance: self.0.clone(),
-        }
-    }
-
-    /// The error for a channel that does not exist in this version of the protocol.
-    fn none_of(&self, channel: Channel) -> ChannelError {
-        match other_version(&self.0, channel.name()) {
-            Some(version) => ChannelError::OtherVersion { version },
-            None => self.no_server(),
-        }
-    }
-}
-
 impl Channel {
     fn name(self) -> &'static str {
         match self {
@@ -159,6 +104,20 @@ impl Channel {
             Self::WakeServer => "wake-server",
             Self::WakeClient => "wake-client",
         }
+    }
+}
+
+/// The service name of a channel.
+pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
+    let name = format!("emberwatch/v2/{}/{}", instance.name(), channel.name());
+    ServiceName::new(&name).expect("invariant: instance names are short and plain")
+}
+
+/// The error for a channel that does not exist in this version of the protocol.
+fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
+    match other_version(instance.name(), channel.name()) {
+        Some(version) => ChannelError::OtherVersion { version },
+        None => instance.no_server(),
     }
 }
 
@@ -237,7 +196,7 @@ impl Services<'_> {
     pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
         let builder = self
             .node
-            .service_builder(&self.instance.service_name(channel))
+            .service_builder(&service_name(self.instance, channel))
             .event();
         let builder = builder
             .max_listeners(MAX_NODES)
@@ -269,11 +228,12 @@ impl Services<'_> {
         n_publishers: usize,
         n_readers: usize,
         buffer: usize,
-    ) -> Result<publish_subscribe::PortFactory<Ipc, [u8], H>, PublishSubscribeOpenOrCreateError>
-    {
-        let name = self.instance.service_name(channel);
+    ) -> Result<Publications<H>, PublishSubscribeOpenOrCreateError> {
+        let name = service_name(self.instance, channel);
         let builder = self.node.service_builder(&name);
-        let builder = builder.publish_subscribe::<[u8]>().user_header::<H>();
+        let builder = builder
+            .publish_subscribe::<[u8]>()
+            .user_header::<WireHeader<H>>();
         let builder = builder
             .max_publishers(n_publishers)
             .max_subscribers(n_readers)
@@ -314,7 +274,7 @@ impl Services<'_> {
             .builder::<Q, R>(channel)
             .open()
             .map_err(|error| match error {
-                RequestResponseOpenError::DoesNotExist => self.instance.none_of(channel),
+                RequestResponseOpenError::DoesNotExist => none_of(self.instance, channel),
                 other => ipc_error("open a request channel")(other),
             })?;
         if service.dynamic_config().number_of_servers() > 0 {
@@ -327,14 +287,14 @@ impl Services<'_> {
     fn builder<Q: Header, R: Header>(
         &self,
         channel: Channel,
-    ) -> request_response_builder::Builder<[u8], Q, [u8], R, Ipc> {
+    ) -> request_response_builder::Builder<[u8], WireHeader<Q>, [u8], WireHeader<R>, Ipc> {
         let builder = self
             .node
-            .service_builder(&self.instance.service_name(channel));
+            .service_builder(&service_name(self.instance, channel));
         let builder = builder.request_response::<[u8], [u8]>();
         builder
-            .request_user_header::<Q>()
-            .response_user_header::<R>()
+            .request_user_header::<WireHeader<Q>>()
+            .response_user_header::<WireHeader<R>>()
     }
 }
 
@@ -346,19 +306,4 @@ pub(crate) fn server_node<Q: Header, R: Header>(service: &RequestResponse<Q, R>)
         CallbackProgression::Stop
     });
     node
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn instance_names_are_plain() {
-        for good in ["default", "a-b_3", &"x".repeat(64)] {
-            assert_eq!(Instance::new(good).expect("good name").name(), good);
-        }
-        for bad in ["", "a b", "../x", "é", &"x".repeat(65)] {
-            assert!(Instance::new(bad).is_err(), "{bad:?}");
-        }
-    }
 }

@@ -10,9 +10,9 @@ use super::channel_files::{
 use super::directory::{
     SHARED_MEMORY, channel_directory, directory_error, node_config, not_usable,
 };
-use super::error::ChannelError;
-use super::interrupt::check_interrupt;
 use super::turn::Turn;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::interrupt::check_interrupt;
 use iceoryx2::node::NodeView;
 use iceoryx2::prelude::Config;
 use std::collections::HashSet;
@@ -156,7 +156,7 @@ fn remove_if(
 mod tests {
     use super::*;
     use crate::wire::channel_files::since_boot;
-    use crate::wire::error::Ipc;
+    use crate::wire::ipc::Ipc;
     use iceoryx2::node::NodeBuilder;
     use iceoryx2::prelude::{FileName, Path as IpcPath, SemanticString};
     use std::fs::{Permissions, create_dir, remove_dir_all, set_permissions};

@@ -1,16 +1,18 @@
 //! A connection with a lease: acquire robots, fly paths, receive frames.
 
+pub use emberwatch_messages::observation::Observation;
+
 use super::connection::{Connection, ConnectionError, StepAnswer, unexpected, worlds_of};
-use super::control::{Reply, Request, ServerInfo, WorldInfo, WorldSeed};
-use super::exchange::garbled;
-use super::message::{
-    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepRequest, WorldResult,
+use emberwatch_messages::control::{Reply, Request, ServerInfo, WorldInfo, WorldSeed};
+use emberwatch_messages::errors::garbled;
+use emberwatch_messages::message::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepRequest,
 };
-use super::payload::write_step_body;
-use super::resend::{Flown, until_moved};
-use crate::model::frame::Frame;
-use crate::model::grid::Shape;
-use crate::model::path::{Move, path_to_bytes};
+use emberwatch_messages::payload::write_step_body;
+use emberwatch_messages::resend::{Flown, until_moved};
+use emberwatch_model::frame::Frame;
+use emberwatch_model::grid::Shape;
+use emberwatch_model::path::{Move, path_to_bytes};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -19,17 +21,6 @@ pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// How long anything else may take; resets simulate the burn-in of all their worlds, on a busy machine for minutes.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(600);
-
-/// What a robot's world shows after a step, or when the robot is acquired.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Observation {
-    /// The world at its step k.
-    pub world: WorldResult,
-    /// The robot: where it is, and what the step gave it.
-    pub robot: RobotResult,
-    /// What the robot saw, or all robots of its world where a client asks for that; shape `[H, W]`.
-    pub frame: Frame,
-}
 
 /// A connection with a lease on consecutive robots, numbered through: robot r of world w is `w * R + r`.
 ///

@@ -2,23 +2,22 @@
 //!
 //! Nothing returned points into shared memory.
 
-use super::channels::{Entries, Instance, Ipc, Services, StepService, create_node, limited_error};
-use super::control::{Reply, Request, ServerInfo};
-use super::exchange::{check_answer, copied, garbled};
-use super::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
+use super::channels::{Entries, Instance, Services, StepService, create_node, limited_error};
+use super::exchange::{RequestClient, copied};
 use super::node::Opened;
-use super::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
 use super::resources::{CLIENT_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::texts::TextPort;
 use super::turn::Turn;
-use iceoryx2::port::client::Client;
-use std::fmt::Debug;
-use std::ops::Range;
+use emberwatch_messages::control::{Reply, Request, ServerInfo};
+use emberwatch_messages::errors::{check_answer, garbled};
+use emberwatch_messages::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
+use emberwatch_messages::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-pub use super::exchange::{ConnectionError, check_status};
+pub use emberwatch_messages::errors::{ConnectionError, check_status, unexpected};
+pub use emberwatch_messages::message::worlds_of;
 
 /// The answer to a step: results and frames of consecutive robots, and results of their worlds.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,7 +39,7 @@ pub struct Connection {
     sequence: u64,
 }
 
-type StepClient = Client<Ipc, [u8], StepRequest, [u8], StepReply>;
+type StepClient = RequestClient<StepRequest, StepReply>;
 
 struct Ports {
     step: Option<StepClient>,
@@ -241,15 +240,4 @@ fn parts<'a>(reply: &StepReply, payload: &'a [u8]) -> Result<StepParts<'a>, Conn
 
 fn parse(what: &'static str, text: &[u8]) -> Result<Reply, ConnectionError> {
     serde_json::from_slice(text).map_err(|error| garbled(what, error))
-}
-
-/// The worlds of consecutive robots, with `team` robots in each world.
-pub fn worlds_of(first_robot: u32, n_robots: u32, team: u32) -> Range<u32> {
-    let (team, end) = (team.max(1), first_robot.saturating_add(n_robots));
-    first_robot / team..end.div_ceil(team)
-}
-
-/// The error for a reply that answers another question.
-pub fn unexpected(what: &'static str, reply: &impl Debug) -> ConnectionError {
-    garbled(what, format!("got the reply to something else: {reply:?}"))
 }

@@ -1,7 +1,8 @@
 //! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
 
-use super::error::{ChannelError, Ipc};
+use super::ipc::Ipc;
 use super::resources::{CLIENT_DESCRIPTORS, REMEDY, ipc_error, no_descriptors};
+use emberwatch_messages::errors::ChannelError;
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 use rustix::io::Errno;

@@ -2,20 +2,23 @@
 //!
 //! A wait ends at once when the server answers or dies: a pidfd of the server is in the poll set.
 
-use super::channels::{ChannelError, Instance, Ipc, ipc_error};
+use super::channels::ipc_error;
 use super::cleanup::remove_leftovers;
-use super::interrupt::check_interrupt;
-use super::message::{Header, Status, VERSION};
+use super::ipc::Ipc;
+use super::ipc::WireHeader;
 use super::process::WatchedProcess;
 use super::wait::{Waiter, descriptor, drain, sleep_until_readable};
-use crate::limits::memory::{NoMemory, with_capacity};
+use emberwatch_messages::errors::{ChannelError, ConnectionError};
+use emberwatch_messages::instance::Instance;
+use emberwatch_messages::interrupt::check_interrupt;
+use emberwatch_messages::limits::memory::{NoMemory, with_capacity};
+use emberwatch_messages::message::Header;
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Longest sleep between two looks at the answer: bounds what a lost wake-up can cost.
 const LONGEST_SLEEP: Duration = Duration::from_millis(50);
@@ -23,51 +26,8 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(50);
 /// How long the answering side may take to release a request that was given up.
 const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// Why a request got no good answer.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ConnectionError {
-    /// The channel could not be used.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-    /// There is too little memory for the answer, which has come.
-    #[error(transparent)]
-    Memory(#[from] NoMemory),
-    /// The server ended while, or before, it was asked.
-    #[error("the server on instance {instance:?} is gone")]
-    ServerGone {
-        /// Name of the instance.
-        instance: String,
-    },
-    /// No answer in time. A step may have been made nevertheless: observe before the next one.
-    #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
-    Timeout {
-        /// Kind of the request.
-        what: &'static str,
-        /// Name of the instance.
-        instance: String,
-        /// How long the client waited.
-        timeout: Duration,
-    },
-    /// The server refused, and changed nothing.
-    #[error("{message}")]
-    Refused {
-        /// Reason for programs.
-        status: Status,
-        /// See [`Status`].
-        detail: u64,
-        /// Reason for people.
-        message: String,
-    },
-    /// The answer makes no sense: client and server are not of one release.
-    #[error("answer to {what}: {problem}")]
-    Garbled {
-        /// Kind of the request.
-        what: &'static str,
-        /// What is wrong with the answer.
-        problem: String,
-    },
-}
+/// A port that sends requests.
+pub(super) type RequestClient<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// What a request and its answer need: both ends of waking, and the server's process.
 pub(super) struct Exchange {
@@ -88,7 +48,7 @@ impl Exchange {
     /// Sends one request and waits for its answer, which `read` copies out of shared memory.
     pub(super) fn request<Q: Header, R: Header, T>(
         &self,
-        client: &Client<Ipc, [u8], Q, [u8], R>,
+        client: &RequestClient<Q, R>,
         header: Q,
         payload: &[u8],
         what: &'static str,
@@ -120,7 +80,7 @@ impl Exchange {
     ) -> Result<Option<T>, ConnectionError> {
         let has_ended = std::cell::Cell::new(false);
         let poll = || match pending.receive().map_err(ipc_error("receive an answer"))? {
-            Some(response) => Ok(Some(read(response.user_header(), response.payload()))),
+            Some(response) => Ok(Some(read(&response.user_header().0, response.payload()))),
             None if has_ended.get() => Err(self.server_gone()),
             None => Ok(None),
         };
@@ -154,11 +114,11 @@ impl Exchange {
 }
 
 /// A request that waits for its answer.
-type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// Sends a request, once the one before is released.
 fn send<Q: Header, R: Header>(
-    client: &Client<Ipc, [u8], Q, [u8], R>,
+    client: &RequestClient<Q, R>,
     header: Q,
     payload: &[u8],
 ) -> Result<Pending<Q, R>, ChannelError> {
@@ -166,7 +126,7 @@ fn send<Q: Header, R: Header>(
     loop {
         let request = client.loan_slice_uninit(payload.len());
         let mut request = request.map_err(ipc_error("send a request"))?;
-        *request.user_header_mut() = header;
+        *request.user_header_mut() = WireHeader(header);
         match request.write_from_slice(payload).send() {
             Err(RequestSendError::ExceedsMaxActiveRequests)
                 if start.elapsed() < RELEASE_TIMEOUT =>
@@ -178,64 +138,9 @@ fn send<Q: Header, R: Header>(
     }
 }
 
-/// Checks that the status of an answer to `what` is `Ok`; `message` is that of the refusal, if it has one.
-///
-/// # Errors
-/// [`ConnectionError::Refused`], or [`ConnectionError::Garbled`] for a status that is unknown.
-pub fn check_status(
-    what: &'static str,
-    code: u32,
-    detail: u64,
-    message: Option<String>,
-) -> Result<(), ConnectionError> {
-    match Status::try_from(code) {
-        Ok(Status::Ok) => Ok(()),
-        Ok(status) => {
-            let message = match status {
-                // Names the flag of the commands that connect this way; not all of them have it.
-                Status::Busy => format!(
-                    "busy: held by pid {detail}; wait for its release, or take over with the flag \
-                     --takeover of `emberwatch-agent run`"
-                ),
-                _ => message.unwrap_or_else(|| status.explain(detail)),
-            };
-            Err(ConnectionError::Refused {
-                status,
-                detail,
-                message,
-            })
-        }
-        Err(unknown) => Err(garbled(what, unknown)),
-    }
-}
-
-/// Checks that an answer is of our version and to our request: `(got, expected)` sequence numbers.
-pub(super) fn check_answer(
-    what: &'static str,
-    version: u32,
-    (got, expected): (u64, u64),
-) -> Result<(), ConnectionError> {
-    let problem = if version != VERSION {
-        format!("expected version {VERSION}, got {version}")
-    } else if got != expected {
-        format!("expected sequence number {expected}, got {got}")
-    } else {
-        return Ok(());
-    };
-    Err(garbled(what, problem))
-}
-
 /// A copy of an answer's payload.
 pub(super) fn copied(what: &str, payload: &[u8]) -> Result<Vec<u8>, NoMemory> {
     let mut copy = with_capacity(format_args!("the answer to {what}"), payload.len())?;
     copy.extend_from_slice(payload);
     Ok(copy)
-}
-
-/// The error of an answer that makes no sense.
-pub(super) fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
-    ConnectionError::Garbled {
-        what,
-        problem: problem.to_string(),
-    }
 }

@@ -2,10 +2,11 @@
 
 use super::cleanup::make_way;
 use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, not_usable, prefix};
-use super::error::{ChannelError, Ipc};
+use super::ipc::Ipc;
 use super::own_nodes;
 use super::resources::{check_room_for_ports, ipc_error};
 use super::turn::Turn;
+use emberwatch_messages::errors::ChannelError;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::SignalHandlingMode;
 use std::fs::Permissions;

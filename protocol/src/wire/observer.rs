@@ -1,19 +1,19 @@
 //! An observer's side of `frames`, `truth` and `agent`: it reads, never acts, and never slows the server.
 
 use super::channels::{
-    AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Services,
-    TRUTH_BUFFER, create_node, ipc_error, limited_error,
+    AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Publications,
+    Services, TRUTH_BUFFER, WireHeader, create_node, ipc_error, limited_error,
 };
-use super::interrupt::check_interrupt;
-use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use super::node::Opened;
 use super::resources::{OBSERVER_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::turn::Turn;
+use emberwatch_messages::interrupt::check_interrupt;
+use emberwatch_messages::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+pub use emberwatch_messages::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::PayloadHeader;
-use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::cell::Cell;
 use std::time::{Duration, Instant};
 
@@ -28,16 +28,7 @@ const IDLE_INTERVAL: Duration = Duration::from_millis(4);
 /// How long an observer stays busy after it began, and after it found a quarter of its buffer full.
 const BUSY: Duration = Duration::from_secs(1);
 
-/// A sample copied out of shared memory.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Sample<H> {
-    /// The binary header.
-    pub header: H,
-    /// The bytes behind it.
-    pub payload: Vec<u8>,
-}
-
-type Ports<H> = (Subscriber<Ipc, [u8], H>, Node<Ipc>);
+type Ports<H> = (Subscriber<Ipc, [u8], WireHeader<H>>, Node<Ipc>);
 
 /// Reads one channel of an instance, whether a server runs or not.
 pub struct Observer<H: Header> {
@@ -99,7 +90,7 @@ impl Observer<AgentHeader> {
 impl<H: Header> Observer<H> {
     fn new(
         instance: &Instance,
-        service: impl FnOnce(&Services<'_>) -> Result<PortFactory<Ipc, [u8], H>, ChannelError>,
+        service: impl FnOnce(&Services<'_>) -> Result<Publications<H>, ChannelError>,
         buffer: usize,
         most: &'static str,
         is_of_server: bool,
@@ -175,7 +166,7 @@ impl<H: Header> Observer<H> {
             let pid = sample.header().node_id().pid::<Ipc>();
             self.publisher.set(pid.ok().map(|id| id.value() as u32));
             Sample {
-                header: *sample.user_header(),
+                header: sample.user_header().0,
                 payload: sample.payload().to_vec(),
             }
         }))

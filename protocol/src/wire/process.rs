@@ -1,8 +1,8 @@
 //! Other processes: whether they run, and a descriptor that tells when they end.
 
-use super::error::ChannelError;
 use super::poll::is_readable;
 use super::resources::call_error;
+use emberwatch_messages::errors::ChannelError;
 use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, getpid, pidfd_open};
 use std::io::{Error, ErrorKind};
@@ -79,13 +79,6 @@ impl WatchedProcess {
 /// The error of a process that cannot be watched, though it may run.
 pub(super) fn watch_error(errno: Errno) -> ChannelError {
     call_error("pidfd_open", errno)
-}
-
-/// The PID namespace of this process, by its number; `None` if the system does not say.
-pub fn pid_namespace() -> Option<u64> {
-    let link = std::fs::read_link("/proc/self/ns/pid").ok()?; // "pid:[4026531836]"
-    let number = link.to_str()?.strip_prefix("pid:[")?.strip_suffix(']')?;
-    number.parse().ok()
 }
 
 /// The process that an iceoryx2 id of a node or a port names, by its number in that process's PID namespace.

@@ -1,8 +1,8 @@
 //! What ports take of the system: shared memory, files, descriptors. Who makes ports asks first, and if iceoryx2 fails
 //! all the same, the error names what is missing.
 
-use super::error::ChannelError;
-use crate::limits::memory::in_words;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::limits::memory::in_words;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::statvfs;
 use rustix::io::Errno;

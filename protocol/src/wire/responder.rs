@@ -3,12 +3,13 @@
 //! The server uses [`Answers`] on each of its channels.
 
 use super::channels::{
-    Channel, ChannelError, ControlService, Ipc, RequestResponse, Services, ipc_error, server_node,
+    Channel, ChannelError, ControlService, Ipc, RequestResponse, Services, WireHeader, ipc_error,
+    server_node,
 };
-use super::control::Reply;
 use super::failed_connections::FailedConnections;
-use super::message::{ControlReply, ControlRequest, Header, Status, VERSION};
 use super::resources::check_room_for_ports;
+use emberwatch_messages::control::Reply;
+use emberwatch_messages::message::{ControlReply, ControlRequest, Header, Status, VERSION};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::ReceiveError;
 use iceoryx2::port::notifier::{ListenerKey, Notifier};
@@ -29,13 +30,14 @@ const MAX_KNOWN_LISTENERS: usize = 1024;
 const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request that waits for its answer.
-pub type Active<Q, R> = ActiveRequest<Ipc, [u8], Q, [u8], R>;
+pub type Active<Q, R> = ActiveRequest<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// A request in JSON that waits for its answer.
 pub type ActiveControl = Active<ControlRequest, ControlReply>;
 
 /// The answering port of a service of JSON messages.
-pub type ControlServer = Server<Ipc, [u8], ControlRequest, [u8], ControlReply>;
+pub type ControlServer =
+    Server<Ipc, [u8], WireHeader<ControlRequest>, [u8], WireHeader<ControlReply>>;
 
 /// Sends answers and wakes the clients that wait for them.
 #[derive(Debug)]
@@ -71,7 +73,7 @@ impl Answers {
             .loan_slice_uninit(payload.len())
             .map_err(|error| format!("{error:?}"))
             .and_then(|mut response| {
-                *response.user_header_mut() = header;
+                *response.user_header_mut() = WireHeader(header);
                 response
                     .write_from_slice(payload)
                     .send()
@@ -94,7 +96,7 @@ impl Answers {
             status = Status::NoMemory;
             text = serde_json::to_vec(&refusal).expect("invariant: replies serialise");
         }
-        let asked = request.user_header();
+        let asked = request.user_header().0;
         let header = ControlReply {
             version: VERSION,
             status: status as u32,

@@ -3,9 +3,10 @@
 
 use super::channel_files::ChannelFiles;
 use super::directory::{directory_error, not_usable};
-use super::error::{ChannelError, Ipc};
+use super::ipc::Ipc;
 use super::resources::{REMEDY, SHARED_MEMORY, call_error, check_free, no_room};
-use crate::limits::memory::in_words;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::limits::memory::in_words;
 use iceoryx2::node::Node;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;

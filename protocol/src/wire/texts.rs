@@ -5,14 +5,15 @@ use super::channels::{
     Channel, ChannelError, ControlService, Instance, Ipc, Services, ipc_error, limited_error,
     server_node,
 };
-use super::control::Request;
-use super::exchange::{ConnectionError, Exchange, check_answer, check_status, copied, garbled};
-use super::message::{ControlReply, ControlRequest, VERSION};
-use super::process::{WatchedProcess, node_pid, pid_namespace, watch_error};
+use super::exchange::{Exchange, RequestClient, copied};
+use super::process::{WatchedProcess, node_pid, watch_error};
 use super::resources::check_room_for_ports;
 use super::wait::Waiter;
+use emberwatch_messages::control::Request;
+use emberwatch_messages::errors::{ConnectionError, check_answer, check_status, garbled};
+use emberwatch_messages::message::{ControlReply, ControlRequest, VERSION};
+use emberwatch_messages::process::pid_namespace;
 use iceoryx2::node::Node;
-use iceoryx2::port::client::Client;
 use iceoryx2::prelude::AllocationStrategy;
 use rustix::io::Errno;
 use serde::Deserialize;
@@ -25,7 +26,7 @@ const WHAT: &str = "a control request";
 
 /// The port for texts, and what all requests of its connection need.
 pub(super) struct TextPort {
-    client: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    client: RequestClient<ControlRequest, ControlReply>,
     sequence: u64,
     pub(super) exchange: Exchange,
 }

@@ -4,10 +4,10 @@
 //! which ends with its process.
 
 use super::directory::{not_usable, own_channel_directory};
-use super::error::ChannelError;
-use super::interrupt::check_interrupt;
 use super::process::process_state;
 use super::resources::call_error;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::interrupt::check_interrupt;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
 use rustix::io::Errno;
 use std::cell::Cell;

@@ -1,8 +1,9 @@
 //! The bounded wait that both sides use: spin while that pays, then block, never past a deadline.
 
-use super::error::{ChannelError, Ipc};
+use super::ipc::Ipc;
 use super::resources::ipc_error;
 use super::spinning::Spinning;
+use emberwatch_messages::errors::ChannelError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::FileDescriptorBased;
 use std::cell::Cell;

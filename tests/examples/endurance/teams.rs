@@ -1,12 +1,12 @@
 //! A world whose robots are flown by a process each: these are killed, stopped, told to end and taken over at random
 //! moments, while this process flies one more robot, which paces the world, and checks each step.
 
-use emberwatch_agent::config::AgentConfig;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
 use emberwatch_belief::planning::{
     CellValues, Objective, Planner, PlanningProblem, RandomWalk, Target,
 };
+use emberwatch_learning::config::AgentConfig;
 use emberwatch_protocol::message::FrameHeader;
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::path::path_to_bytes;

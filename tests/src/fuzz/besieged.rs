@@ -11,11 +11,11 @@ use emberwatch_protocol::message::{
 };
 use emberwatch_protocol::path::path_to_bytes;
 use emberwatch_protocol::payload::split_step_payload;
-use emberwatch_server::config::ServerConfig;
-use emberwatch_server::simulator::{
+use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::simulator::{
     ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
 };
-use emberwatch_server::world::Episode;
+use emberwatch_sim::world::Episode;
 use rayon::ThreadPoolBuilder;
 use std::cell::RefCell;
 use std::ops::Range;

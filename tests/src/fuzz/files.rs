@@ -1,20 +1,20 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
-use emberwatch_agent::config::AgentConfig;
-use emberwatch_agent::estimation::Follower;
-use emberwatch_agent::learning::belief::LearnedBelief;
-use emberwatch_agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
-use emberwatch_agent::learning::learned::Learned;
-use emberwatch_agent::learning::learners::decisions::{self, Base, DecisionsLearner};
-use emberwatch_agent::learning::learners::filter::fit::{self, FilterFit};
-use emberwatch_agent::learning::learners::filter::{FilterLearner, SavedFilter};
-use emberwatch_agent::learning::learners::network::{self, Position, SavedNetwork};
-use emberwatch_agent::learning::learners::{Learner, Worlds};
-use emberwatch_agent::learning::reward::RewardEstimate;
-use emberwatch_agent::policy::EstimatorKind;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_learning::belief::LearnedBelief;
+use emberwatch_learning::checkpoint::{Contents, WrongDigest, decode, encode};
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::estimation::Follower;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::learners::decisions::{self, Base, DecisionsLearner};
+use emberwatch_learning::learners::filter::fit::{self, FilterFit};
+use emberwatch_learning::learners::filter::{FilterLearner, SavedFilter};
+use emberwatch_learning::learners::network::{self, Position, SavedNetwork};
+use emberwatch_learning::learners::{Learner, Worlds};
+use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_learning::reward::RewardEstimate;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
 use emberwatch_protocol::{Airspace, Dynamics, Frame, Grid, Model, Move, Shape, Transition};

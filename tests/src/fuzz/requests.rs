@@ -12,7 +12,7 @@ use emberwatch_protocol::control::{Reply, Request, parse};
 use emberwatch_protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepRequest, VERSION,
 };
-use emberwatch_server::simulator::{Outcome, PendingReply, Stepped};
+use emberwatch_sim::simulator::{Outcome, PendingReply, Stepped};
 use std::time::Duration;
 
 /// What stands for the attacker's lease in a control request.

@@ -1,8 +1,8 @@
 //! Bayes' rule on the cells that a frame shows (paper eqs. 5 and 10).
 
 use crate::estimation::belief::Belief;
-use emberwatch_protocol::grid::Probabilities;
-use emberwatch_protocol::{Cell, Frame};
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::{Cell, Frame};
 use ndarray::{Array2, NdFloat};
 use thiserror::Error;
 

@@ -3,8 +3,8 @@
 //! Estimators produce beliefs (the `u` and `p` of paper eqs. 5 and 6), objectives read them; the
 //! uncertainty that attracts an exploring robot is their entropy (eq. 14).
 
-use emberwatch_protocol::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
-use emberwatch_protocol::model::Model;
+use emberwatch_model::Model;
+use emberwatch_model::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
 use ndarray::{ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;

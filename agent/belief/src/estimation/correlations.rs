@@ -6,7 +6,7 @@
 
 use crate::estimation::belief::Belief;
 use crate::estimation::innovation::Innovation;
-use emberwatch_protocol::{Cell, Frame};
+use emberwatch_model::{Cell, Frame};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 

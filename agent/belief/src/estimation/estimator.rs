@@ -2,8 +2,8 @@
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
-use emberwatch_protocol::grid::Probabilities;
-use emberwatch_protocol::{Frame, Grid};
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::{Frame, Grid};
 use ndarray::Array2;
 use std::borrow::Cow;
 use std::error::Error as StdError;

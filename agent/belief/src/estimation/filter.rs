@@ -8,10 +8,10 @@ use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::parameters::Tables;
-use emberwatch_protocol::frame::Frame;
-use emberwatch_protocol::grid::Probabilities;
-use emberwatch_protocol::model::{Model, ModelError};
-use emberwatch_protocol::transition::Transition;
+use emberwatch_model::frame::Frame;
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::transition::Transition;
+use emberwatch_model::{Model, ModelError};
 use ndarray::{Array2, Array4};
 use std::borrow::Cow;
 
@@ -158,7 +158,7 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::grid::Shape;
+    use emberwatch_model::grid::Shape;
 
     fn frame(shape: Shape, values: &[u8]) -> Frame {
         Frame::from_bytes(shape, 3, values).expect("test frame")

@@ -3,10 +3,11 @@
 
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
-use emberwatch_protocol::grid::{Probabilities, Shape};
-use emberwatch_protocol::model::{Model, ModelFile};
+use emberwatch_model::grid::{Probabilities, Shape};
+use emberwatch_model::{Model, ModelFile};
 use std::fs::OpenOptions;
 use std::io::Write;
+#[cfg(unix)]
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -105,11 +106,11 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let beside = path.with_extension(std::process::id().to_string());
     // What an earlier process of this number left may have other readers.
     let _ = std::fs::remove_file(&beside);
-    let opened = OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(0o600)
-        .open(&beside);
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    options.mode(0o600);
+    let opened = options.open(&beside);
     let written = opened
         .and_then(|mut file| file.write_all(bytes))
         .and_then(|()| std::fs::rename(&beside, path));

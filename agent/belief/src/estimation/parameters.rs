@@ -5,9 +5,9 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
-use emberwatch_protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Grid, Model, Shape};
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Grid, Model, Shape};
+use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

@@ -1,10 +1,10 @@
 //! What a filter believes before its first frame: the predictor `u_0` of paper section III.A.
 
 use crate::estimation::belief::Belief;
-use emberwatch_protocol::dynamics::Dynamics;
-use emberwatch_protocol::grid::{Grid, Probabilities, Shape};
-use emberwatch_protocol::model::{Model, ModelError};
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::dynamics::Dynamics;
+use emberwatch_model::grid::{Grid, Probabilities, Shape};
+use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::{Model, ModelError};
 use ndarray::{Array3, Axis};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;

@@ -1,7 +1,7 @@
 //! How well a belief predicted a frame: the log-likelihood of what was seen.
 
 use crate::estimation::belief::Belief;
-use emberwatch_protocol::Frame;
+use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::ops::AddAssign;
 
@@ -45,7 +45,7 @@ pub fn score(predictor: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Sco
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::{Model, Shape};
+    use emberwatch_model::{Model, Shape};
 
     #[test]
     fn a_score_is_the_logarithm_of_the_probability_of_what_was_seen() {

@@ -13,7 +13,7 @@ use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
-use emberwatch_protocol::Frame;
+use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::borrow::Cow;
 

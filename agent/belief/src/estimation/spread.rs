@@ -3,8 +3,8 @@
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{AGE_RANGES, Ages, Correlations, RADIUS, SIDE, class};
 use crate::estimation::innovation::Innovation;
-use emberwatch_protocol::vectors::vectorised;
-use emberwatch_protocol::{Cell, Shape};
+use emberwatch_model::vectors::vectorised;
+use emberwatch_model::{Cell, Shape};
 
 /// Nothing that neighbours say is certain: after that, the paying state of a cell has at least this probability, and at
 /// most one minus it.

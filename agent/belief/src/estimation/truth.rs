@@ -2,8 +2,8 @@
 
 use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::estimator::{Estimator, EstimatorError, Told};
-use emberwatch_protocol::model::ModelError;
-use emberwatch_protocol::{Frame, Grid, Model, Probabilities, Transition};
+use emberwatch_model::ModelError;
+use emberwatch_model::{Frame, Grid, Model, Probabilities, Transition};
 
 /// Told X_k: certain of it, and one prediction ahead of it for the next path.
 pub struct Oracle {

@@ -4,7 +4,7 @@
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::{Cell, Grid};
+use emberwatch_model::{Cell, Grid};
 
 /// Paths that are planned at once: of T = 12 moves, they reach most of a grid of 64 x 64 cells.
 const N_PATHS: usize = 6;
@@ -107,6 +107,6 @@ mod tests {
             seed: 0,
             step: 0,
         });
-        assert_eq!(plan.moves, [emberwatch_protocol::Move::Down; 4]);
+        assert_eq!(plan.moves, [emberwatch_model::Move::Down; 4]);
     }
 }

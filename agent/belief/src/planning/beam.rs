@@ -7,8 +7,8 @@
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use crate::planning::reach::Reach;
-use emberwatch_protocol::path::Move;
-use emberwatch_protocol::randomness::split_mix;
+use emberwatch_model::path::Move;
+use emberwatch_model::randomness::split_mix;
 
 /// Key of the hash values that stand for cells, unless told otherwise: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
@@ -368,8 +368,8 @@ mod tests {
     use super::*;
     use crate::estimation::belief::Belief;
     use crate::planning::{Objective, Target};
-    use emberwatch_protocol::grid::{Cell, Shape};
-    use emberwatch_protocol::path::fly;
+    use emberwatch_model::grid::{Cell, Shape};
+    use emberwatch_model::path::fly;
     use std::collections::HashSet;
 
     /// Number of states in the beam after some moves, none of them left out.

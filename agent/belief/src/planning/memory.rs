@@ -1,6 +1,6 @@
 //! What a robot remembers beside its belief: how long ago it saw each cell, and what its paths brought.
 
-use emberwatch_protocol::{Frame, Grid, Shape};
+use emberwatch_model::{Frame, Grid, Shape};
 use serde::{Deserialize, Serialize};
 
 /// Steps in which what is known of a cell fades to `1/e`.

@@ -2,9 +2,9 @@
 //! maximise (the costs `c_1` and `c_2` of paper eqs. 13 and 14, with the sign turned).
 
 use crate::estimation::belief::{Belief, EntropyKind};
-use emberwatch_protocol::grid::{Cell, Grid, Shape};
-use emberwatch_protocol::model::{Airspace, Pays};
-use emberwatch_protocol::path::Move;
+use emberwatch_model::grid::{Cell, Grid, Shape};
+use emberwatch_model::path::Move;
+use emberwatch_model::{Airspace, Pays};
 use ndarray::ArrayView2;
 use serde::{Deserialize, Serialize};
 

@@ -7,7 +7,7 @@ use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::{Cell, Grid};
+use emberwatch_model::{Cell, Grid};
 
 /// What a path is for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -280,9 +280,9 @@ mod tests {
     use super::*;
     use crate::estimation::belief::Belief;
     use crate::planning::memory::Memory;
-    use emberwatch_protocol::path::fly;
-    use emberwatch_protocol::randomness::split_mix;
-    use emberwatch_protocol::{Airspace, Frame, Move, Probabilities, Shape};
+    use emberwatch_model::path::fly;
+    use emberwatch_model::randomness::split_mix;
+    use emberwatch_model::{Airspace, Frame, Move, Probabilities, Shape};
 
     fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");

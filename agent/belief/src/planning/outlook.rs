@@ -2,8 +2,8 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::planning::memory::{Memory, Recent};
-use emberwatch_protocol::model::Pays;
-use emberwatch_protocol::{Airspace, Cell, Grid, Shape};
+use emberwatch_model::Pays;
+use emberwatch_model::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
 
 /// A region is the cells within so many rows and columns of its centre, cut at the grid's edge.
@@ -212,7 +212,7 @@ mod tests {
     fn outlook(height: usize, width: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");
         let random = |(row, col)| {
-            (emberwatch_protocol::randomness::split_mix(row as u64, col as u64) % 3) as u8
+            (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
         };
         let states = Grid::from_shape_fn((height, width), random);
         let belief = Belief::from_states(&states, 3).expect("valid states");

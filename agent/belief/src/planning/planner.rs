@@ -1,8 +1,8 @@
 //! What a planner is: a value per cell in, a path out (paper section III.D).
 
 use super::objective::CellValues;
-use emberwatch_protocol::grid::Cell;
-use emberwatch_protocol::path::Move;
+use emberwatch_model::grid::Cell;
+use emberwatch_model::path::Move;
 
 #[derive(Debug, Clone, Copy)]
 pub struct PlanningProblem<'a> {

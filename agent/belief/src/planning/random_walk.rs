@@ -1,8 +1,8 @@
 //! The random walk: the paper's baseline, and the path of its sections III.B and III.C.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::path::Move;
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::path::Move;
+use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 
 /// Moves drawn uniformly and independently, whatever the cells are worth; around no-fly cells.

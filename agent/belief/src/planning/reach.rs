@@ -2,8 +2,8 @@
 //! path's length and not on the grid's size.
 
 use crate::planning::planner::PlanningProblem;
-use emberwatch_protocol::grid::Cell;
-use emberwatch_protocol::path::Move;
+use emberwatch_model::grid::Cell;
+use emberwatch_model::path::Move;
 use std::ops::Range;
 
 /// The rectangle of cells within T rows and T columns of the start, with what they are worth.

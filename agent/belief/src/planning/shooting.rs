@@ -2,9 +2,9 @@
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use crate::planning::reach::Reach;
-use emberwatch_protocol::grid::{Cell, Shape};
-use emberwatch_protocol::path::Move;
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::grid::{Cell, Shape};
+use emberwatch_model::path::Move;
+use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 

@@ -5,8 +5,8 @@
 
 use crate::planning::objective::CellValues;
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use emberwatch_protocol::Cell;
-use emberwatch_protocol::randomness::split_mix;
+use emberwatch_model::Cell;
+use emberwatch_model::randomness::split_mix;
 
 /// How often each robot answers the others' paths.
 pub const ROUNDS: usize = 2;

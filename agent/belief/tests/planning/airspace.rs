@@ -6,9 +6,9 @@ use emberwatch_belief::planning::{
     Ahead, BeamSearch, CellValues, Integration, Memory, OPTIONS, Objective, OptionPlanner, Outlook,
     Planner, RandomWalk, Shooting, Target,
 };
-use emberwatch_protocol::model::Pays;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Airspace, Cell, Grid, Move, Shape};
+use emberwatch_model::Pays;
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Airspace, Cell, Grid, Move, Shape};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;

@@ -2,8 +2,8 @@
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Move, Probabilities, Shape};
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Move, Probabilities, Shape};
 use proptest::prelude::*;
 
 /// Seed and step of the planners' random numbers.

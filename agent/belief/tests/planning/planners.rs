@@ -7,14 +7,14 @@ use emberwatch_belief::planning::{
     Ahead, BeamSearch, CellValues, Integration, Memory, Objective, OptionPlanner, Outlook, Plan,
     Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
-use emberwatch_protocol::frame::{Frame, UNOBSERVED};
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::randomness::{Purpose, split_mix, stream};
-use emberwatch_protocol::{Airspace, Cell, Grid, Model, Move, Probabilities, Shape};
+use emberwatch_model::frame::{Frame, UNOBSERVED};
+use emberwatch_model::path::fly;
+use emberwatch_model::randomness::{Purpose, split_mix, stream};
+use emberwatch_model::{Airspace, Cell, Grid, Model, Move, Probabilities, Shape};
 use proptest::prelude::*;
 use rand_chacha::rand_core::Rng;
 
-/// The score from `emberwatch_protocol::path::fly`, whose flight says nothing of revisits.
+/// The score from `emberwatch_model::path::fly`, whose flight says nothing of revisits.
 fn score_of_flight(values: &CellValues, start: Cell, moves: &[Move]) -> f32 {
     let shape = values.shape();
     let worth = |cell: Cell| values.value()[[cell.row, cell.col]];

@@ -5,8 +5,8 @@ use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
 use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
 };
-use emberwatch_protocol::path::fly;
-use emberwatch_protocol::{Cell, Move, Shape};
+use emberwatch_model::path::fly;
+use emberwatch_model::{Cell, Move, Shape};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 

@@ -8,7 +8,7 @@ use crate::variables::{Variables, build, uniform, uniform_init};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::loss::mse;
 use candle_nn::{Linear, Module, VarBuilder};
-use emberwatch_protocol::randomness::{Purpose, stream};
+use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;

@@ -1,7 +1,7 @@
 //! What the operators share: tensors as slices, frames in parallel, results with gradients of their own.
 
 use candle_core::{CpuStorage, CustomOp1, Device, Layout, Result, Shape, Storage, Tensor};
-use emberwatch_protocol::vectors::vectorised;
+use emberwatch_model::vectors::vectorised;
 use rayon::prelude::*;
 use std::ops::{AddAssign, Deref, Range};
 use std::sync::Mutex;

@@ -2,7 +2,7 @@
 
 use super::cpu::{add, add_scaled, derived, numbers};
 use candle_core::{Result, Tensor};
-use emberwatch_protocol::vectors::vectorised;
+use emberwatch_model::vectors::vectorised;
 
 struct Gru {
     /// Length of `h`.

@@ -271,7 +271,7 @@ mod tests {
     use super::*;
     use crate::variables::normal;
     use candle_core::{DType, Var};
-    use emberwatch_protocol::randomness::{Purpose, stream};
+    use emberwatch_model::randomness::{Purpose, stream};
 
     fn random(shape: &[usize], seed: u64) -> Var {
         let mut rng = stream(seed, Purpose::Weights, 0);

@@ -2,10 +2,10 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
+use emberwatch_model::randomness::split_mix;
 use emberwatch_network::{
     Dqn, DqnSettings, DqnShape, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition,
 };
-use emberwatch_protocol::randomness::split_mix;
 
 const N_INPUTS: usize = 6;
 const N_ACTIONS: usize = 4;

@@ -13,12 +13,12 @@
 
 use crate::golden_file::{Golden, frame_from};
 use candle_core::Tensor;
+use emberwatch_model::frame::{Frame, UNOBSERVED};
+use emberwatch_model::grid::Shape;
 use emberwatch_network::{
     AdamSettings, Autoencoder, AutoencoderSettings, Device, Dropout, NetworkError, NetworkShape,
     Pass, Window,
 };
-use emberwatch_protocol::frame::{Frame, UNOBSERVED};
-use emberwatch_protocol::grid::Shape;
 use ndarray::{Array, Array1, Array3, Array4, ArrayD, Axis, IxDyn};
 use std::borrow::Borrow;
 

@@ -1,7 +1,7 @@
 //! Arrays of the authors' runs, in this crate's `tests/data`.
 
-use emberwatch_protocol::frame::{Frame, UNOBSERVED};
-use emberwatch_protocol::grid::Shape;
+use emberwatch_model::frame::{Frame, UNOBSERVED};
+use emberwatch_model::grid::Shape;
 use ndarray::{Array, ArrayView2, Dimension};
 use ndarray_npy::{NpzReader, ReadableElement};
 use std::fs::File;

@@ -2,10 +2,10 @@
 
 use crate::synthetic::rayon_pool;
 use candle_core::{DType, Device, Tensor, Var};
+use emberwatch_model::grid::Shape;
+use emberwatch_model::randomness::split_mix;
 use emberwatch_network::variables::{Variables, build};
 use emberwatch_network::{Lesson, NamedTensor, NetworkError, NeuralBelief, Sightings, UNet};
-use emberwatch_protocol::grid::Shape;
-use emberwatch_protocol::randomness::split_mix;
 
 fn numbers(tensor: &Tensor) -> Vec<f64> {
     let numbers = tensor

@@ -2,11 +2,11 @@
 
 use crate::synthetic::{coin, dropout, frames, rayon_pool};
 use candle_core::Tensor;
+use emberwatch_model::grid::Shape;
 use emberwatch_network::{
     Autoencoder, AutoencoderSettings, Device, NamedTensor, NetworkError, NetworkShape, NotFinite,
     Window,
 };
-use emberwatch_protocol::grid::Shape;
 
 fn network(grid: [usize; 2], seed: u64) -> Autoencoder {
     let settings = AutoencoderSettings::paper_large();

@@ -7,9 +7,9 @@
 use crate::synthetic::{coin, dropout, frames};
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Tensor};
+use emberwatch_model::grid::Shape;
 use emberwatch_network::variables::{Variables, build};
 use emberwatch_network::{Network, NetworkShape, Pass, Stock, Window};
-use emberwatch_protocol::grid::Shape;
 
 const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
 

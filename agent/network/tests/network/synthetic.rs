@@ -1,9 +1,9 @@
 //! Frames to learn from, and masks.
 
+use emberwatch_model::frame::Frame;
+use emberwatch_model::grid::Shape;
+use emberwatch_model::randomness::split_mix;
 use emberwatch_network::{Dropout, Mask};
-use emberwatch_protocol::frame::Frame;
-use emberwatch_protocol::grid::Shape;
-use emberwatch_protocol::randomness::split_mix;
 
 /// Frames in which each cell is seen with a probability of one in `one_in`.
 pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> Vec<Frame> {

@@ -2,7 +2,7 @@
 
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use crate::learning::tensorboard::{EventFile, Value};
+use crate::training::tensorboard::{EventFile, Value};
 use anyhow::Result;
 use std::path::Path;
 

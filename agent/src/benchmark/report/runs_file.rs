@@ -3,8 +3,8 @@
 //! `emberwatch.benchmark` in Python locks and replaces it in the same way, so that no writer loses another's rows.
 
 use crate::benchmark::report::policy_run::PolicyRun;
-use crate::file::{Readers, check_replaceable, replace_file};
 use anyhow::{Context, Result, bail, ensure};
+use emberwatch_learning::file::{Readers, check_replaceable, replace_file};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};

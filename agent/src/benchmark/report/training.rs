@@ -2,7 +2,7 @@
 
 use crate::benchmark::report::figures::save;
 use crate::benchmark::report::statistics::Estimate;
-use crate::learning::metrics::Rows;
+use crate::training::metrics::Rows;
 use anyhow::{Context, Result};
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;

@@ -8,8 +8,8 @@
 
 use super::*;
 use crate::estimation::correlations::N_AGES;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Grid, Model, Probabilities, Shape};
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Grid, Model, Probabilities, Shape};
 use ndarray::{Array2, Array3, Array4, Axis};
 use ndarray_npy::NpzReader;
 use proptest::prelude::*;

@@ -1,0 +1,469 @@
+//! What a learner keeps between runs, in one safetensors file: weights and the optimiser's moments as tensors by
+//! name, everything else as one value that bincode encodes, the tensor of bytes `state`.
+//!
+//! Written next to the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
+//! which learner and which format it is of, and a digest tells damage that keeps its form. Equal contents are equal bytes,
+//! so trainings can be compared by a hash of their checkpoints.
+
+use crate::config::AgentConfig;
+use crate::file::{Readers, replace_file};
+use anyhow::{Context, Result, anyhow, bail, ensure};
+use bincode::config::{Configuration, Fixint, LittleEndian};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_model::Shape;
+use emberwatch_network::NamedTensor;
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::collections::{BTreeMap, HashMap};
+use std::fmt::Display;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use thiserror::Error;
+
+/// Entries of the metadata.
+const KIND: &str = "emberwatch.kind";
+const FORMAT: &str = "emberwatch.format";
+const DIGEST: &str = "emberwatch.digest";
+const SETTINGS: &str = "settings";
+
+/// The tensor of bytes.
+const STATE: &str = "state";
+
+/// How states are encoded: integers of fixed size.
+const FORM: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
+
+/// Largest file that is written or read, bytes: 200 times what a full replay of 64 x 64 cells and 3
+/// states needs.
+const MAX_BYTES: u64 = 1 << 32;
+
+/// Largest count: far from where one more would not fit.
+const MAX_COUNT: u64 = 1 << 53;
+
+/// The form is right and the numbers are not those that were written.
+#[derive(Debug, Error)]
+#[error("expected contents with digest {expected}, got {got}: the file is damaged")]
+pub struct WrongDigest {
+    pub expected: String,
+    pub got: String,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    pub shape: Vec<usize>,
+    /// Its numbers, row-major.
+    pub numbers: Vec<f32>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Contents {
+    pub tensors: BTreeMap<String, Tensor>,
+    pub state: Vec<u8>,
+    pub settings: String,
+}
+
+impl Contents {
+    /// Tensors and state; the settings are still to be added.
+    pub fn new(tensors: impl IntoIterator<Item = NamedTensor>, state: &impl Serialize) -> Self {
+        let tensors = tensors.into_iter();
+        let tensor = |(name, shape, numbers)| (name, Tensor { shape, numbers });
+        let mut contents = Self {
+            tensors: tensors.map(tensor).collect(),
+            state: Vec::new(),
+            settings: String::new(),
+        };
+        contents.set_state(state);
+        contents
+    }
+
+    pub fn set_state(&mut self, state: &impl Serialize) {
+        let state = bincode::serde::encode_to_vec(state, FORM);
+        self.state = state.expect("invariant: states hold values and sequences of known length");
+    }
+
+    /// The state, as a learner's type.
+    pub fn state<S: DeserializeOwned>(&self) -> Result<S> {
+        use bincode::serde::decode_from_slice as decode;
+        // The limit is part of a type: the smallest one, so that a small file cannot ask for much memory.
+        let decoded = match self.state.len() {
+            0..0x1_0000 => decode(&self.state, FORM.with_limit::<0x10_0000>()),
+            0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
+            _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
+        };
+        let (state, length) =
+            decoded.map_err(|error| wrong(STATE, "that of its learner", error))?;
+        let got = self.state.len();
+        check(length == got, STATE, format!("{length} bytes"), got)?;
+        Ok(state)
+    }
+
+    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
+        let tensor = self.tensors.get(name);
+        let tensor =
+            tensor.with_context(|| format!("{name}: expected shape {expected:?}, got none"))?;
+        let (shape, got) = (format!("shape {expected:?}"), format!("{:?}", tensor.shape));
+        check(tensor.shape == expected, name, shape, got)?;
+        check_numbers(name, &tensor.numbers, expected.iter().product())?;
+        Ok(tensor.numbers.clone())
+    }
+
+    /// The tensors whose names begin so.
+    pub fn part(&self, prefix: &str) -> Part<'_> {
+        Part {
+            contents: self,
+            prefix: prefix.into(),
+        }
+    }
+
+    /// Refuses means of squares, whose roots are taken, that are negative.
+    pub fn check_squares(&self) -> Result<()> {
+        let ends = [".second_moment", "running_var"];
+        let is_square = |name: &str| {
+            name.contains("adam.second.") || ends.iter().any(|end| name.ends_with(end))
+        };
+        let mut squares = self.tensors.iter().filter(|(name, _)| is_square(name));
+        squares.try_for_each(|(name, tensor)| {
+            let least = tensor.numbers.iter().copied().fold(0.0, f32::min);
+            check(least >= 0.0, name, "numbers from 0 on", least)
+        })
+    }
+
+    pub fn settings(&self) -> Result<AgentConfig> {
+        let is_there = !self.settings.is_empty();
+        check(is_there, SETTINGS, "those of an agent", "none")?;
+        let config = AgentConfig::from_toml(&self.settings);
+        config.map_err(|error| wrong(SETTINGS, "those of an agent", error))
+    }
+
+    /// Against damage, not malice.
+    pub fn digest(&self) -> String {
+        let mut digest = crc32fast::Hasher::new();
+        for (name, Tensor { shape, numbers }) in &self.tensors {
+            digest.update(format!("{name} {shape:?} ").as_bytes());
+            digest.update(&little_endian(numbers));
+        }
+        digest.update(&self.state);
+        digest.update(self.settings.as_bytes());
+        format!("{:08x}", digest.finalize())
+    }
+}
+
+/// Tensors of a checkpoint whose names begin alike.
+#[derive(Debug, Clone)]
+pub struct Part<'a> {
+    contents: &'a Contents,
+    prefix: String,
+}
+
+impl Part<'_> {
+    /// A part of this part.
+    pub fn part(&self, prefix: &str) -> Self {
+        Self {
+            contents: self.contents,
+            prefix: format!("{}{prefix}", self.prefix),
+        }
+    }
+
+    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
+        self.contents
+            .tensor(&format!("{}{name}", self.prefix), expected)
+    }
+
+    /// The axes of a tensor, if it is there.
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        let tensor = self.contents.tensors.get(&format!("{}{name}", self.prefix));
+        tensor.map(|tensor| &*tensor.shape)
+    }
+}
+
+/// Writes a checkpoint of a kind of learner, whole or not at all.
+///
+/// # Errors
+/// Where the system refuses; the file is then as it was.
+pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<()> {
+    let of_file = || format!("checkpoint {}", path.display());
+    let bytes = encode(kind, contents).with_context(of_file)?;
+    // It holds beliefs about worlds, which are their owner's.
+    replace_file(path, &bytes, Readers::Owner).with_context(of_file)
+}
+
+/// Reads a checkpoint of one of some kinds, and tells which.
+pub fn read(path: &Path, kinds: &[&'static str]) -> Result<(&'static str, Contents)> {
+    let bytes = || {
+        let found = std::fs::metadata(path)?;
+        ensure!(
+            found.is_file(),
+            "expected a regular file, got something else"
+        );
+        check_size(found.len())?;
+        let mut bytes = Vec::new();
+        File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
+    contents.with_context(|| format!("checkpoint {}", path.display()))
+}
+
+/// A checkpoint of a kind of learner as bytes.
+pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>> {
+    let tensors = contents.tensors.iter();
+    let tensor = |(name, tensor): (&String, &Tensor)| {
+        let bytes = little_endian(&tensor.numbers);
+        (name.clone(), Dtype::F32, tensor.shape.clone(), bytes)
+    };
+    let mut all: Vec<_> = tensors.map(tensor).collect();
+    let state = contents.state.clone();
+    all.push((STATE.into(), Dtype::U8, vec![state.len()], state));
+    let views = all.iter();
+    let views = views.map(|(name, kind, shape, bytes)| {
+        Ok((name, TensorView::new(*kind, shape.clone(), bytes)?))
+    });
+    let views = views.collect::<Result<Vec<_>, _>>().map_err(damaged)?;
+    let texts = [
+        (KIND, kind),
+        (FORMAT, version(kind)),
+        (DIGEST, &contents.digest()),
+        (SETTINGS, &contents.settings),
+    ];
+    let texts = texts.map(|(name, text)| (name.into(), text.into()));
+    let mut bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    sort_header(&mut bytes);
+    check_size(bytes.len() as u64)?;
+    Ok(bytes)
+}
+
+/// The format of a kind's state. Transitions of a DQN have had their own discounts since format 5.
+fn version(kind: &str) -> &'static str {
+    match kind {
+        "autoencoder" | "decisions" => "5",
+        _ => "4",
+    }
+}
+
+/// Sorts the header by name: safetensors writes its texts in the random order of a hash map. The length stays the same.
+fn sort_header(file: &mut [u8]) {
+    type Header = BTreeMap<String, BTreeMap<String, serde_json::Value>>;
+    const WRITTEN: &str = "invariant: safetensors wrote a header of its length";
+    let (length, rest) = file.split_first_chunk_mut().expect(WRITTEN);
+    let header = &mut rest[..u64::from_le_bytes(*length) as usize];
+    let sorted: Header = serde_json::from_slice(header).expect(WRITTEN);
+    let sorted = serde_json::to_vec(&sorted).expect(WRITTEN);
+    header[..sorted.len()].copy_from_slice(&sorted);
+}
+
+/// The checkpoint of one of some kinds that bytes are, and which.
+pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents)> {
+    let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
+    let mut texts = metadata.metadata().clone().unwrap_or_default();
+    let got = texts
+        .remove(KIND)
+        .unwrap_or_else(|| "something else".into());
+    let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
+        let kinds = kinds.join(" or ");
+        bail!("expected a checkpoint of {kinds}, got one of {got}");
+    };
+    let got = texts.remove(FORMAT).unwrap_or_else(|| "none".into());
+    check(got == version(kind), FORMAT, version(kind), got)?;
+    let mut contents = Contents::new([], &());
+    contents.settings = texts.remove(SETTINGS).unwrap_or_default();
+    for (name, view) in file.iter() {
+        match (name, view.dtype()) {
+            (STATE, Dtype::U8) => contents.state = view.data().to_vec(),
+            (_, Dtype::F32) => {
+                let (numbers, _) = view.data().as_chunks();
+                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
+                let (shape, numbers) = (view.shape().to_vec(), numbers.collect());
+                let tensor = Tensor { shape, numbers };
+                contents.tensors.insert(name.into(), tensor);
+            }
+            (_, other) => return Err(wrong(name, "F32", other)),
+        }
+    }
+    let (expected, got) = (texts.remove(DIGEST).unwrap_or_default(), contents.digest());
+    ensure!(got == expected, WrongDigest { expected, got });
+    Ok((kind, contents))
+}
+
+fn little_endian(numbers: &[f32]) -> Vec<u8> {
+    let numbers = numbers.iter();
+    numbers.flat_map(|number| number.to_le_bytes()).collect()
+}
+
+fn check_size(n_bytes: u64) -> Result<()> {
+    let expected = format!("at most {MAX_BYTES} bytes");
+    check(n_bytes <= MAX_BYTES, "file", expected, n_bytes)
+}
+
+fn damaged(error: SafeTensorError) -> anyhow::Error {
+    anyhow!("expected a whole safetensors file, got one that is damaged or cut off: {error}")
+}
+
+/// Refuses a field that does not fit.
+pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) -> Result<()> {
+    ensure!(fits, wrong(name, expected, got));
+    Ok(())
+}
+
+/// What is wrong with a tensor or a field of the state.
+pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
+    anyhow!("{name}: expected {expected}, got {got:#}")
+}
+
+pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
+    let expected = format!("at most {MAX_COUNT}");
+    let mut counts = counts.iter();
+    counts.try_for_each(|&(name, count)| check(count <= MAX_COUNT, name, &expected, count))
+}
+
+/// Refuses other than so many finite numbers.
+pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usize) -> Result<()> {
+    let mut floats = numbers.iter().map(|&number| number.into());
+    let wrong = floats.find(|number: &f64| !number.is_finite());
+    let got = wrong.unwrap_or(numbers.len() as f64);
+    let fits = wrong.is_none() && numbers.len() == length;
+    check(fits, name, format!("{length} finite numbers"), got)
+}
+
+/// Refuses a belief about other states or on another grid.
+pub fn check_belief(name: &str, belief: &Belief, n_states: usize, shape: Shape) -> Result<()> {
+    let expected = format!("{n_states} states on {shape}");
+    let got = format!("{} states on {}", belief.n_states(), belief.shape());
+    check(got == expected, name, &expected, &got)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::PathBuf;
+
+    type State = (Vec<u64>, Option<String>);
+
+    fn state() -> State {
+        (vec![3, u64::MAX], Some("words".into()))
+    }
+
+    fn contents() -> Contents {
+        let kernel = ("kernel".into(), vec![2, 2], vec![1.0, -0.5, 0.0, 3e-9]);
+        let mut contents = Contents::new([kernel], &state());
+        contents.settings = "seed = 3".into();
+        contents
+    }
+
+    fn place() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("checkpoint.safetensors");
+        (folder, path)
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let (folder, path) = place();
+        std::fs::write(&path, "open to everybody").expect("written");
+        write(&path, "tests", &contents()).expect("written");
+        write(&path, "tests", &contents()).expect("written over");
+        let (kind, read) = read(&path, &["others", "tests"]).expect("read");
+        assert_eq!((kind, &read), ("tests", &contents()));
+        assert_eq!(read.state::<State>().expect("its state"), state());
+        assert_eq!(read.settings().expect("settings").seed, 3);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            let mode = path.metadata().expect("the file").permissions().mode();
+            assert_eq!(mode & 0o777, 0o600);
+        }
+        let files = std::fs::read_dir(folder.path()).expect("the folder");
+        assert_eq!(files.count(), 1, "nothing left next to it");
+    }
+
+    #[test]
+    fn equal_contents_are_equal_bytes() {
+        let mut other = contents();
+        let kernel = other.tensors.remove("kernel").expect("a tensor");
+        other
+            .tensors
+            .insert("bias \"\u{e9}\n".into(), kernel.clone());
+        other.tensors.insert("kernel".into(), kernel);
+        for contents in [contents(), other] {
+            let first = encode("tests", &contents).expect("small");
+            let (_, read) = decode(&["tests"], &first).expect("whole");
+            assert_eq!(read, contents);
+            // Each map has its own order: of 24, ten in a row would hardly be the same.
+            for _ in 0..10 {
+                assert!(encode("tests", &contents).expect("small") == first);
+            }
+        }
+    }
+
+    #[test]
+    fn every_cut_and_every_flipped_byte_is_refused_by_name() {
+        let (_folder, path) = place();
+        write(&path, "tests", &contents()).expect("written");
+        let whole = std::fs::read(&path).expect("readable");
+        let read = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).expect("written");
+            let read = read(&path, &["tests"]).map(|(_, contents)| contents);
+            read.map_err(|error| format!("{error:#}"))
+        };
+        let check = |bytes: &[u8], what: String| match read(bytes) {
+            // Space that pads the header may change without a change of meaning.
+            Ok(got) => assert!(bytes.len() == whole.len() && got == contents(), "{what}"),
+            Err(error) => assert!(
+                error.contains("checkpoint.safetensors: ") && error.contains("expected"),
+                "{what}: {error}"
+            ),
+        };
+        for at in 0..whole.len() {
+            check(&whole[..at], format!("cut to {at}"));
+            let mut bytes = whole.clone();
+            bytes[at] ^= 1;
+            check(&bytes, format!("byte {at}"));
+        }
+    }
+
+    #[test]
+    fn another_kind_format_tensor_or_state_is_named() {
+        let whole = encode("tests", &contents()).expect("small");
+        let refused = |kind, from: &str, to: &str| {
+            let at = whole
+                .windows(from.len())
+                .position(|word| word == from.as_bytes());
+            let (mut bytes, at) = (whole.clone(), at.expect("in the file"));
+            bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+            decode(&[kind], &bytes).expect_err(to).to_string()
+        };
+        let words = "expected a checkpoint of others, got one of tests";
+        assert_eq!(refused("others", "kernel", "kernel"), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"4""#, "none")] {
+            let words = format!("emberwatch.format: expected 4, got {got}");
+            assert_eq!(refused("tests", r#"format":"4""#, to), words);
+        }
+        let got = contents();
+        let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
+        assert_eq!(
+            error("kernel", &[4]),
+            "kernel: expected shape [4], got [2, 2]"
+        );
+        assert_eq!(error("bias", &[4]), "bias: expected shape [4], got none");
+        let error = got.state::<u64>().expect_err("longer").to_string();
+        assert!(
+            error.starts_with("state: expected 8 bytes, got "),
+            "{error}"
+        );
+        let error = Contents::new([], &u64::MAX).state::<Vec<String>>();
+        let error = error.expect_err("a forged length").to_string();
+        assert!(
+            error.starts_with("state: expected that of its learner"),
+            "{error}"
+        );
+        let endless = read(Path::new("/dev/zero"), &["tests"]).expect_err("no file");
+        assert!(format!("{endless:#}").contains("expected a regular file"));
+        let missing = read(Path::new("no/such"), &["tests"]).expect_err("none");
+        assert!(format!("{missing:#}").starts_with("checkpoint no/such: No such file"));
+    }
+}

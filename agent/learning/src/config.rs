@@ -1,0 +1,298 @@
+//! The agent's settings: defaults or the paper's preset, then a TOML file's.
+
+mod sections;
+
+pub use sections::{
+    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig,
+    ObjectiveConfig, StepSize,
+};
+
+use self::sections::check;
+use crate::policy::{PlannerKind, Policy};
+use anyhow::{Result, bail};
+use emberwatch_belief::estimation::Prior;
+use emberwatch_belief::planning::{
+    Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+/// Every setting with its default and meaning.
+const DEFAULTS: &str = include_str!("../agent.toml");
+
+/// Where what the authors ran differs: moves clamped after the sum, a uniform first belief, the autoencoder and
+/// the DQN with steps of constant size.
+const PAPER: &str = r#"
+shooting_integration = "clamp_sum"
+prior = "uniform"
+learner = "autoencoder"
+autoencoder.step_size.power = 0.0
+dqn.step_size.power = 0.0
+"#;
+
+/// Settings of planners and estimators; `config/agent.toml` says what each means.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AgentConfig {
+    pub beam_width: usize,
+    pub shooting_samples: usize,
+    pub shooting_integration: Integration,
+    pub prior: PriorKind,
+    pub prior_worlds: usize,
+    pub seed: u64,
+    pub learner: LearnerKind,
+    pub objective: ObjectiveConfig,
+    pub learning: LearningConfig,
+    pub neural: NeuralConfig,
+    pub autoencoder: AutoencoderConfig,
+    pub dqn: NetworkDqnConfig,
+    pub decisions: DecisionsConfig,
+}
+
+/// What `train` learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LearnerKind {
+    Filter,
+    OwnFilter,
+    Neural,
+    Autoencoder,
+    Decisions,
+}
+
+/// The known-model filter's first belief.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PriorKind {
+    Simulated,
+    Initial,
+    Uniform,
+}
+
+impl LearnerKind {
+    /// Each kind with its name and what it learns.
+    pub const ALL: [(Self, &str, &str); 5] = [
+        (
+            Self::Filter,
+            "filter",
+            "A Bayes filter of the paper's form, with unknown parameters",
+        ),
+        (
+            Self::OwnFilter,
+            "own_filter",
+            "The same with a kernel for each state that a cell itself can be in",
+        ),
+        (
+            Self::Neural,
+            "neural",
+            "A network that keeps space, from what was seen to what will be seen",
+        ),
+        (
+            Self::Autoencoder,
+            "autoencoder",
+            "The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives",
+        ),
+        (
+            Self::Decisions,
+            "decisions",
+            "A DQN that chooses among options on an estimator's belief, which is learned first, unless it is given",
+        ),
+    ];
+}
+
+impl PriorKind {
+    /// Each kind with its name and what it says.
+    pub const ALL: [(Self, &str, &str); 3] = [
+        (
+            Self::Simulated,
+            "simulated",
+            "How often each cell of simulated worlds is in each state after the server's burn-in",
+        ),
+        (Self::Initial, "initial", "The model's initial distribution"),
+        (Self::Uniform, "uniform", "Every state equally likely"),
+    ];
+}
+
+impl Default for AgentConfig {
+    fn default() -> Self {
+        Self::from_toml("").expect("invariant: the defaults are settings")
+    }
+}
+
+impl AgentConfig {
+    /// What the authors ran.
+    pub fn paper() -> Self {
+        Self::from_toml(PAPER).expect("invariant: the preset is settings")
+    }
+
+    /// The defaults, and a text's settings in their place.
+    ///
+    /// # Errors
+    /// Names the first setting that is unknown or out of its range.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let mut settings: Table = DEFAULTS.parse()?;
+        replace(&mut settings, text.parse()?, "")?;
+        let config: Self = settings.try_into()?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// Names the first that is out of its range.
+    pub fn check(&self) -> Result<()> {
+        let ranges = [
+            ("beam_width", self.beam_width as f64, 1.0, 1e4),
+            ("shooting_samples", self.shooting_samples as f64, 1.0, 1e6),
+            ("prior_worlds", self.prior_worlds as f64, 1.0, 1e4),
+        ];
+        check("", &ranges)?;
+        self.objective.check()?;
+        self.learning.check()?;
+        self.neural.check()?;
+        self.autoencoder.check()?;
+        self.dqn.check()?;
+        self.decisions.check()
+    }
+
+    /// The prior for a server with this burn-in.
+    pub fn prior(&self, burn_in: u64) -> Prior {
+        match self.prior {
+            PriorKind::Simulated => Prior::Simulated {
+                n_worlds: self.prior_worlds,
+                burn_in,
+            },
+            PriorKind::Initial => Prior::Initial,
+            PriorKind::Uniform => Prior::Uniform,
+        }
+    }
+
+    /// What a policy maximises under these settings. A policy without a bonus, such as
+    /// `shooting_exploit_only`, and coverage, which is nothing but the bonus, keep theirs.
+    pub fn objective(&self, policy: &Policy) -> Objective {
+        let own = policy.objective;
+        let settings = &self.objective;
+        let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
+        let coverage_bonus = match policy.planner {
+            _ if keeps => own.coverage_bonus,
+            PlannerKind::Beam | PlannerKind::BeamAhead => settings.beam_bonus,
+            PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
+        };
+        Objective {
+            target: own.target,
+            coverage_bonus,
+            entropy: settings.entropy,
+            revisits: settings.revisits,
+        }
+    }
+
+    /// Seed of a planner: its world's, told apart by the agent's own.
+    pub fn planner_seed(&self, world_seed: u64) -> u64 {
+        world_seed ^ self.seed.rotate_left(32)
+    }
+
+    pub fn planner(&self, policy: &Policy) -> Box<dyn Planner + Send> {
+        match policy.planner {
+            PlannerKind::RandomWalk => Box::new(RandomWalk),
+            PlannerKind::Shooting => Box::new(Shooting::new(
+                self.shooting_samples,
+                self.shooting_integration,
+            )),
+            PlannerKind::Beam => Box::new(BeamSearch::new(self.beam_width)),
+            PlannerKind::BeamAhead => Box::new(Ahead::new(self.beam_width)),
+        }
+    }
+}
+
+/// Puts settings in the place of others of the same names.
+fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
+    for (name, value) in by {
+        match (settings.get_mut(&name), value) {
+            (None, _) => bail!("{section}{name}: expected a setting's name"),
+            (Some(Value::Table(settings)), Value::Table(by)) => {
+                replace(settings, by, &format!("{section}{name}."))?;
+            }
+            (Some(setting), value) => *setting = value,
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_take_the_place_of_defaults_and_unknown_ones_are_named() {
+        let config = AgentConfig::from_toml("seed = 3\n[dqn]\nstep_size.rate = 1").expect("valid");
+        assert_eq!((config.seed, config.dqn.step_size.rate), (3, 1.0));
+        assert_eq!(config.dqn.step_size.power, 0.6);
+        let written = toml::to_string(&config).expect("TOML");
+        assert_eq!(AgentConfig::from_toml(&written).expect("valid"), config);
+        let error = AgentConfig::from_toml("[dqn]\ngama = 1").expect_err("no such setting");
+        assert_eq!(error.to_string(), "dqn.gama: expected a setting's name");
+    }
+
+    #[test]
+    fn settings_of_the_objective_reach_the_policies() {
+        let model = emberwatch_model::Model::wildfire();
+        let policy = |name| Policy::named(name, &model).expect("a known name");
+        let mut config = AgentConfig::default();
+        for policy in Policy::ladder(&model) {
+            assert_eq!(
+                config.objective(&policy).coverage_bonus,
+                policy.objective.coverage_bonus
+            );
+        }
+        config.objective.shooting_bonus = 3.0;
+        config.objective.revisits = true;
+        assert_eq!(
+            config.objective(&policy("shooting_explore")).coverage_bonus,
+            3.0
+        );
+        assert!(config.objective(&policy("beam_exploit")).revisits);
+        assert_eq!(
+            config
+                .objective(&policy("shooting_exploit_only"))
+                .coverage_bonus,
+            0.0
+        );
+        assert_eq!(config.objective(&policy("coverage")).coverage_bonus, 1.0);
+        config.objective.beam_bonus = f32::NAN;
+        let error = config.check().expect_err("no number").to_string();
+        assert_eq!(error, "objective.beam_bonus: expected 0 to 1000, got NaN");
+    }
+
+    #[test]
+    fn kinds_are_named_as_in_files() {
+        for (kind, name, _) in LearnerKind::ALL {
+            assert_eq!(serde_json::to_value(kind).expect("a name"), name);
+        }
+        for (kind, name, _) in PriorKind::ALL {
+            assert_eq!(serde_json::to_value(kind).expect("a name"), name);
+        }
+    }
+
+    #[test]
+    fn wrong_settings_are_named() {
+        let config = AgentConfig {
+            beam_width: 0,
+            ..AgentConfig::default()
+        };
+        let error = config.check().expect_err("no beam").to_string();
+        assert_eq!(error, "beam_width: expected 1 to 10000, got 0");
+        for (text, words) in [
+            (
+                "[objective]\nbelief = \"prior\"",
+                "unknown variant `prior`, expected `predictor` or `estimate`",
+            ),
+            (
+                "[decisions]\nestimator = \"filter\"",
+                "expected one of known_model, spatial_filter, learned_filter",
+            ),
+        ] {
+            let error = AgentConfig::from_toml(text).expect_err("no such name");
+            assert!(error.to_string().contains(words), "{error}");
+        }
+    }
+}

@@ -1,0 +1,39 @@
+//! A filter's first belief: simulating it may take long, so it is announced, and kept for later runs.
+
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::kept_belief::KeptBelief;
+use emberwatch_belief::estimation::prior::Prior;
+use emberwatch_model::ModelError;
+use emberwatch_model::{Model, Shape};
+
+/// Cells that a core moves by one step in a second: 64 x 64 of the wildfire in 3.4 us.
+const CELLS_PER_SECOND: f64 = 1.2e9;
+
+/// The belief before the first frame, see [`Prior::belief`].
+pub fn first_belief(
+    prior: Prior,
+    model: &Model,
+    shape: Shape,
+    seed: u64,
+) -> Result<Belief, ModelError> {
+    let Prior::Simulated { n_worlds, burn_in } = prior else {
+        return prior.belief(model, shape, seed);
+    };
+    let kept = KeptBelief::new(prior, model, shape, seed);
+    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
+        return Ok(belief);
+    }
+    let cells = n_worlds as f64 * burn_in as f64 * shape.n_cells() as f64;
+    let seconds = cells / CELLS_PER_SECOND / rayon::current_num_threads() as f64;
+    tracing::info!(
+        worlds = n_worlds,
+        steps = burn_in,
+        about_seconds = seconds.ceil(),
+        "simulating the first belief"
+    );
+    let belief = prior.belief(model, shape, seed)?;
+    if let Some(Err(error)) = kept.map(|kept| kept.write(&belief)) {
+        tracing::debug!("the first belief is not kept: {error}");
+    }
+    Ok(belief)
+}

@@ -1,0 +1,11 @@
+//! What learns while it acts, as [`crate::train`] drives it. Pure: frames in, paths out.
+
+mod base;
+pub mod decisions;
+pub mod filter;
+pub mod network;
+pub mod neural;
+#[cfg(test)]
+mod tests;
+
+pub use self::base::{Learner, Worlds};

@@ -1,0 +1,304 @@
+//! Learns which option to fly (paper section III.E): on an estimator's belief all options are planned, and a DQN that
+//! reads each one's features says what it is worth.
+
+mod base;
+mod run;
+mod saved;
+
+pub use self::base::Base;
+pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
+
+use self::run::{Run, features};
+use self::saved::{Held, SavedRun, belief_tensors};
+use crate::belief::SavedBelief;
+use crate::checkpoint::{Contents, check};
+use crate::config::AgentConfig;
+use crate::learners::base::{Learner, Worlds, lacks_steps, without_truth};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
+use crate::update::{ModelUpdate, Tick};
+use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::{OPTIONS, Target};
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
+use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_network::Dqn;
+use rand_chacha::rand_core::Rng;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+pub const KIND: &str = "decisions";
+
+/// A DQN over options that learns on several worlds.
+pub struct DecisionsLearner {
+    worlds: Worlds,
+    config: AgentConfig,
+    base: Base,
+    policy: Policy,
+    dqn: Dqn,
+    runs: Vec<Run>,
+    /// Where a checkpoint left the worlds.
+    left: BTreeMap<u32, SavedRun>,
+    world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    earned: f64,
+    is_frozen: bool,
+    times: [(&'static str, Duration); 2],
+}
+
+impl DecisionsLearner {
+    /// Before the first step, or going on from a checkpoint of decisions on such a base.
+    pub fn new(
+        base: Base,
+        contents: Option<&Contents>,
+        worlds: Worlds,
+        config: &AgentConfig,
+    ) -> Result<Self> {
+        let target = Target::State(base.target);
+        let mut learner = Self {
+            policy: Policy::new("decisions", base.kind, PlannerKind::Beam, target),
+            base,
+            dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
+            runs: Vec::new(),
+            left: BTreeMap::new(),
+            world_steps: 0,
+            earned: 0.0,
+            is_frozen: false,
+            times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
+            worlds,
+            config: config.clone(),
+        };
+        if let Some(contents) = contents {
+            learner.load(contents)?;
+        }
+        Ok(learner)
+    }
+
+    /// An agent before it takes in what its world shows.
+    fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
+        let (base, names) = (&self.base, self.base.state_names.clone());
+        let (config, policy) = (&self.config, &self.policy);
+        let estimator = base.estimator()?;
+        Ok(self
+            .worlds
+            .rollout(config, policy, estimator, names, observation))
+    }
+
+    /// A run that begins with what its world shows.
+    fn begun(&self, observation: Observation) -> Result<Run> {
+        let mut rollout = self.rollout_at(observation)?;
+        rollout.correct()?;
+        rollout.agent.predict();
+        Ok(Run::begun(rollout, &self.dqn))
+    }
+
+    /// Chooses a run's option: the best one, or while one is held at random, that.
+    fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
+        if self.is_frozen {
+            return self.dqn.best(features);
+        }
+        let step = self.world_steps + index as u64;
+        let mut rng = stream(self.config.seed, Purpose::Exploration, step);
+        let mut random = |below: u64| rng.next_u64() % below;
+        let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
+        // A held option lasts two or three steps, so that half as many begin.
+        if held.n_steps == 0 && (random(1 << 24) as f32) < epsilon / 2.0 * (1 << 24) as f32 {
+            held.option = random(OPTIONS.len() as u64) as usize;
+            held.n_steps = 1 + random(self.config.decisions.longest_hold);
+        }
+        if held.n_steps == 0 {
+            return self.dqn.best(features);
+        }
+        held.n_steps -= 1;
+        held.option
+    }
+
+    /// Plans all options of all robots, remembers what the last ones led to, and chooses the next ones.
+    fn decide(&mut self) {
+        let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
+        let mut runs = std::mem::take(&mut self.runs);
+        for (index, (run, mut proposals)) in runs.iter_mut().zip(proposals).enumerate() {
+            let features = features(&proposals);
+            if let Some(transition) = run.led_to(&features, &self.dqn) {
+                self.dqn.remember(transition);
+            }
+            let option = self.choose(index, &features, &mut run.held);
+            run.next = Some((option, proposals.swap_remove(option)));
+        }
+        self.runs = runs;
+    }
+
+    /// Share of the step size by now: falls linearly over the steps of a training.
+    fn rate_share(&self) -> f32 {
+        let config = &self.config.decisions;
+        let done = self.world_steps as f32 / config.steps.max(1) as f32;
+        (1.0 - done).max(config.final_rate)
+    }
+
+    fn saved(&self) -> Result<Contents> {
+        let runs = self.runs.iter().map(Run::saved);
+        let belief = self.base.belief();
+        let state = SavedDecisions {
+            options: OPTIONS.map(|option| option.name.into()).into(),
+            estimator: self.base.kind,
+            belief: belief.map(SavedBelief::of),
+            world_steps: self.world_steps,
+            earned: self.earned,
+            dqn: self.dqn.saved(),
+            worlds: self.worlds.numbers.clone().zip(runs).collect(),
+        };
+        let of_belief = belief.map(belief_tensors).transpose()?;
+        let of_belief = of_belief.unwrap_or_default();
+        let tensors = self.dqn.named_tensors().into_iter().chain(of_belief);
+        Ok(Contents::new(tensors, &state))
+    }
+
+    /// Goes on from a checkpoint on the same base.
+    fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedDecisions = contents.state()?;
+        saved.load_into(&mut self.dqn, contents)?;
+        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
+        check(got == expected, "decisions.estimator", expected, got)?;
+        self.world_steps = saved.world_steps;
+        self.earned = saved.earned;
+        self.left = saved.worlds;
+        let n_states = self.base.state_names.len();
+        let mut left = self.left.values();
+        left.try_for_each(|left| left.check(n_states, self.worlds.shape()))
+    }
+}
+
+impl Learner for DecisionsLearner {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &["dqn_loss", "dqn_rate", "epsilon"]
+    }
+
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
+        let mut n_gone_on = 0;
+        for (world, observation) in self.worlds.numbers.clone().zip(observations) {
+            let left = self.left.remove(&world);
+            let run = match left.filter(|left| left.is_of(&observation)) {
+                Some(left) => {
+                    n_gone_on += 1;
+                    Run::restore(left, self.rollout_at(observation)?, &self.dqn)?
+                }
+                None => self.begun(observation)?,
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
+    }
+
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let begun = self.begun(observation)?;
+        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
+        let mut ended = std::mem::replace(run, begun);
+        if !self.is_frozen {
+            let start = Instant::now();
+            let transitions = ended.end(&self.dqn).into_iter();
+            transitions.for_each(|transition| self.dqn.remember(transition));
+            self.times[0].1 += start.elapsed();
+        }
+        Ok(())
+    }
+
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        self.decide();
+        let paths = self.runs.iter_mut().map(Run::take_up).collect();
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
+        let turns = see_all(rollouts, without_truth(observations))?;
+        let scale = self.config.decisions.reward_scale / self.worlds.n_moves as f32;
+        let mut tick = Tick::default();
+        for (run, turn) in self.runs.iter_mut().zip(turns) {
+            let reward = run.rollout.observation().robot.reward;
+            if let Some((_, scaled)) = &mut run.last {
+                *scaled = reward as f32 * scale;
+            }
+            tick.reward += reward;
+            tick.score += turn.score.unwrap_or_default();
+        }
+        tick.n_worlds = self.runs.len() as u64;
+        self.world_steps += tick.n_worlds;
+        tick.world_steps = self.world_steps;
+        self.earned += tick.n_worlds as f64 * self.config.decisions.updates_per_step;
+        Ok(tick)
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.runs[index].rollout
+    }
+
+    fn predict(&mut self) {
+        predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
+    }
+
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
+        let start = Instant::now();
+        let rate = self.config.decisions.rate * self.rate_share();
+        self.dqn.set_learning_rate(rate);
+        let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
+        let mut updates = Vec::new();
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            let Some(loss) = self.dqn.update()? else {
+                continue;
+            };
+            updates.push(ModelUpdate {
+                number: self.n_updates(),
+                loss: None,
+                rate: None,
+                more: [loss, rate, epsilon].map(|it| Some(it.into())).into(),
+            });
+        }
+        self.times[1].1 += start.elapsed();
+        Ok(updates)
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.world_steps
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.dqn.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        let (batch, n) = (self.dqn.settings().batch, self.dqn.n_remembered());
+        if n < batch {
+            return format!(
+                "an update learns from {batch} transitions, and the steps gave {n}; train for more --steps, or with a \
+                 smaller decisions.batch"
+            );
+        }
+        let rate = self.config.decisions.updates_per_step;
+        lacks_steps("decisions.updates_per_step", rate)
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let run = self.runs.first()?;
+        Some((run.rollout.agent.belief(), self.base.target))
+    }
+
+    fn contents(&self) -> Result<Contents> {
+        self.saved()
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        self.times.to_vec()
+    }
+}

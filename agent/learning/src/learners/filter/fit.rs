@@ -1,0 +1,439 @@
+//! What learns a model while an agent acts: replay in, parameters out. Pure.
+
+mod neighbours;
+
+pub use self::neighbours::Neighbours;
+
+use crate::checkpoint::{Contents, check, check_counts};
+use crate::config::{AgentConfig, LearningConfig};
+use crate::filter::{Optimiser, Update};
+use crate::learners::base::lacks_steps;
+use crate::learners::filter::form::{Form, check_zones, named_tensors, zones_tensor};
+use crate::replay::Replay;
+use crate::reward::{RewardEstimate, met};
+use anyhow::Result;
+use emberwatch_belief::estimation::Correlations;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_model::{Frame, Grid, Shape};
+use emberwatch_network::NamedTensor;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+pub const KIND: &str = "learned_filter";
+
+/// The same where kernels see the cell's own state.
+pub const OWN_KIND: &str = "learned_own_filter";
+
+/// Names of tensors end so: parameters, means and means of squares.
+const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
+
+/// More updates than a step of all worlds earns.
+const MAX_EARNED: f64 = 2e6;
+
+/// What was learned: all that acting on it needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LearnedModel {
+    /// The free numbers, and what they stand for.
+    pub parameters: Parameters,
+    pub tables: Tables,
+    pub target: usize,
+    /// How much that state of one cell says of its neighbours'.
+    pub correlations: Correlations,
+}
+
+impl LearnedModel {
+    pub fn new(parameters: Parameters, target: usize, correlations: Correlations) -> Self {
+        Self {
+            tables: parameters.tables(),
+            parameters,
+            target,
+            correlations,
+        }
+    }
+}
+
+/// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct FilterFit {
+    pub optimiser: Optimiser,
+    pub reward: RewardEstimate,
+    /// World steps seen, of all worlds together.
+    pub world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    pub earned: f64,
+    replay: Replay,
+    neighbours: Neighbours,
+}
+
+impl FilterFit {
+    /// Before the first frame.
+    pub fn new(
+        dimensions: Dimensions,
+        zones: Option<Arc<Grid<u8>>>,
+        shape: Shape,
+        config: &AgentConfig,
+    ) -> Self {
+        let parameters = Parameters::first(dimensions, config.seed).on_land(zones);
+        Self {
+            optimiser: Optimiser::new(parameters, shape, config.learning, config.seed),
+            reward: RewardEstimate::new(dimensions.n_states),
+            world_steps: 0,
+            earned: 0.0,
+            replay: replay(&config.learning),
+            neighbours: Neighbours::default(),
+        }
+    }
+
+    /// A world's track begins, for the first time or again.
+    pub fn begin(&mut self, world: u32) {
+        self.replay.begin(world);
+        self.neighbours
+            .begin(world, self.optimiser.cut().0.n_cells());
+    }
+
+    pub fn has_track(&self, world: u32) -> bool {
+        self.replay.has_track(world)
+    }
+
+    /// A world's next frame, the belief before it unless it is the first, and what was known then.
+    pub fn see(
+        &mut self,
+        world: u32,
+        frame: &Frame,
+        predictor: Option<&Belief>,
+        learned: &LearnedModel,
+    ) {
+        self.replay.push(world, frame, predictor);
+        let (tables, target) = (&learned.tables, learned.target);
+        self.neighbours.see(world, frame, predictor, tables, target);
+    }
+
+    /// The reward of a path that visited some cells, with the belief after its frame.
+    pub fn reward(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
+        let met = met(posterior, visited.iter().copied());
+        self.reward.add(&met, reward);
+        self.world_steps += 1;
+        self.earned += self.optimiser.config().updates_per_step;
+    }
+
+    /// Makes the updates that the steps since the last call have earned.
+    ///
+    /// # Errors
+    /// For numbers that are not finite; the parameters are those before.
+    pub fn learn(&mut self) -> Result<Vec<Update>> {
+        let mut updates = Vec::new();
+        let target = self.reward.target();
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            updates.extend(self.optimiser.update(&mut self.replay, target)?);
+        }
+        Ok(updates)
+    }
+
+    /// Forgets all frames, and every world's track; what was learned from them stays.
+    pub fn forget(&mut self) {
+        self.replay = replay(self.optimiser.config());
+        self.optimiser.leave_replay();
+        self.earned = 0.0;
+        self.neighbours.forget_worlds();
+    }
+
+    pub fn learned(&self) -> LearnedModel {
+        let parameters = self.optimiser.parameters();
+        let last = parameters.dimensions.n_states - 1;
+        let target = self.reward.target().unwrap_or(last);
+        let correlations = self.neighbours.correlations_of(target);
+        LearnedModel::new(parameters.clone(), target, correlations)
+    }
+
+    pub fn kind(&self) -> &'static str {
+        if self.optimiser.dimensions().sees_own_state {
+            OWN_KIND
+        } else {
+            KIND
+        }
+    }
+
+    /// Why a run of that many steps made no update, and what to do.
+    pub fn lacks(&self, steps: u64) -> String {
+        let config = self.optimiser.config();
+        let (expected, got) = (config.streams, self.replay.n_blocks());
+        if got < expected {
+            return format!(
+                "an update needs {expected} blocks of frames (learning.streams), and there were {got}; a block ends \
+                 after {} frames or with its episode: train for more --steps",
+                config.window * config.block_windows
+            );
+        }
+        if steps as f64 * config.updates_per_step < 1.0 {
+            return lacks_steps("learning.updates_per_step", config.updates_per_step);
+        }
+        "the frames show no cell".into()
+    }
+
+    pub fn n_updates(&self) -> u64 {
+        self.optimiser.adam.n_steps
+    }
+
+    /// Parameters and moments by name.
+    pub fn named_tensors(&self) -> Vec<NamedTensor> {
+        let adam = &self.optimiser.adam;
+        let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
+        let parts = SUFFIXES.into_iter().zip(parts);
+        let parts = parts.flat_map(|(suffix, part)| named_tensors(part, suffix));
+        parts
+            .chain(zones_tensor(self.optimiser.parameters()))
+            .collect()
+    }
+
+    /// Takes the tensors of a checkpoint that it is of.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn load(&mut self, contents: &Contents, form: &Form) -> Result<()> {
+        let counts = [
+            ("n_updates", self.n_updates()),
+            ("world_steps", self.world_steps),
+        ];
+        check_counts(&counts)?;
+        let part = contents.part("");
+        let [parameters, first, second] = SUFFIXES.map(|suffix| form.parameters(&part, suffix));
+        self.optimiser.set_parameters(parameters?);
+        (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
+        contents.check_squares()?;
+        self.reward.check(form.dimensions.n_states)
+    }
+
+    /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
+    /// than the settings say.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn resume(
+        mut saved: Self,
+        contents: &Contents,
+        dimensions: Dimensions,
+        zones: Option<Arc<Grid<u8>>>,
+        shape: Shape,
+        config: &AgentConfig,
+    ) -> Result<Self> {
+        let form = Form::read(dimensions, &contents.part(""))?;
+        let (expected, got) = (dimensions.n_matrices, form.dimensions.n_matrices);
+        check(got == expected, "observation matrices", expected, got)?;
+        check_zones(zones.as_deref(), form.zones.as_deref())?;
+        saved.load(contents, &form)?;
+        let mut fit = Self::new(dimensions, zones, shape, config);
+        if saved.optimiser.cut() == fit.optimiser.cut() {
+            let fits = (0.0..MAX_EARNED).contains(&saved.earned);
+            check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
+            fit.earned = saved.earned;
+            let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
+            let replay = &mut fit.replay;
+            replay.resume(saved.replay, shape, n_states, n_observations)?;
+            let n_cells = shape.n_cells();
+            let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+            check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
+        } else {
+            saved.neighbours.forget_worlds();
+        }
+        fit.optimiser.resume(saved.optimiser)?;
+        fit.reward = saved.reward;
+        fit.neighbours = saved.neighbours;
+        fit.world_steps = saved.world_steps;
+        Ok(fit)
+    }
+}
+
+fn replay(config: &LearningConfig) -> Replay {
+    Replay::new(config.window * config.block_windows, config.replay_frames)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint::Tensor;
+    use emberwatch_belief::estimation::belief::Belief;
+
+    const DIMENSIONS: Dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 2,
+        kernel: (1, 3),
+        sees_own_state: false,
+        n_zones: 0,
+        n_matrices: 1,
+    };
+
+    fn shape() -> Shape {
+        Shape::new(1, 3).expect("test shape")
+    }
+
+    fn config() -> AgentConfig {
+        let mut config = AgentConfig::default();
+        config.learning.window = 2;
+        config.learning.block_windows = 1;
+        config.learning.streams = 2;
+        config
+    }
+
+    fn see(fit: &mut FilterFit, values: &[u8]) {
+        let belief = Belief::uniform(3, shape());
+        for &value in values {
+            let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
+            let learned = fit.learned();
+            fit.see(4, &frame, Some(&belief), &learned);
+            let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
+            fit.reward(&belief, &visited, 0.3);
+            fit.learn().expect("finite");
+        }
+    }
+
+    fn fit() -> FilterFit {
+        let mut fit = FilterFit::new(DIMENSIONS, None, shape(), &config());
+        fit.begin(4);
+        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
+        fit
+    }
+
+    fn contents(fit: &FilterFit) -> Contents {
+        Contents::new(fit.named_tensors(), fit)
+    }
+
+    fn resume(
+        contents: &Contents,
+        dimensions: Dimensions,
+        config: &AgentConfig,
+    ) -> Result<FilterFit, String> {
+        let fit = contents.state().and_then(|saved| {
+            FilterFit::resume(saved, contents, dimensions, None, shape(), config)
+        });
+        fit.map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_learner_resumes_alike_unless_its_replay_is_cut_otherwise() {
+        let mut fit = fit();
+        assert!(fit.n_updates() > 0);
+        let stored = contents(&fit);
+        let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
+        assert!(same.has_track(4) && contents(&same) == stored);
+        let later = |fit: &mut FilterFit| see(fit, &[1, 0, 0, 1, 1]);
+        later(&mut fit);
+        later(&mut same);
+        assert!(contents(&same) == contents(&fit) && contents(&same) != stored);
+        let mut config = config();
+        config.learning.streams = 3;
+        let other = resume(&stored, DIMENSIONS, &config).expect("whole");
+        assert!(!other.has_track(4), "an empty replay");
+        assert_eq!(contents(&other).tensors, stored.tensors);
+    }
+
+    fn zones(zones: [u8; 3]) -> Option<Arc<Grid<u8>>> {
+        let zones = Grid::from_shape_vec((1, 3), zones.to_vec());
+        Some(Arc::new(zones.expect("a map")))
+    }
+
+    #[test]
+    fn zones_and_matrices_are_kept_in_checkpoints() {
+        let dimensions = Dimensions {
+            n_zones: 2,
+            n_matrices: 2,
+            ..DIMENSIONS
+        };
+        let mut fit = FilterFit::new(dimensions, zones([0, 1, 1]), shape(), &config());
+        fit.begin(4);
+        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
+        assert!(fit.n_updates() > 0);
+        let stored = contents(&fit);
+        let resume = |contents: &Contents, dimensions, zones| {
+            let saved = contents.state();
+            let fit = saved.and_then(|saved| {
+                FilterFit::resume(saved, contents, dimensions, zones, shape(), &config())
+            });
+            fit.map_err(|error| error.to_string())
+        };
+        let same = resume(&stored, dimensions, zones([0, 1, 1])).expect("whole");
+        assert!(contents(&same) == stored);
+        let error = |contents: &Contents, dimensions, map| {
+            resume(contents, dimensions, map).expect_err("others")
+        };
+        assert_eq!(
+            error(&stored, dimensions, zones([0, 0, 1])),
+            "zones: expected 2 on 1 x 3 cells, got another map"
+        );
+        assert_eq!(
+            error(&stored, DIMENSIONS, zones([0, 1, 1])),
+            "observation matrices: expected 1, got 2"
+        );
+        let forged = |change: fn(&mut Tensor), words: &str| {
+            let mut contents = stored.clone();
+            change(contents.tensors.get_mut("zones").expect("a map"));
+            let error = error(&contents, dimensions, zones([0, 1, 1]));
+            assert!(error.starts_with(words), "{error}");
+        };
+        forged(
+            |map| map.numbers[1] = 0.5,
+            "zones: expected zones from 0 to 255, got 0.5",
+        );
+        forged(
+            |map| map.numbers[1] = 255.0,
+            "zones: expected 2 on 1 x 3 cells, got 256 on 1 x 3 cells",
+        );
+        forged(
+            |map| map.shape = vec![3],
+            "zones: expected a map of a grid, got [3]",
+        );
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_by_name() {
+        let other = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = DIMENSIONS;
+            change(&mut dimensions);
+            let error = resume(&contents(&fit()), dimensions, &config()).expect_err(words);
+            assert_eq!(error, words);
+        };
+        other(
+            |dimensions| dimensions.kernel = (3, 3),
+            "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]",
+        );
+        other(
+            |dimensions| dimensions.n_observations = 4,
+            "likelihood: expected shape [3, 4], got [3, 2]",
+        );
+        let forged = |change: fn(&mut Contents, &mut FilterFit), words: &str| {
+            let (mut contents, mut saved) = (contents(&fit()), fit());
+            change(&mut contents, &mut saved);
+            contents.set_state(&saved);
+            let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
+            assert!(error.starts_with(words), "{error}");
+        };
+        forged(
+            |contents, _| drop(contents.tensors.remove("initial.first_moment")),
+            "initial.first_moment: expected shape [3], got none",
+        );
+        forged(
+            |contents, _| {
+                let tensor = contents.tensors.get_mut("kernel.second_moment");
+                tensor.expect("a moment").numbers[2] = -0.5;
+            },
+            "kernel.second_moment: expected numbers from 0 on, got -0.5",
+        );
+        forged(
+            |_, saved| saved.earned = 1e300,
+            "earned: expected 0 to 2000000, got 1",
+        );
+        forged(
+            |_, saved| saved.reward.rewards[1] = f64::NAN,
+            "reward.rewards: expected 3 finite numbers, got NaN",
+        );
+        forged(
+            |_, saved| saved.optimiser.adam.n_steps = u64::MAX,
+            "n_updates: expected at most",
+        );
+        forged(
+            |_, saved| saved.optimiser.streams.clear(),
+            "streams: expected 2, got 0",
+        );
+    }
+}

@@ -1,0 +1,77 @@
+//! A learned filter in a checkpoint: the learner, and where its robots are.
+
+use crate::checkpoint::check_belief;
+use crate::learners::base::{Place, place};
+use crate::learners::filter::fit::FilterFit;
+use crate::rollout::Rollout;
+use crate::rollout::agent::Agent;
+use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Shape;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// All of a learned filter's checkpoint but the tensors.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SavedFilter {
+    pub fit: FilterFit,
+    pub worlds: BTreeMap<u32, SavedWorld>,
+}
+
+/// Where a checkpoint left a world: what it showed, the belief about what comes next, and the estimate
+/// behind it, where paths are planned on that.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedWorld {
+    place: Place,
+    frame: Vec<u8>,
+    belief: Belief,
+    estimate: Option<Belief>,
+}
+
+impl SavedWorld {
+    pub fn of(rollout: &Rollout) -> Self {
+        let (agent, observation) = (&rollout.agent, rollout.observation());
+        Self {
+            place: place(observation),
+            frame: observation.frame.as_bytes().to_vec(),
+            belief: agent.belief().clone(),
+            estimate: agent.estimate().cloned(),
+        }
+    }
+
+    /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
+    /// and noise of sensors would all have to be the same.
+    pub fn is_of(&self, observation: &Observation) -> bool {
+        self.place == place(observation) && self.frame == observation.frame.as_bytes()
+    }
+
+    /// Whether any of these worlds shows what it showed then.
+    pub fn any_is_of(
+        all: &BTreeMap<u32, Self>,
+        worlds: Range<u32>,
+        observations: &[Observation],
+    ) -> bool {
+        worlds.zip(observations).any(|(world, observation)| {
+            let saved = all.get(&world);
+            saved.is_some_and(|saved| saved.is_of(observation))
+        })
+    }
+
+    /// Gives an agent the belief, and the estimate if its paths are planned on that.
+    pub fn restore(&self, agent: &mut Agent) {
+        let filter = agent.estimator_mut().handover_mut();
+        let is_taken = filter.is_some_and(|filter| filter.restore(&self.belief.to_bytes()));
+        debug_assert!(is_taken, "invariant: the belief was checked");
+        agent.remember_estimate(self.estimate.as_ref());
+    }
+
+    /// Refuses beliefs of another grid or about other states.
+    pub fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
+        check_belief("worlds.belief", &self.belief, n_states, shape)?;
+        self.estimate
+            .iter()
+            .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))
+    }
+}

@@ -1,0 +1,313 @@
+//! The paper's Algorithm 1: a dynamic autoencoder estimates, a DQN chooses what the next path is for,
+//! shooting finds the path, and both networks learn from every step.
+//!
+//! One iteration: `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
+//! rule (eq. 10), an action from `h` (eq. 17), a path for it (eq. 15), the path's frame and reward; then one
+//! step of Adam on each network (eq. 19), with step sizes of their own ([`crate::config::StepSize`]).
+
+mod progress;
+
+pub use self::progress::{Position, Progress, SavedNetwork};
+
+use self::progress::follower;
+use anyhow::Result;
+
+use crate::checkpoint::Contents;
+use crate::config::AgentConfig;
+use crate::estimation::{AutoencoderEstimator, Follower};
+use crate::learners::base::{Learner, Worlds, place, without_truth};
+use crate::policy::{Policy, numbered_states};
+use crate::reward::met;
+use crate::rollout::{Rollout, predict_all, see_all};
+use crate::update::{ModelUpdate, Tick};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
+use emberwatch_network::{Transition, Window};
+use std::time::{Duration, Instant};
+
+pub const KIND: &str = "autoencoder";
+
+const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
+
+/// An autoencoder and a DQN that are learned.
+pub struct NetworkLearner {
+    worlds: Worlds,
+    config: AgentConfig,
+    progress: Progress,
+    choices: Vec<Policy>,
+    /// Its world's, once it is attached.
+    rollout: Option<Rollout>,
+    /// The last decision, and the path that was planned for it.
+    decision: Option<Decision>,
+    is_frozen: bool,
+    times: [(&'static str, Duration); 3],
+}
+
+/// The action of a step, what it was chosen on, and the path for it.
+struct Decision {
+    input: Vec<f32>,
+    action: usize,
+    value: f32,
+    path: Vec<Move>,
+}
+
+impl NetworkLearner {
+    /// Goes on from some progress, or begins.
+    pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
+        Self {
+            choices: Policy::network_choices(progress.autoencoder.shape().n_states),
+            progress,
+            worlds,
+            config: config.clone(),
+            rollout: None,
+            decision: None,
+            is_frozen: false,
+            times: ["planning", "dqn", "autoencoder"].map(|part| (part, Duration::ZERO)),
+        }
+    }
+
+    /// A rollout whose hidden vector is where another was, before it takes in what its world shows.
+    fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
+        let network = &self.progress.autoencoder;
+        let estimator = AutoencoderEstimator::at(network, follower);
+        let names = numbered_states(network.shape().n_states);
+        let (policy, config) = (&self.choices[0], &self.config);
+        let worlds = &self.worlds;
+        worlds.rollout(config, policy, Box::new(estimator), names, observation)
+    }
+
+    fn at_world(&self) -> &Rollout {
+        let rollout = self.rollout.as_ref();
+        rollout.expect("invariant: a world begins before it is acted on")
+    }
+
+    fn at_world_mut(&mut self) -> &mut Rollout {
+        let rollout = self.rollout.as_mut();
+        rollout.expect("invariant: a world begins before it is acted on")
+    }
+
+    /// What the next action goes by: `h_{k+1}`, which has read the last frame.
+    fn input(&self) -> Vec<f32> {
+        follower(self.at_world()).hidden
+    }
+
+    fn decide(&self) -> Decision {
+        let (dqn, input) = (&self.progress.dqn, self.input());
+        let action = if self.is_frozen {
+            dqn.best(&input)
+        } else {
+            dqn.act(&input, self.progress.position.iterations)
+        };
+        Decision {
+            value: dqn.values(&input)[action],
+            input,
+            action,
+            path: Vec::new(),
+        }
+    }
+
+    /// Remembers what the last decision brought, and at the end of an episode the last ones before it.
+    fn remember(&mut self) {
+        let decision = self.decision.as_ref();
+        let decision = decision.expect("invariant: a step begins with a decision");
+        let Observation { world, robot, .. } = self.at_world().observation();
+        let is_over = world.truncated != 0 || world.terminated != 0;
+        let step = Transition {
+            input: decision.input.clone(),
+            action: decision.action,
+            reward: robot.reward as f32,
+            next: self.input(),
+            discount: self.progress.dqn.discount(world.terminated != 0),
+        };
+        let Progress { position, dqn, .. } = &mut self.progress;
+        let full = position.track.add(step);
+        let short = if is_over {
+            position.track.end()
+        } else {
+            Vec::new()
+        };
+        let transitions = full.into_iter().chain(short);
+        transitions.for_each(|transition| dqn.remember(transition));
+    }
+
+    fn update_dqn(&mut self) -> Result<[Option<f64>; 2]> {
+        let start = Instant::now();
+        let rate = self
+            .config
+            .dqn
+            .step_size
+            .at(self.progress.position.iterations);
+        self.progress.dqn.set_learning_rate(rate as f32);
+        let loss = self.progress.dqn.update();
+        self.times[1].1 += start.elapsed();
+        Ok([loss?.map(f64::from), Some(rate)])
+    }
+
+    fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2]> {
+        let start = Instant::now();
+        let number = self.progress.autoencoder.n_updates();
+        let config = &self.config.autoencoder;
+        let replay = &self.progress.replay;
+        let window = replay.window(config.window, self.config.seed, number);
+        let Some(window) = window.filter(Window::has_targets) else {
+            return Ok([None; 2]);
+        };
+        // Both step sizes go by the iteration, as eq. 20 compares them.
+        let rate = config.step_size.at(self.progress.position.iterations);
+        self.progress.autoencoder.set_learning_rate(rate as f32);
+        let loss = self.progress.autoencoder.update(&window);
+        self.times[2].1 += start.elapsed();
+        Ok([Some(loss?), Some(rate)])
+    }
+}
+
+impl Learner for NetworkLearner {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &COLUMNS
+    }
+
+    fn wants_full_frames(&self) -> bool {
+        !self.is_frozen && self.progress.position.iterations < self.config.autoencoder.full_frames
+    }
+
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
+        let observation = observations.remove(0);
+        let shown = self.progress.replay.frames().last();
+        let goes_on = self.progress.position.place == Some(place(&observation))
+            && shown == Some(&observation.frame);
+        if goes_on {
+            let follower = self.progress.position.follower.clone();
+            let mut rollout = self.rollout_at(follower, observation);
+            let estimate = self.progress.position.estimate.as_ref();
+            rollout.agent.remember_estimate(estimate);
+            self.rollout = Some(rollout);
+        } else {
+            self.begin(self.worlds.numbers.start, observation)?;
+        }
+        Ok(usize::from(goes_on))
+    }
+
+    fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
+        self.progress.position.track = self.progress.dqn.track();
+        self.progress.replay.begin();
+        self.progress.replay.push(observation.frame.clone());
+        let follower = Follower::new(&self.progress.autoencoder)?;
+        let mut rollout = self.rollout_at(follower, observation);
+        rollout.correct()?;
+        rollout.agent.predict();
+        self.rollout = Some(rollout);
+        Ok(())
+    }
+
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let mut decision = self.decide();
+        let objective = self.config.objective(&self.choices[decision.action]);
+        let rollout = self.at_world_mut();
+        let (cells, step) = (rollout.cells(), rollout.step());
+        decision.path = rollout
+            .agent
+            .plan_for(objective, &cells, step)
+            .remove(0)
+            .moves;
+        let paths = vec![decision.path.clone()];
+        self.decision = Some(decision);
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let turns = see_all(&mut self.rollout, without_truth(observations))?;
+        let (turn, rollout) = (&turns[0], self.at_world());
+        let path = self.decision.as_ref().map(|decision| &*decision.path);
+        let start = turn.before.robot.cell();
+        let paying = self.worlds.airspace.paying(start, path.unwrap_or_default());
+        let (met, observation) = (
+            met(rollout.agent.belief(), paying.into_iter()),
+            rollout.observation().clone(),
+        );
+        let position = &mut self.progress.position;
+        position.reward.add(&met, observation.robot.reward);
+        position.iterations += 1;
+        self.progress.replay.push(observation.frame);
+        Ok(Tick {
+            reward: observation.robot.reward,
+            score: turn.score.unwrap_or_default(),
+            n_worlds: 1,
+            world_steps: self.progress.position.iterations,
+        })
+    }
+
+    fn rollout(&self, _: usize) -> &Rollout {
+        self.at_world()
+    }
+
+    fn predict(&mut self) {
+        predict_all(&mut self.rollout);
+        self.remember();
+    }
+
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
+        let epsilon = self
+            .config
+            .dqn
+            .settings()
+            .epsilon_at(self.progress.position.iterations - 1);
+        let [dqn_loss, dqn_rate] = self.update_dqn()?;
+        let [loss, rate] = self.update_autoencoder()?;
+        let decision = self.decision.as_ref();
+        let more = vec![
+            dqn_loss,
+            dqn_rate,
+            decision.map(|decision| decision.action as f64),
+            decision.map(|decision| f64::from(decision.value)),
+            Some(f64::from(epsilon)),
+        ];
+        let number = self.n_updates();
+        Ok(vec![ModelUpdate {
+            number,
+            loss,
+            rate,
+            more,
+        }])
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.progress.position.iterations
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.progress.autoencoder.n_updates()
+    }
+
+    fn lacks(&self, _: u64) -> String {
+        format!(
+            "an update learns from a window of {} frames of one episode that see some cell twice, and there was none; \
+             train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
+             autoencoder.window",
+            self.config.autoencoder.window
+        )
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let rollout = self.rollout.as_ref()?;
+        Some((rollout.agent.belief(), self.progress.target()))
+    }
+
+    fn contents(&self) -> Result<Contents> {
+        Ok(self.progress.to_contents(self.at_world())?)
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        self.times.to_vec()
+    }
+}

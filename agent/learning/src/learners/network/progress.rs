@@ -1,0 +1,223 @@
+//! What Algorithm 1 has learned, and where it stands: as a checkpoint, and from one.
+
+use crate::checkpoint::{Contents, check, check_belief, check_counts, check_numbers, wrong};
+use crate::config::AgentConfig;
+use crate::estimation::Follower;
+use crate::learners::base::{Place, Worlds, place};
+use crate::policy::Policy;
+use crate::reward::RewardEstimate;
+use crate::rollout::Rollout;
+use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::BasisKind;
+use emberwatch_model::MAX_VALUES;
+use emberwatch_model::{Airspace, Frame, Shape};
+use emberwatch_network::{
+    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
+};
+use serde::{Deserialize, Serialize};
+
+/// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
+#[derive(Debug)]
+pub struct Progress {
+    pub autoencoder: Autoencoder,
+    pub dqn: Dqn,
+    /// What the paths are planned on that the DQN values.
+    pub basis: BasisKind,
+    /// The frames that are learned from.
+    pub replay: Replay,
+    pub position: Position,
+}
+
+/// Where Algorithm 1 stands in its world.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Position {
+    pub follower: Follower,
+    /// The estimate where paths are planned on it, as a checkpoint left it.
+    pub estimate: Option<Belief>,
+    /// The world's latest steps, for the DQN's replay.
+    pub track: Track,
+    pub reward: RewardEstimate,
+    pub iterations: u64,
+    /// Where the world is that the hidden vector knows, if any.
+    pub place: Option<Place>,
+}
+
+/// All of a checkpoint of Algorithm 1 but the tensors.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SavedNetwork {
+    pub shape: Shape,
+    /// Number of values that an observed cell may show.
+    pub n_observations: usize,
+    /// Steps of the autoencoder's Adam, and its updates.
+    pub counters: [u64; 2],
+    pub dqn: SavedDqn,
+    /// The replay, the oldest frame first.
+    pub frames: Vec<Vec<u8>>,
+    /// The places of frames with which tracks begin.
+    pub tracks: Vec<u64>,
+    pub position: Position,
+}
+
+impl Progress {
+    /// Before the first frame; the autoencoder computes on `device`.
+    pub fn first(
+        worlds: &Worlds,
+        config: &AgentConfig,
+        device: &Device,
+    ) -> Result<Self, NetworkError> {
+        let shape = network_shape(worlds.shape(), worlds.n_observations, config);
+        let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
+        let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
+        let n_actions = Policy::network_choices(n_states).len();
+        let actions = DqnShape::of_actions(settings.hidden, n_actions);
+        let dqn = Dqn::new(config.dqn.settings(), actions, config.seed);
+        let position = Position {
+            follower: Follower::new(&autoencoder)?,
+            estimate: None,
+            track: dqn.track(),
+            reward: RewardEstimate::new(n_states),
+            iterations: 0,
+            place: None,
+        };
+        Ok(Self {
+            autoencoder,
+            dqn,
+            basis: config.objective.belief,
+            replay: Replay::new(settings.replay),
+            position,
+        })
+    }
+
+    /// The state that pays most, as far as rewards tell by now.
+    pub fn target(&self) -> usize {
+        let reward = &self.position.reward;
+        reward.target().unwrap_or(reward.rewards.len() - 1)
+    }
+
+    /// As a checkpoint, without the settings: an agent stands in its world.
+    pub fn to_contents(&self, rollout: &Rollout) -> Result<Contents, NetworkError> {
+        let shape = self.autoencoder.shape();
+        let frames = self.replay.frames();
+        let state = SavedNetwork {
+            shape: shape.grid,
+            n_observations: shape.n_observations,
+            counters: self.autoencoder.counters(),
+            dqn: self.dqn.saved(),
+            frames: frames.map(|frame| frame.as_bytes().to_vec()).collect(),
+            tracks: self.replay.tracks().collect(),
+            position: Position {
+                follower: follower(rollout),
+                estimate: rollout.agent.estimate().cloned(),
+                place: Some(place(rollout.observation())),
+                ..self.position.clone()
+            },
+        };
+        let mut tensors = self.autoencoder.named_tensors()?;
+        tensors.extend(self.dqn.named_tensors());
+        Ok(Contents::new(tensors, &state))
+    }
+
+    /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
+    pub fn read(contents: &Contents, device: &Device) -> Result<Self> {
+        let config = contents.settings()?;
+        let saved: SavedNetwork = contents.state()?;
+        let (shape, n_observations) = (saved.shape, saved.n_observations);
+        let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
+        let fits = fits.contains(&n_observations);
+        check(fits, "n_observations", expected, n_observations)?;
+        let sizes = network_shape(shape, n_observations, &config);
+        check_size(contents, &sizes)?;
+        let prediction = saved.position.follower.prediction();
+        check_belief("prediction", prediction, sizes.n_states, shape)?;
+        let worlds = Worlds {
+            airspace: Airspace::open(shape),
+            zones: None,
+            n_observations,
+            n_moves: 0,
+            numbers: 0..1,
+        };
+        let mut progress = Self::first(&worlds, &config, device)?;
+        progress.load(contents)?;
+        Ok(progress)
+    }
+
+    /// Takes over a checkpoint of the same sizes.
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedNetwork = contents.state()?;
+        let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
+        check_counts(&[
+            ("adam_steps", saved.counters[0]),
+            ("updates", saved.counters[1]),
+            ("dqn.n_updates", n_updates),
+            ("iterations", position.iterations),
+        ])?;
+        contents.check_squares()?;
+        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
+        self.autoencoder.load(find, saved.counters)?;
+        self.dqn.load(find, &saved.dqn)?;
+        self.load_replay(&saved.frames, &saved.tracks)?;
+        let NetworkShape {
+            grid,
+            n_states,
+            hidden,
+            ..
+        } = *self.autoencoder.shape();
+        check_numbers("hidden", position.follower.hidden(), hidden)?;
+        let prediction = position.follower.prediction();
+        check_belief("prediction", prediction, n_states, grid)?;
+        let mut estimate = position.estimate.iter();
+        estimate.try_for_each(|estimate| check_belief("estimate", estimate, n_states, grid))?;
+        position.reward.check(n_states)?;
+        position.track = self.dqn.resume_track(position.track)?;
+        self.position = position;
+        Ok(())
+    }
+
+    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<()> {
+        let shape = self.autoencoder.shape();
+        let mut tracks = tracks.iter().peekable();
+        for (index, bytes) in (0..).zip(frames) {
+            if tracks.next_if_eq(&&index).is_some() {
+                self.replay.begin();
+            }
+            let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
+            let misfit = |error| wrong("frames", "frames of these worlds", error);
+            self.replay.push(frame.map_err(misfit)?);
+        }
+        Ok(())
+    }
+}
+
+/// What the network of an agent knows of its world, after a prediction.
+pub(super) fn follower(rollout: &Rollout) -> Follower {
+    let (agent, hidden) = (&rollout.agent, rollout.agent.estimator().hidden());
+    let hidden = hidden.expect("invariant: its estimator is an autoencoder");
+    Follower::at(hidden.to_vec(), agent.belief().clone())
+}
+
+fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> NetworkShape {
+    let settings = config.autoencoder.settings();
+    NetworkShape {
+        grid,
+        n_states: match config.autoencoder.states {
+            0 => n_observations,
+            states => states,
+        },
+        n_observations,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    }
+}
+
+/// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
+fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
+    let expected = shape.n_numbers();
+    let tensors = contents.tensors.values();
+    let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
+    let words = format!(
+        "the {expected} numbers or more of a network on a {} grid",
+        shape.grid
+    );
+    check(got >= expected, "tensors", words, got)
+}

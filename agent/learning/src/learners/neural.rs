@@ -1,0 +1,354 @@
+//! Learns the neural belief on several worlds at once, from masked frames alone (paper eqs. 8 and 11).
+//!
+//! Robots behave in ways that change: what is seen and what is not depends on behaviour, and the belief must hold for that
+//! of any policy. At first they explore; then most plan on the belief as it is.
+
+mod behaviour;
+mod replay;
+mod saved;
+
+pub use self::saved::{NeuralModel, SavedNeural, new_network};
+
+use self::behaviour::Behaviour;
+use self::replay::Replay;
+use self::saved::{SavedRun, estimator};
+use crate::checkpoint::{Contents, check};
+use crate::config::AgentConfig;
+use crate::learners::base::{Learner, Worlds, lacks_steps, without_truth};
+use crate::learners::filter::fit::LearnedModel;
+use crate::learners::filter::model::SavedModel;
+use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
+use crate::reward::{RewardEstimate, met};
+use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
+use crate::update::{ModelUpdate, Tick};
+use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::Target;
+use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
+use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_network::{Device, NeuralBelief};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+pub const KIND: &str = "neural_belief";
+
+pub struct NeuralLearner {
+    worlds: Worlds,
+    config: AgentConfig,
+    network: NeuralBelief,
+    /// The filter that it corrects, if it does.
+    filter: Option<Box<LearnedModel>>,
+    reward: RewardEstimate,
+    replay: Replay,
+    runs: Vec<Run>,
+    /// Where a checkpoint left the robots.
+    left: BTreeMap<u32, SavedRun>,
+    world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    earned: f64,
+    is_frozen: bool,
+    times: [(&'static str, Duration); 2],
+}
+
+/// A robot at its world.
+struct Run {
+    rollout: Rollout,
+    behaviour: Option<Behaviour>,
+    path: Vec<Move>,
+}
+
+impl NeuralLearner {
+    /// Before the first frame, or going on from a checkpoint. `filter`: what it is to correct.
+    pub fn new(
+        contents: Option<&Contents>,
+        filter: Option<&LearnedModel>,
+        worlds: Worlds,
+        config: &AgentConfig,
+        device: &Device,
+    ) -> Result<Self> {
+        let n_observations = worlds.n_observations;
+        let mut learner = Self {
+            network: NeuralBelief::new(n_observations, config.seed, device)?,
+            filter: filter.cloned().map(Box::new),
+            reward: RewardEstimate::new(n_observations),
+            replay: Replay::new(config.neural.replay_frames),
+            runs: Vec::new(),
+            left: BTreeMap::new(),
+            world_steps: 0,
+            earned: 0.0,
+            is_frozen: false,
+            times: ["planning", "updates"].map(|part| (part, Duration::ZERO)),
+            worlds,
+            config: config.clone(),
+        };
+        if let Some(contents) = contents {
+            learner.load(contents)?;
+        }
+        let mut filters = learner.filter.iter();
+        filters.try_for_each(|filter| filter.check_world(&learner.worlds.form()))?;
+        Ok(learner)
+    }
+
+    /// The value that pays most, as far as rewards tell by now.
+    fn target(&self) -> usize {
+        let last = self.worlds.n_observations - 1;
+        self.reward.target().unwrap_or(last)
+    }
+
+    /// What robots act by that plan on the belief.
+    fn policy(&self) -> Policy {
+        let target = Target::State(self.target());
+        Policy::new(
+            "neural_beam",
+            EstimatorKind::Neural,
+            PlannerKind::Beam,
+            target,
+        )
+    }
+
+    /// A robot before it takes in what its world shows.
+    fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
+        let filter = self.filter.as_deref();
+        let estimator = estimator(&self.network, filter, self.worlds.shape())?;
+        let names = numbered_states(self.worlds.n_observations);
+        let (policy, config) = (self.policy(), &self.config);
+        let estimator = Box::new(estimator);
+        Ok(self
+            .worlds
+            .rollout(config, &policy, estimator, names, observation))
+    }
+
+    /// A robot that has taken in what its world shows, with a track that begins there.
+    fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
+        let mut rollout = self.rollout_at(observation)?;
+        self.replay.begin(robot, self.worlds.shape());
+        let base = rollout.agent.estimator().base();
+        self.replay.push(robot, &rollout.observation().frame, base);
+        rollout.correct()?;
+        rollout.agent.predict();
+        Ok(Run {
+            rollout,
+            behaviour: None,
+            path: Vec::new(),
+        })
+    }
+
+    /// Share of the training that is done.
+    fn progress(&self) -> f64 {
+        self.world_steps as f64 / self.config.neural.steps.max(1) as f64
+    }
+
+    /// Step size: falls linearly over the steps of a training.
+    fn rate(&self) -> f64 {
+        let config = &self.config.neural;
+        config.rate * (1.0 - self.progress()).max(config.final_rate)
+    }
+
+    fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedNeural = contents.state()?;
+        let (expected, got) = (self.worlds.n_observations, saved.n_observations);
+        check(got == expected, "n_observations", expected, got)?;
+        saved.load_into(&mut self.network, contents)?;
+        self.filter = saved.filter(contents)?;
+        let shape = self.worlds.shape();
+        if saved.shape == shape {
+            saved.check_worlds()?;
+            self.replay.resume(saved.replay.into_owned());
+            (self.left, self.earned) = (saved.worlds, saved.earned);
+        }
+        (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
+        Ok(())
+    }
+}
+
+impl Run {
+    /// A run where a checkpoint left it, with a rollout that has not yet taken in what its world shows.
+    fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
+        saved.restore(&mut rollout.agent)?;
+        Ok(Self {
+            rollout,
+            behaviour: saved.behaviour,
+            path: Vec::new(),
+        })
+    }
+}
+
+impl Learner for NeuralLearner {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
+        let mut left = std::mem::take(&mut self.left);
+        let robots = self.worlds.numbers.clone().zip(&observations);
+        left.retain(|robot, left| {
+            let mut robots = robots.clone();
+            robots.any(|(other, observation)| other == *robot && left.is_of(observation))
+        });
+        if left.is_empty() {
+            // Frames of other worlds, perhaps of another model.
+            self.replay.forget();
+            self.earned = 0.0;
+        }
+        self.replay.end_others(&self.worlds.numbers);
+        let n_gone_on = left.len();
+        for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
+            let run = match left.remove(&robot) {
+                Some(left) => Run::restore(left, self.rollout_at(observation)?)?,
+                None => self.begun(robot, observation)?,
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
+    }
+
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let run = self.begun(robot, observation)?;
+        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
+        Ok(())
+    }
+
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let (policy, target, first) = (self.policy(), self.target(), self.worlds.numbers.start);
+        let objective = self.config.objective(&policy);
+        let is_exploring = self.progress() < self.config.neural.explore_share;
+        let (seed, step, is_frozen) = (self.config.seed, self.world_steps, self.is_frozen);
+        let mut runs = std::mem::take(&mut self.runs);
+        let paths = in_parallel(runs.iter_mut().enumerate(), |(index, run)| {
+            let (cells, k) = (run.rollout.cells(), run.rollout.step());
+            let agent = &mut run.rollout.agent;
+            let mut rng = stream(seed, Purpose::Exploration, step + index as u64);
+            let behaviour =
+                Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
+            let plans = if is_frozen {
+                agent.plan_for(objective, &cells, k)
+            } else {
+                let seen = || self.replay.present(first + index as u32);
+                let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
+                match behaviour.values(objective, airspace, target, belief, seen, &mut rng) {
+                    Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
+                    None => agent.walk(&cells, k),
+                }
+            };
+            run.behaviour = Some(behaviour);
+            run.path = plans
+                .into_iter()
+                .next()
+                .map_or(Vec::new(), |plan| plan.moves);
+            run.path.clone()
+        });
+        self.runs = runs;
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
+        let turns = see_all(rollouts, without_truth(observations))?;
+        let mut tick = Tick::default();
+        let runs = self.worlds.numbers.clone().zip(&self.runs);
+        for ((robot, run), turn) in runs.zip(turns) {
+            let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
+            let reward = observation.robot.reward;
+            let start = turn.before.robot.cell();
+            let paying = self.worlds.airspace.paying(start, &run.path);
+            self.reward.add(&met(belief, paying.into_iter()), reward);
+            let base = run.rollout.agent.estimator().base();
+            self.replay.push(robot, &observation.frame, base);
+            tick.reward += reward;
+            tick.score += turn.score.unwrap_or_default();
+        }
+        tick.n_worlds = self.runs.len() as u64;
+        self.world_steps += tick.n_worlds;
+        self.earned += tick.n_worlds as f64 * self.config.neural.updates_per_step;
+        tick.world_steps = self.world_steps;
+        Ok(tick)
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.runs[index].rollout
+    }
+
+    fn predict(&mut self) {
+        predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
+    }
+
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
+        let start = Instant::now();
+        let mut updates = Vec::new();
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            let mut rng = stream(self.config.seed, Purpose::Replay, self.n_updates());
+            let lessons = self.replay.lessons(self.config.neural.batch, &mut rng);
+            if lessons.is_empty() {
+                continue;
+            }
+            let rate = self.rate();
+            let loss = self.network.update(rate as f32, &lessons)?;
+            updates.push(ModelUpdate {
+                number: self.n_updates(),
+                loss: Some(loss),
+                rate: Some(rate),
+                more: Vec::new(),
+            });
+        }
+        self.times[1].1 += start.elapsed();
+        Ok(updates)
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.world_steps
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.network.n_updates()
+    }
+
+    fn lacks(&self, steps: u64) -> String {
+        let rate = self.config.neural.updates_per_step;
+        if (steps as f64) * rate < 1.0 {
+            return lacks_steps("neural.updates_per_step", rate);
+        }
+        "the frames show no cell".into()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let run = self.runs.first()?;
+        Some((run.rollout.agent.belief(), self.target()))
+    }
+
+    fn contents(&self) -> Result<Contents> {
+        let runs = self.runs.iter();
+        let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
+        let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
+        let state = SavedNeural {
+            shape: self.worlds.shape(),
+            n_observations: self.worlds.n_observations,
+            n_updates: self.n_updates(),
+            world_steps: self.world_steps,
+            earned: self.earned,
+            filter: self.filter.as_deref().map(SavedModel::of),
+            reward: Cow::Borrowed(&self.reward),
+            replay: Cow::Borrowed(&self.replay),
+            worlds,
+        };
+        let filter = self.filter.iter().flat_map(|it| it.corrected_tensors());
+        let tensors = self.network.named_tensors()?.into_iter().chain(filter);
+        Ok(Contents::new(tensors, &state))
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        self.times.to_vec()
+    }
+}

@@ -1,0 +1,230 @@
+//! How a robot flies for some steps while a belief is learned: what is worth seeing to it.
+
+use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::planning::{CellValues, Objective};
+use emberwatch_model::{Airspace, Grid, Shape};
+use emberwatch_network::Sightings;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::Rng;
+use serde::{Deserialize, Serialize};
+
+/// Chance of another behaviour at a step: one in so many.
+const STEPS: u64 = 20;
+
+/// Steps in which a seen cell becomes as good as new to a robot that covers the grid, and in which it forgets what it saw.
+const FADING_STEPS: [f32; 2] = [300.0, 100.0];
+
+/// What a robot flies for, and where it flies if that is far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Behaviour {
+    aim: Aim,
+    goal: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+enum Aim {
+    /// Random moves.
+    Walk,
+    /// What was not seen for long.
+    Cover,
+    /// A cell.
+    Far,
+    /// Where what pays was seen last.
+    Last,
+    /// What is believed to pay, and so many tenths of the belief's entropy.
+    Exploit { entropy: u8 },
+}
+
+/// Aims with their chances in per cent: while exploring, and later.
+const AIMS: [(Aim, [u64; 2]); 8] = [
+    (Aim::Walk, [20, 4]),
+    (Aim::Cover, [30, 8]),
+    (Aim::Far, [10, 8]),
+    (Aim::Last, [40, 5]),
+    (Aim::Exploit { entropy: 0 }, [0, 30]),
+    (Aim::Exploit { entropy: 1 }, [0, 15]),
+    (Aim::Exploit { entropy: 3 }, [0, 15]),
+    (Aim::Exploit { entropy: 10 }, [0, 15]),
+];
+
+impl Behaviour {
+    /// The one before, or another one.
+    pub fn next(
+        before: Option<Self>,
+        is_exploring: bool,
+        shape: Shape,
+        rng: &mut ChaCha8Rng,
+    ) -> Self {
+        let changes = rng.next_u64().is_multiple_of(STEPS);
+        if let Some(before) = before.filter(|_| !changes) {
+            return before;
+        }
+        let stage = usize::from(!is_exploring);
+        let mut chance = rng.next_u64() % 100;
+        let mut aims = AIMS.iter().skip_while(|(_, chances)| {
+            let is_passed = chance >= chances[stage];
+            chance = chance.saturating_sub(chances[stage]);
+            is_passed
+        });
+        let aim = aims.next().map_or(Aim::Walk, |(aim, _)| *aim);
+        let goal = (rng.next_u64() % shape.n_cells() as u64) as usize;
+        Self { aim, goal }
+    }
+
+    /// What each cell is worth in an airspace; `None` for random moves. `target`: the value that pays most; `seen`: what was
+    /// seen by now.
+    pub fn values(
+        &self,
+        objective: Objective,
+        airspace: &Airspace,
+        target: usize,
+        belief: &Belief,
+        seen: impl Fn() -> Sightings,
+        rng: &mut ChaCha8Rng,
+    ) -> Option<CellValues> {
+        match self.aim {
+            Aim::Walk => None,
+            Aim::Cover => {
+                let value = self.value(&seen(), target, rng);
+                Some(CellValues::in_sight_of(airspace, value))
+            }
+            Aim::Far | Aim::Last => {
+                let value = self.value(&seen(), target, rng);
+                Some(CellValues::new(value, 0.0).within(airspace, None))
+            }
+            Aim::Exploit { entropy } => {
+                let mut values = objective.values_in(belief, airspace);
+                if entropy > 0 {
+                    let weight = f32::from(entropy) / 10.0;
+                    values.add_in_sight(weight, &belief.entropy(EntropyKind::Sum));
+                }
+                Some(values)
+            }
+        }
+    }
+
+    /// Without a belief.
+    fn value(&self, seen: &Sightings, target: usize, rng: &mut ChaCha8Rng) -> Grid<f32> {
+        let shape = seen.shape();
+        let (height, width) = shape.dim();
+        let goal = shape.cell(self.goal);
+        let fresh = |age: u32, steps: f32| (-(age as f32) / steps).exp();
+        let value = |cell: usize| {
+            let noise = (rng.next_u32() >> 8) as f32 / (1 << 24) as f32;
+            let last = seen.last(cell);
+            let at = shape.cell(cell);
+            match self.aim {
+                Aim::Far => {
+                    let distance = at.row.abs_diff(goal.row) + at.col.abs_diff(goal.col);
+                    0.3 * ((height + width - distance) as f32 + noise)
+                }
+                Aim::Last => {
+                    let age = last.map_or(0.0, |(_, age)| fresh(age, FADING_STEPS[1]));
+                    let pays = last.is_some_and(|(value, _)| usize::from(value) == target);
+                    0.05 * (1.0 - age + noise) + if pays { age } else { 0.0 }
+                }
+                _ => 1.0 - last.map_or(0.0, |(_, age)| fresh(age, FADING_STEPS[0])),
+            }
+        };
+        let values = (0..shape.n_cells()).map(value).collect();
+        Grid::from_shape_vec(shape.dim(), values).expect("invariant: one value per cell")
+    }
+
+    /// In a word, for observers.
+    pub fn label(&self) -> &'static str {
+        match self.aim {
+            Aim::Walk => "random moves",
+            Aim::Cover => "coverage",
+            Aim::Far => "a far cell",
+            Aim::Last => "what was seen to pay",
+            Aim::Exploit { entropy: 0 } => "what pays",
+            Aim::Exploit { .. } => "what pays, and entropy",
+        }
+    }
+
+    /// Whether its goal lies on a grid.
+    pub fn is_of(&self, shape: Shape) -> bool {
+        self.goal < shape.n_cells()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_model::Model;
+    use emberwatch_model::randomness::{Purpose, stream};
+
+    fn shape() -> Shape {
+        Shape::new(3, 4).expect("test shape")
+    }
+
+    #[test]
+    fn chances_are_whole_and_behaviours_last() {
+        for stage in [0, 1] {
+            let sum: u64 = AIMS.iter().map(|(_, chances)| chances[stage]).sum();
+            assert_eq!(sum, 100);
+        }
+        let mut rng = stream(1, Purpose::Exploration, 0);
+        let (mut behaviour, mut counts, mut n_changes) = (None, [0; AIMS.len()], 0);
+        for _ in 0..20_000 {
+            let next = Behaviour::next(behaviour, false, shape(), &mut rng);
+            n_changes += u32::from(behaviour != Some(next));
+            let aim = AIMS.iter().position(|(aim, _)| *aim == next.aim);
+            counts[aim.expect("an aim")] += 1;
+            behaviour = Some(next);
+        }
+        // A thousand draws, some the same as before: 8 in 100 keep aim and goal.
+        assert!((850..1050).contains(&n_changes), "{n_changes}");
+        for (count, (aim, chances)) in counts.iter().zip(AIMS) {
+            // Shares of 1,000 draws: three standard deviations are .045 at most, lengths vary too.
+            let share = f64::from(*count) / 20_000.0;
+            assert!(
+                (share - chances[1] as f64 / 100.0).abs() < 0.08,
+                "{aim:?} {share}"
+            );
+        }
+    }
+
+    #[test]
+    fn each_aim_is_worth_most_where_it_leads() {
+        let mut seen = Sightings::new(shape());
+        let cells = (0..12).filter(|cell| *cell != 7);
+        cells.for_each(|cell| seen.see_cell(cell, u8::from(cell == 2)));
+        seen.pass();
+        let belief = Belief::uniform(2, shape());
+        let objective = Objective::new(emberwatch_belief::planning::Target::State(1));
+        let best = |aim| {
+            let mut rng = stream(1, Purpose::Exploration, 0);
+            let behaviour = Behaviour { aim, goal: 11 };
+            let airspace = Airspace::open(shape());
+            let values =
+                behaviour.values(objective, &airspace, 1, &belief, || seen.clone(), &mut rng);
+            let values = values.expect("values");
+            let values = values.value().iter().copied().collect::<Vec<_>>();
+            let best = (0..12).max_by(|&a, &b| values[a].total_cmp(&values[b]));
+            (best.expect("cells"), values[0])
+        };
+        assert_eq!(best(Aim::Cover).0, 7);
+        assert_eq!(best(Aim::Far).0, 11);
+        assert_eq!(best(Aim::Last).0, 2);
+        assert_eq!(best(Aim::Exploit { entropy: 0 }).1, 0.5);
+        let with_entropy = best(Aim::Exploit { entropy: 3 }).1;
+        assert!((with_entropy - 0.5 - 0.3 * 2_f32.ln()).abs() < 1e-6);
+        // With a wider sensor, covering and entropy are of what is seen.
+        let model = Model::wildfire().with_radius(1).expect("a radius");
+        let wide = model.airspace(shape()).expect("an airspace");
+        for (aim, in_sight) in [
+            (Aim::Cover, true),
+            (Aim::Far, false),
+            (Aim::Exploit { entropy: 0 }, false),
+            (Aim::Exploit { entropy: 3 }, true),
+        ] {
+            let mut rng = stream(1, Purpose::Exploration, 0);
+            let behaviour = Behaviour { aim, goal: 11 };
+            let values = behaviour.values(objective, &wide, 1, &belief, || seen.clone(), &mut rng);
+            let values = values.expect("values");
+            assert_eq!(values.in_sight().is_some(), in_sight, "{aim:?}");
+            assert_eq!(values.airspace(), &wide);
+        }
+    }
+}

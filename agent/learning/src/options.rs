@@ -1,0 +1,156 @@
+//! Beliefs about worlds of one robot each, and the plan of every option, for a learner that chooses among the options.
+//! Pure: the caller flies the paths.
+
+use crate::config::AgentConfig;
+use crate::learned::Learned;
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::registry::{self, Task};
+use crate::rollout::agent::Agent;
+use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::{Proposal, Target};
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_model::{Cell, Frame, Model, Shape};
+use std::time::{Duration, Instant};
+
+/// The planner settings of all options.
+pub struct Crew {
+    model: Model,
+    shape: Shape,
+    n_moves: usize,
+    config: AgentConfig,
+    learned: Learned,
+    policy: Policy,
+}
+
+/// The belief about one world, and the plans of all options in it.
+pub struct Planned {
+    agent: Agent,
+    /// In the order of [`emberwatch_belief::planning::OPTIONS`].
+    proposals: Vec<Proposal>,
+    /// Planning time.
+    planning: Duration,
+}
+
+/// The observation of a world after a step or a reset.
+#[derive(Debug, Clone)]
+pub struct Shown {
+    pub frame: Frame,
+    /// Reward of the last path; `None` before the first.
+    pub reward: Option<f64>,
+}
+
+impl Crew {
+    /// `estimator`: keeps the beliefs. `None`: the checkpoint's estimator, or the known model's filter without one.
+    ///
+    /// # Errors
+    /// If the checkpoint lacks the estimator, or comes from worlds of another form. The message begins with `checkpoint`.
+    pub fn new(
+        estimator: Option<EstimatorKind>,
+        learned: Learned,
+        model: Model,
+        shape: Shape,
+        n_moves: usize,
+    ) -> Result<Self> {
+        let kind = estimator.unwrap_or_else(|| learned.estimator());
+        let label = kind.label();
+        ensure!(
+            learned.network.is_none(),
+            "checkpoint: expected one of a belief that options are planned on, such as {label}, got an autoencoder's"
+        );
+        if kind.is_learned() {
+            let belief = learned.belief(kind);
+            belief
+                .with_context(|| format!("checkpoint: expected one of a {label}, got none"))?
+                .check_world(&registry::world_form(&model))?;
+        }
+        let target = Target::State(model.target_state());
+        Ok(Self {
+            policy: Policy::new("options", kind, PlannerKind::Beam, target),
+            model,
+            shape,
+            n_moves,
+            config: AgentConfig::default(),
+            learned,
+        })
+    }
+
+    pub fn estimator(&self) -> EstimatorKind {
+        self.policy.estimator
+    }
+
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Moves of a path.
+    pub fn n_moves(&self) -> usize {
+        self.n_moves
+    }
+
+    /// Creates a belief before the first frame. `prior`: the first belief of filters that know the model.
+    pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<Planned> {
+        let task = Task {
+            model: &self.model,
+            shape: self.shape,
+            n_moves: self.n_moves,
+            prior,
+            seed: self.config.planner_seed(world_seed),
+            learned: &self.learned,
+        };
+        Ok(Planned {
+            agent: registry::agent(&self.policy, &self.config, task)?,
+            proposals: Vec::new(),
+            planning: Duration::ZERO,
+        })
+    }
+}
+
+impl Planned {
+    /// Corrects the belief with a frame: it is the posterior afterwards.
+    pub fn see(&mut self, shown: &Shown) -> Result<()> {
+        self.agent.correct(&shown.frame, None)?;
+        if let Some(reward) = shown.reward {
+            self.agent.earn(reward);
+        }
+        Ok(())
+    }
+
+    pub fn predict(&mut self) {
+        self.agent.predict();
+    }
+
+    /// Plans all options from the robot's cell.
+    pub fn plan(&mut self, robot: Cell) {
+        let start = Instant::now();
+        self.proposals = self.agent.propose(robot);
+        self.planning = start.elapsed();
+    }
+
+    /// Features and paths of the last plans, in the order of `OPTIONS`; empty before the first plan.
+    pub fn proposals(&self) -> &[Proposal] {
+        &self.proposals
+    }
+
+    /// The last flown option, for observers.
+    pub fn intent(&mut self, flown: Option<usize>) -> Intent {
+        if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
+            self.agent
+                .take_up(flown.unwrap_or_default(), proposal.clone());
+        }
+        self.agent.intent(self.planning)
+    }
+
+    pub fn agent(&self) -> &Agent {
+        &self.agent
+    }
+
+    /// Continues from the belief that another agent left, like [`Agent::take_over`].
+    pub fn take_over(&mut self, kind: &str, bytes: &[u8]) -> bool {
+        self.agent.handover_kind().is_some_and(|own| own == kind) && self.agent.take_over(bytes)
+    }
+}

@@ -1,0 +1,367 @@
+//! Recent frames of one or more worlds, in blocks that learners run through.
+//!
+//! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
+//! length, the last of which may be shorter; a block keeps the belief before its first frame, which the learner that
+//! runs through the block before it renews. Frames of a block that is not full yet are not replayed while their
+//! track goes on. The oldest blocks go when there is no room.
+
+use crate::checkpoint::{check, check_counts, check_numbers, wrong};
+use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_model::{Frame, Probabilities, Shape};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sighting {
+    pub cell: u32,
+    pub value: u8,
+}
+
+/// Consecutive frames of one track, at least one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Block {
+    pub frames: Vec<Vec<Sighting>>,
+    /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
+    pub start: Option<Vec<f32>>,
+    /// The block that follows on its track.
+    next: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Replay {
+    block_length: usize,
+    max_frames: usize,
+    full: BTreeMap<u64, Block>,
+    /// The block that each world's frames go into, by world.
+    open: BTreeMap<u32, (u64, Block)>,
+    n_opened: u64,
+}
+
+impl Replay {
+    /// Room for `max_frames` frames, in blocks of at most `block_length`; for one block at least.
+    pub fn new(block_length: usize, max_frames: usize) -> Self {
+        Self {
+            block_length,
+            max_frames,
+            full: BTreeMap::new(),
+            open: BTreeMap::new(),
+            n_opened: 0,
+        }
+    }
+
+    /// Begins a new track of a world; the last block of the one before ends here.
+    pub fn begin(&mut self, world: u32) {
+        let block = self.new_block(None);
+        if let Some((number, last)) = self.open.insert(world, block)
+            && !last.frames.is_empty()
+        {
+            self.keep(number, last);
+        }
+    }
+
+    pub fn has_track(&self, world: u32) -> bool {
+        self.open.contains_key(&world)
+    }
+
+    /// Adds the next frame of a world's track, and the belief before it where there is one.
+    ///
+    /// # Panics
+    /// If the world's track was not begun.
+    pub fn push(&mut self, world: u32, frame: &Frame, before: Option<&Belief>) {
+        let sighting = |(cell, value)| Sighting {
+            cell: cell as u32,
+            value,
+        };
+        let sightings = frame.observed().map(sighting).collect();
+        let (_, block) = self.open.get_mut(&world).expect("a track that was begun");
+        if block.frames.is_empty() && block.start.is_some() {
+            block.start = before.map(|belief| belief.as_slice().to_vec());
+        }
+        block.frames.push(sightings);
+        if block.frames.len() == self.block_length {
+            // An empty belief stands for one that is still to be given.
+            let following = self.new_block(Some(Vec::new()));
+            let next = following.0;
+            if let Some((id, mut block)) = self.open.insert(world, following) {
+                block.next = next;
+                self.keep(id, block);
+            }
+        }
+    }
+
+    pub fn n_blocks(&self) -> usize {
+        self.full.len()
+    }
+
+    /// Numbers of the blocks that are full or ended, oldest first.
+    pub fn blocks(&self) -> impl Iterator<Item = u64> + '_ {
+        self.full.keys().copied()
+    }
+
+    /// Such a block that is still there.
+    pub fn block(&self, number: u64) -> Option<&Block> {
+        self.full.get(&number)
+    }
+
+    /// Hands the belief at the end of a block on to the block after it.
+    pub fn hand_on(&mut self, number: u64, belief: &[f32]) {
+        let Some(next) = self.full.get(&number).map(|block| block.next) else {
+            return;
+        };
+        if let Some(block) = self.full.get_mut(&next) {
+            block.start = Some(belief.to_vec());
+        }
+    }
+
+    /// Goes on from another replay with blocks of the same length; of more blocks than fit, the newest stay.
+    pub fn resume(
+        &mut self,
+        other: Self,
+        shape: Shape,
+        n_states: usize,
+        n_observations: usize,
+    ) -> Result<()> {
+        let full = other
+            .full
+            .iter()
+            .map(|(number, block)| (*number, block, true));
+        let open = other.open.values();
+        let open = open.map(|(number, block)| (*number, block, false));
+        for (number, block, is_full) in full.chain(open) {
+            let fits = number < other.n_opened;
+            check(fits, "replay.blocks", "numbers of opened blocks", number)?;
+            let (n_frames, most) = (block.frames.len(), self.block_length);
+            let expected = if is_full { 1..=most } else { 0..=most - 1 };
+            check(
+                expected.contains(&n_frames),
+                "replay.frames",
+                format_args!("blocks of {expected:?} frames"),
+                n_frames,
+            )?;
+            block.check(shape, n_states, n_observations)?;
+        }
+        check_counts(&[("replay.n_opened", other.n_opened)])?;
+        (self.full, self.open, self.n_opened) = (other.full, other.open, other.n_opened);
+        self.drop_oldest();
+        Ok(())
+    }
+
+    fn keep(&mut self, number: u64, block: Block) {
+        self.full.insert(number, block);
+        self.drop_oldest();
+    }
+
+    fn drop_oldest(&mut self) {
+        let mut n_frames: usize = self.full.values().map(|block| block.frames.len()).sum();
+        while n_frames > self.max_frames && self.full.len() > 1 {
+            let oldest = self.full.pop_first();
+            n_frames -= oldest.map_or(0, |(_, block)| block.frames.len());
+        }
+    }
+
+    fn new_block(&mut self, start: Option<Vec<f32>>) -> (u64, Block) {
+        let number = self.n_opened;
+        self.n_opened += 1;
+        let block = Block {
+            frames: Vec::with_capacity(self.block_length),
+            start,
+            next: u64::MAX,
+        };
+        (number, block)
+    }
+}
+
+impl Block {
+    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<()> {
+        for Sighting { cell, value } in self.frames.iter().flatten().copied() {
+            let fits = (cell as usize) < shape.n_cells();
+            check(fits, "replay.cell", format_args!("cells of {shape}"), cell)?;
+            let fits = usize::from(value) < n_observations;
+            check(
+                fits,
+                "replay.value",
+                format_args!("values below {n_observations}"),
+                value,
+            )?;
+        }
+        match self.start.as_deref() {
+            None => Ok(()),
+            // Still to be given.
+            Some([]) if self.frames.is_empty() => Ok(()),
+            Some(start) => {
+                let dim = (n_states, shape.height(), shape.width());
+                check_numbers("replay.start", start, n_states * shape.n_cells())?;
+                let start = Probabilities::from_shape_vec(dim, start.to_vec());
+                let start = start.expect("invariant: as many numbers");
+                let start = Belief::from_probabilities(start).map(drop);
+                start.map_err(|error| wrong("replay.start", "a belief", error))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_model::Probabilities;
+
+    fn frame(value: u8) -> Frame {
+        let shape = Shape::new(1, 3).expect("test shape");
+        Frame::from_bytes(shape, 9, &[255, value, 255]).expect("test frame")
+    }
+
+    /// About two states of three cells, another for each number.
+    fn belief(number: u8) -> Belief {
+        let p = f32::from(number) / 16.0;
+        let states = Probabilities::from_shape_fn((2, 1, 3), |(state, _, _)| [p, 1.0 - p][state]);
+        Belief::from_probabilities(states).expect("valid")
+    }
+
+    /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
+    fn replay(n_frames: u8) -> Replay {
+        let mut replay = Replay::new(2, 7);
+        replay.begin(0);
+        replay.begin(5);
+        (0..n_frames).for_each(|value| see(&mut replay, value));
+        replay
+    }
+
+    fn see(replay: &mut Replay, value: u8) {
+        for world in [0, 5] {
+            replay.push(world, &frame(value), Some(&belief(value)));
+        }
+    }
+
+    #[test]
+    fn frames_come_back_in_blocks_of_their_world() {
+        let replay = replay(3);
+        assert_eq!(replay.blocks().collect::<Vec<_>>(), [0, 1]);
+        let block = replay.block(1).expect("kept");
+        let seen = |value| vec![Sighting { cell: 1, value }];
+        assert_eq!(block.frames, [seen(0), seen(1)]);
+        assert_eq!(block.start, None);
+        assert_eq!(replay.block(2), None, "not full");
+    }
+
+    #[test]
+    fn old_blocks_go_when_there_is_no_room() {
+        let replay = replay(6);
+        assert_eq!(replay.blocks().collect::<Vec<_>>(), [3, 4, 5]);
+        let mut short = Replay::new(2, 7);
+        for _ in 0..9 {
+            short.begin(0);
+            short.push(0, &frame(1), None);
+        }
+        assert_eq!(short.blocks().collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7]);
+    }
+
+    #[test]
+    fn beliefs_are_handed_on_along_a_track() {
+        let mut replay = replay(4);
+        let start = |replay: &Replay, number| replay.block(number).and_then(|it| it.start.clone());
+        let given = Some(belief(2).as_slice().to_vec());
+        assert_eq!(start(&replay, 2), given);
+        replay.hand_on(1, &[9.0]);
+        assert_eq!(start(&replay, 2), given);
+        assert_eq!(start(&replay, 3), Some(vec![9.0]));
+        replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
+        replay.hand_on(77, &[8.0]);
+    }
+
+    #[test]
+    fn a_track_ends_with_a_shorter_block() {
+        let mut replay = replay(3);
+        replay.begin(0);
+        replay.push(0, &frame(7), Some(&belief(7)));
+        replay.push(0, &frame(8), None);
+        let kept = replay.blocks().map(|number| {
+            let block = replay.block(number).expect("kept");
+            (number, block.frames.len(), block.start.clone())
+        });
+        let expected = [
+            (0, 2, None),
+            (1, 2, None),
+            (2, 1, Some(belief(2).as_slice().to_vec())),
+            (4, 2, None),
+        ];
+        assert_eq!(kept.collect::<Vec<_>>(), expected);
+        replay.hand_on(2, &[8.0]); // nobody to hand on to
+        replay.begin(0);
+        replay.begin(0);
+        assert_eq!(replay.blocks().last(), Some(4), "without frames no block");
+        assert_eq!(resumed(replay.clone()).expect("whole"), replay);
+    }
+
+    fn resumed(other: Replay) -> Result<Replay> {
+        let mut replay = Replay::new(2, 7);
+        let shape = Shape::new(1, 3).expect("test shape");
+        replay.resume(other, shape, 2, 9).map(|()| replay)
+    }
+
+    #[test]
+    fn a_replay_goes_on_alike_and_the_newest_blocks_stay() {
+        for n_frames in 0..9 {
+            let mut before = replay(n_frames);
+            let mut after = resumed(before.clone()).expect("whole");
+            for value in 0..4 {
+                assert_eq!(before, after, "{n_frames} frames, then {value}");
+                see(&mut before, value);
+                see(&mut after, value);
+            }
+        }
+        let mut longer = replay(1);
+        longer.max_frames += 9;
+        (1..8).for_each(|value| see(&mut longer, value));
+        assert_eq!(longer.n_blocks(), 8);
+        let shorter = resumed(longer).expect("whole");
+        assert_eq!(shorter.blocks().collect::<Vec<_>>(), [5, 6, 7]);
+    }
+
+    #[test]
+    fn what_no_replay_holds_is_named() {
+        let check = |change: fn(&mut Replay), words: &str| {
+            let mut other = replay(5);
+            change(&mut other);
+            assert_eq!(resumed(other).expect_err(words).to_string(), words);
+        };
+        fn full(replay: &mut Replay) -> &mut Block {
+            replay.full.get_mut(&2).expect("kept")
+        }
+        check(
+            |replay| full(replay).frames[1][0].cell = 3,
+            "replay.cell: expected cells of 1 x 3, got 3",
+        );
+        check(
+            |replay| full(replay).frames[1][0].value = 9,
+            "replay.value: expected values below 9, got 9",
+        );
+        check(
+            |replay| full(replay).frames.clear(),
+            "replay.frames: expected blocks of 1..=2 frames, got 0",
+        );
+        check(
+            |replay| full(replay).frames.push(Vec::new()),
+            "replay.frames: expected blocks of 1..=2 frames, got 3",
+        );
+        check(
+            |replay| replay.n_opened = 3,
+            "replay.blocks: expected numbers of opened blocks, got 3",
+        );
+        check(
+            |replay| replay.n_opened = u64::MAX,
+            "replay.n_opened: expected at most 9007199254740992, got 18446744073709551615",
+        );
+        let lengths = "replay.start: expected 6 finite numbers, got 0";
+        check(|replay| full(replay).start = Some(Vec::new()), lengths);
+        check(
+            |replay| full(replay).start = Some(vec![f32::NAN; 6]),
+            "replay.start: expected 6 finite numbers, got NaN",
+        );
+        check(
+            |replay| full(replay).start = Some(vec![0.25; 6]),
+            "replay.start: expected a belief, got belief of cell (0, 0): expected probabilities >= 0 \
+             with sum 1, got [0.25, 0.25]",
+        );
+    }
+}

@@ -1,0 +1,395 @@
+//! The learned filter against the known-model filter, finite differences and itself.
+
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
+use emberwatch_learning::config::{AgentConfig, LearningConfig};
+use emberwatch_learning::filter::{Optimiser, Recursion, Update};
+use emberwatch_learning::replay::{Replay, Sighting};
+use emberwatch_model::randomness::split_mix;
+use emberwatch_model::{Cell, Frame, Grid, Model, Probabilities, Shape};
+use std::sync::Arc;
+
+/// What a few cells of a made-up world show: no two frames see the same cells.
+fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
+    let n_cells = shape.n_cells() as u64;
+    let mut cells: Vec<u64> = (0..6).map(|n| split_mix(frame, n) % n_cells).collect();
+    cells.sort_unstable();
+    cells.dedup();
+    let sighting = |cell: u64| Sighting {
+        cell: cell as u32,
+        value: (split_mix(cell, frame / 100) % n_observations as u64) as u8,
+    };
+    cells.into_iter().map(sighting).collect()
+}
+
+fn frame(shape: Shape, n_observations: usize, number: u64) -> Frame {
+    let mut frame = Frame::empty(shape);
+    for seen in sightings(shape, n_observations, number) {
+        frame.observe(seen.cell as usize, seen.value);
+    }
+    frame
+}
+
+fn belief(n_states: usize, shape: Shape, seed: u64) -> Belief {
+    let number = |index: usize| 0.1 + (split_mix(seed, index as u64) >> 40) as f32 / 2e7;
+    let n_cells = shape.n_cells();
+    let mut belief: Vec<f32> = (0..n_states * n_cells).map(number).collect();
+    for cell in 0..n_cells {
+        let sum: f32 = (0..n_states)
+            .map(|state| belief[state * n_cells + cell])
+            .sum();
+        (0..n_states).for_each(|state| belief[state * n_cells + cell] /= sum);
+    }
+    let dim = (n_states, shape.height(), shape.width());
+    let belief = Probabilities::from_shape_vec(dim, belief).expect("as many");
+    Belief::from_probabilities(belief).expect("sums of one")
+}
+
+fn burnout() -> Model {
+    Model::built_in("wildfire-burnout").expect("a built-in model")
+}
+
+#[test]
+fn with_the_true_parameters_it_is_the_known_model_filter() {
+    let road_ice = include_str!("../../../config/models/road-ice.toml");
+    let models = [
+        Model::wildfire(),
+        Model::from_toml(road_ice).expect("valid"),
+        burnout(),
+        Model::built_in("wildfire-terrain").expect("a built-in model"),
+    ];
+    for model in models {
+        let shapes = [(1, 1), (5, 9), (20, 33), (64, 64)];
+        let shapes = shapes.map(|(height, width)| Shape::new(height, width).expect("test shape"));
+        // A map of zones is of one grid.
+        for shape in shapes
+            .into_iter()
+            .filter(|shape| model.check_on(*shape).is_ok())
+        {
+            let prior = Belief::uniform(model.n_states(), shape);
+            let mut known = BayesFilter::known(&model, prior.clone()).expect("valid model");
+            let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
+            for number in 0..30 {
+                let frame = frame(shape, model.n_observations(), number);
+                known.correct(&frame).expect("possible");
+                learned.correct(&frame).expect("possible");
+                known.predict();
+                learned.predict();
+            }
+            let pairs = known
+                .belief()
+                .as_slice()
+                .iter()
+                .zip(learned.belief().as_slice());
+            let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            // 30 steps of roundings of 6e-8.
+            assert!(most < 1e-5, "{} on {shape}: {most}", model.name());
+        }
+    }
+}
+
+/// `-ln P` of frames by the definition, in f64; `tables`: kernel, likelihood and first belief.
+fn loss(
+    dimensions: Dimensions,
+    tables: &[Vec<f64>; 3],
+    shape: Shape,
+    start: Option<&[f32]>,
+    frames: &[Vec<Sighting>],
+) -> f64 {
+    let [kernel, likelihood, initial] = tables;
+    let (n_states, n_cells) = (dimensions.n_states, shape.n_cells());
+    let mut belief: Vec<f64> = match start {
+        Some(belief) => belief.iter().map(|&p| f64::from(p)).collect(),
+        None => initial.iter().flat_map(|&p| vec![p; n_cells]).collect(),
+    };
+    let mut loss = 0.0;
+    for frame in frames {
+        for seen in frame {
+            let (cell, value) = (seen.cell as usize, usize::from(seen.value));
+            let seen_as = |state: usize| likelihood[state * dimensions.n_observations + value];
+            let joint = |state: usize| belief[state * n_cells + cell] * seen_as(state);
+            let joint: Vec<f64> = (0..n_states).map(joint).collect();
+            let evidence: f64 = joint.iter().sum();
+            loss -= evidence.ln();
+            for (state, p) in joint.iter().enumerate() {
+                belief[state * n_cells + cell] = p / evidence;
+            }
+        }
+        belief = predicted(dimensions, kernel, shape, &belief);
+    }
+    loss
+}
+
+/// The zone of each cell, scattered, if the dimensions have zones.
+fn zones(dimensions: Dimensions, shape: Shape) -> Option<Arc<Grid<u8>>> {
+    let n_zones = dimensions.n_zones;
+    let zone = |(row, col)| ((7 * row + 3 * col + row * col) % n_zones) as u8;
+    (n_zones > 0).then(|| Arc::new(Grid::from_shape_fn(shape.dim(), zone)))
+}
+
+/// Eqs. 2 and 3 by the definition.
+fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
+    let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
+    let n_cells = shape.n_cells();
+    let mut predicted = vec![0.0; n_states * n_cells];
+    for (cell, own) in
+        (0..n_cells).flat_map(|cell| (0..dimensions.n_own()).map(move |own| (cell, own)))
+    {
+        let Cell { row, col } = shape.cell(cell);
+        let zone = zones(dimensions, shape).map_or(0, |zones| zones[[row, col]]);
+        let first = usize::from(zone) * dimensions.n_own() + own;
+        let mut weights = vec![0.0; n_states];
+        for (at, weight) in kernel[first * n_states * n_states * rows * cols..]
+            .iter()
+            .enumerate()
+        {
+            let (down, right) = (at / cols % rows, at % cols);
+            let (to, from) = (at / cols / rows / n_states, at / cols / rows % n_states);
+            if to == n_states {
+                break;
+            }
+            let near = Cell {
+                row: (row + down).wrapping_sub(rows / 2),
+                col: (col + right).wrapping_sub(cols / 2),
+            };
+            let is_centre = near == Cell { row, col };
+            weights[to] += if !shape.contains(near) {
+                0.0
+            } else if is_centre && dimensions.sees_own_state {
+                weight * f64::from(u8::from(from == own))
+            } else {
+                weight * belief[from * n_cells + shape.index(near)]
+            };
+        }
+        let share = if dimensions.sees_own_state {
+            belief[own * n_cells + cell]
+        } else {
+            1.0
+        };
+        let sum: f64 = weights.iter().sum();
+        for (to, weight) in weights.iter().enumerate() {
+            predicted[to * n_cells + cell] += share * weight / sum;
+        }
+    }
+    predicted
+}
+
+fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bool) {
+    let shape = Shape::new(size.0, size.1).expect("test shape");
+    let parameters = Parameters::first(dimensions, 11);
+    let tables = parameters.on_land(zones(dimensions, shape)).tables();
+    let frames: Vec<_> = (0..5)
+        .map(|number| sightings(shape, dimensions.n_observations, number))
+        .collect();
+    let belief = belief(dimensions.n_states, shape, 4);
+    let start = from_belief.then_some(belief.as_slice());
+    let mut end = vec![0.0; belief.as_slice().len()];
+    let outcome = Recursion::new(tables.clone(), shape, 5).run(start, &frames, &mut end);
+    let numbers = [tables.kernel, tables.likelihood, tables.initial];
+    let numbers = numbers.map(|table| table.into_iter().map(f64::from).collect::<Vec<f64>>());
+    let expected = -loss(dimensions, &numbers, shape, start, &frames);
+    assert!(
+        (outcome.log_likelihood - expected).abs() < 1e-4,
+        "{expected}"
+    );
+    for (which, gradient) in outcome.gradient.iter().enumerate() {
+        for (entry, &got) in gradient.iter().enumerate() {
+            let moved = |by: f64| {
+                let mut moved = numbers.clone();
+                moved[which][entry] += by;
+                loss(dimensions, &moved, shape, start, &frames)
+            };
+            // Central differences: their error is of the order of the square of the step, 1e-10; that of sums of 32
+            // bits is larger.
+            let difference = (moved(1e-5) - moved(-1e-5)) / 2e-5;
+            let close = (got - difference).abs() <= 1e-4 * difference.abs().max(1.0);
+            assert!(
+                close,
+                "{dimensions:?} {size:?} {which} {entry}: {got}, not {difference}"
+            );
+        }
+    }
+}
+
+#[test]
+fn every_gradient_agrees_with_finite_differences() {
+    for (from_belief, sees_own_state) in
+        [(false, false), (true, false), (false, true), (true, true)]
+    {
+        let check = |n_zones, n_states, n_observations, kernel, size| {
+            let dimensions = Dimensions {
+                n_states,
+                n_observations,
+                kernel,
+                sees_own_state,
+                n_zones,
+                n_matrices: 1,
+            };
+            check_gradients(dimensions, size, from_belief);
+        };
+        check(0, 3, 3, (3, 3), (6, 7));
+        check(0, 2, 3, (1, 5), (4, 19));
+        check(0, 4, 2, (5, 3), (if sees_own_state { 2 } else { 9 }, 70));
+        check(0, 7, 4, (3, 1), (3, 2));
+        check(3, 3, 3, (3, 3), (6, 7));
+        check(5, 2, 3, (1, 5), (4, 19));
+    }
+}
+
+fn check_window(tables: Tables) {
+    let shape = Shape::new(7, 18).expect("test shape");
+    let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
+    let mut window = Recursion::new(tables, shape, 8);
+    let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
+    let mut end = vec![0.0; 3 * shape.n_cells()];
+    window.run(None, &frames, &mut end);
+    for number in 0..8 {
+        filter.correct(&frame(shape, 3, number)).expect("possible");
+        filter.predict();
+    }
+    let most = filter.belief().as_slice().iter().zip(&end);
+    let most = most.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(most < 1e-6, "{most}");
+}
+
+#[test]
+fn a_window_ends_with_the_filters_prediction() {
+    for sees_own_state in [false, true] {
+        check_window(Parameters::first(dimensions(sees_own_state), 2).tables());
+    }
+    check_window(Tables::of_model(&burnout()));
+    for sees_own_state in [false, true] {
+        let dimensions = Dimensions {
+            n_zones: 4,
+            ..dimensions(sees_own_state)
+        };
+        let shape = Shape::new(7, 18).expect("test shape");
+        let parameters = Parameters::first(dimensions, 2).on_land(zones(dimensions, shape));
+        check_window(parameters.tables());
+    }
+}
+
+#[test]
+fn learning_begins_alike_for_every_own_state() {
+    let shape = Shape::new(12, 40).expect("test shape");
+    let prior = belief(3, shape, 0);
+    let [one, own] = [false, true].map(|sees_own_state| {
+        let tables = Parameters::first(dimensions(sees_own_state), 0).tables();
+        let mut filter = BayesFilter::learned(&tables, prior.clone());
+        filter.predict();
+        filter.belief().clone()
+    });
+    let pairs = one.as_slice().iter().zip(own.as_slice());
+    let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // Weights differ by noise of 10 %.
+    assert!(most < 0.05, "{most}");
+}
+
+fn config() -> LearningConfig {
+    LearningConfig {
+        window: 4,
+        streams: 5,
+        block_windows: 2,
+        ..AgentConfig::default().learning
+    }
+}
+
+/// A replay of two worlds with enough blocks for [`config`].
+fn replay(shape: Shape, n_frames: u64) -> Replay {
+    let mut replay = Replay::new(8, 1000);
+    for world in 0..2 {
+        replay.begin(world);
+        for number in 0..n_frames {
+            let frame = frame(shape, 3, number * 2 + u64::from(world));
+            replay.push(world, &frame, Some(&belief(3, shape, number)));
+        }
+    }
+    replay
+}
+
+fn dimensions(sees_own_state: bool) -> Dimensions {
+    Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+        sees_own_state,
+        n_zones: 0,
+        n_matrices: 1,
+    }
+}
+
+fn optimiser(shape: Shape, seed: u64) -> Optimiser {
+    trainer_of(false, shape, seed)
+}
+
+fn trainer_of(sees_own_state: bool, shape: Shape, seed: u64) -> Optimiser {
+    let parameters = Parameters::first(dimensions(sees_own_state), seed);
+    Optimiser::new(parameters, shape, config(), seed)
+}
+
+fn updates(n: usize, sees_own_state: bool, seed: u64) -> (Vec<Update>, Parameters) {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let mut optimiser = trainer_of(sees_own_state, shape, seed);
+    let mut replay = replay(shape, 40);
+    let update = |_| optimiser.update(&mut replay, Some(2)).expect("finite");
+    let updates: Vec<Update> = (0..n)
+        .map(update)
+        .map(|update| update.expect("full"))
+        .collect();
+    (updates, optimiser.parameters().clone())
+}
+
+#[test]
+fn training_repeats_bit_for_bit_on_any_number_of_threads() {
+    for sees_own_state in [false, true] {
+        let on = |n_threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(n_threads)
+                .build();
+            pool.expect("threads")
+                .install(|| updates(30, sees_own_state, 1))
+        };
+        let (one, two) = (on(1), on(2));
+        assert_eq!(one, two);
+        assert_eq!(one, on(1));
+        assert_ne!(one.0, updates(30, sees_own_state, 2).0, "another seed");
+    }
+}
+
+#[test]
+fn training_lowers_the_loss() {
+    for sees_own_state in [false, true] {
+        let (updates, _) = updates(200, sees_own_state, 3);
+        let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
+        let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
+        assert!(after < before - 0.1, "{before} {after}");
+    }
+}
+
+#[test]
+fn training_waits_for_a_block_for_each_stream() {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let mut replay = replay(shape, 16); // 4 blocks
+    let update = optimiser(shape, 0).update(&mut replay, None);
+    assert_eq!(update.expect("finite"), None);
+}
+
+#[test]
+fn a_number_that_is_not_finite_stops_training_by_name() {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let mut parameters = optimiser(shape, 0).parameters().clone();
+    parameters.tensors[1][4] = f32::NAN;
+    let before = format!("{parameters:?}");
+    let mut optimiser = Optimiser::new(parameters, shape, config(), 0);
+    let error = optimiser
+        .update(&mut replay(shape, 40), None)
+        .expect_err("NaN");
+    let words = "update 1: likelihood: expected finite numbers, got a parameter that is not";
+    assert_eq!(error.to_string(), words);
+    assert_eq!(
+        format!("{:?}", optimiser.parameters()),
+        before,
+        "changed nothing"
+    );
+}

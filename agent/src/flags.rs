@@ -1,0 +1,78 @@
+//! The agent's settings as flags; each overrides the preset or the file.
+
+use anyhow::{Context, Result, bail};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use clap::{Args, ValueEnum};
+use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_protocol::program::read_text;
+use std::path::{Path, PathBuf};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// Whatever measures best
+    Default,
+    /// What the paper's authors ran
+    Paper,
+}
+
+/// The settings as flags.
+#[derive(Debug, Args)]
+pub struct AgentFlags {
+    /// Start from these settings
+    #[arg(long, default_value = "default")]
+    pub preset: Preset,
+    /// Read settings from this TOML file
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// States that beam search keeps
+    #[arg(long)]
+    pub beam_width: Option<usize>,
+    /// Paths that shooting samples
+    #[arg(long)]
+    pub shooting_samples: Option<usize>,
+    /// The known-model filter's first belief
+    #[arg(long, value_parser = one_of(&PriorKind::ALL))]
+    pub prior: Option<PriorKind>,
+    /// Seed of planners, of the prior's worlds and of learners [default: 0]
+    #[arg(long)]
+    pub agent_seed: Option<u64>,
+}
+
+/// Parses a flag that is one of these values, by its name; the words after it explain it in `--help`.
+pub fn one_of<T: Copy + Send + Sync + 'static>(
+    all: &'static [(T, &str, &str)],
+) -> impl TypedValueParser<Value = T> {
+    let names = all
+        .iter()
+        .map(|(_, name, help)| PossibleValue::new(*name).help(*help));
+    PossibleValuesParser::new(names).map(|name| {
+        let found = all.iter().find(|(_, known, _)| *known == name);
+        found.expect("invariant: only these names are accepted").0
+    })
+}
+
+impl AgentFlags {
+    pub fn effective(&self) -> Result<AgentConfig> {
+        let mut config = match (&self.config, self.preset) {
+            (Some(path), Preset::Default) => read(path)?,
+            (Some(path), Preset::Paper) => bail!(
+                "config file {}: expected no file beside --preset paper",
+                path.display()
+            ),
+            (None, Preset::Default) => AgentConfig::default(),
+            (None, Preset::Paper) => AgentConfig::paper(),
+        };
+        config.beam_width = self.beam_width.unwrap_or(config.beam_width);
+        config.shooting_samples = self.shooting_samples.unwrap_or(config.shooting_samples);
+        config.prior = self.prior.unwrap_or(config.prior);
+        config.seed = self.agent_seed.unwrap_or(config.seed);
+        config.check()?;
+        Ok(config)
+    }
+}
+
+fn read(path: &Path) -> Result<AgentConfig> {
+    let text = read_text(path).map_err(anyhow::Error::from);
+    let config = text.and_then(|text| AgentConfig::from_toml(&text));
+    config.with_context(|| format!("config file {}", path.display()))
+}

@@ -1,0 +1,214 @@
+//! Metrics of a training as CSV: one row per update, and one per step without any.
+
+use anyhow::{Context, Result, ensure};
+use csv::StringRecord;
+use emberwatch_learning::update::{ModelUpdate, Tick};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// The file's name in the folder of a training.
+pub const METRICS: &str = "metrics.csv";
+
+/// The name of that of a run without learning.
+pub const FROZEN: &str = "frozen.csv";
+
+const HEADER: [&str; 6] = [
+    "update",
+    "world_steps",
+    "loss",
+    "held_out_log_likelihood",
+    "mean_reward",
+    "rate",
+];
+
+pub struct Metrics {
+    path: PathBuf,
+    writer: csv::Writer<File>,
+}
+
+impl Metrics {
+    /// Begins a file. `more`: columns of the learner's own.
+    pub fn begin(path: &Path, more: &[&str]) -> Result<Self> {
+        Self::write(path, more, &[]).with_context(|| of_file(path))
+    }
+
+    /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
+    /// from, and rows that a kill cut off; begins it if it is not there. Refuses one with other columns.
+    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self> {
+        let go_on = || {
+            let rows = kept_rows(path, more, world_steps)?;
+            let beside = path.with_extension("csv.new");
+            let written = Self::write(&beside, more, &rows)?;
+            std::fs::rename(&beside, path)?;
+            anyhow::Ok(Self {
+                path: path.to_owned(),
+                ..written
+            })
+        };
+        if path.exists() {
+            go_on().with_context(|| of_file(path))
+        } else {
+            Self::begin(path, more)
+        }
+    }
+
+    fn write(path: &Path, more: &[&str], rows: &[StringRecord]) -> Result<Self> {
+        let mut writer = csv::Writer::from_path(path)?;
+        writer.write_record(HEADER.iter().chain(more))?;
+        rows.iter().try_for_each(|row| writer.write_record(row))?;
+        writer.flush()?;
+        let path = path.to_owned();
+        Ok(Self { path, writer })
+    }
+
+    /// Adds a row for each update of a step.
+    pub fn add(&mut self, tick: &Tick, updates: &[ModelUpdate]) -> Result<()> {
+        let mut rows = updates.iter().map(|update| row(tick, update));
+        rows.try_for_each(|row| self.writer.write_record(row))
+            .with_context(|| of_file(&self.path))
+    }
+
+    pub fn flush(&mut self) -> Result<()> {
+        let flushed = self.writer.flush();
+        flushed.with_context(|| of_file(&self.path))
+    }
+}
+
+fn of_file(path: &Path) -> String {
+    format!("metrics {}", path.display())
+}
+
+fn reader(path: &Path) -> csv::Result<csv::Reader<File>> {
+    csv::ReaderBuilder::new().flexible(true).from_path(path)
+}
+
+/// The whole rows of a file up to a world step.
+fn kept_rows(path: &Path, more: &[&str], world_steps: u64) -> Result<Vec<StringRecord>> {
+    let mut reader = reader(path)?;
+    let got = reader.headers()?;
+    let expected = StringRecord::from_iter(HEADER.iter().chain(more));
+    let names = |record: &StringRecord| record.iter().collect::<Vec<_>>().join(",");
+    ensure!(
+        *got == expected,
+        "expected the columns {}, got {}",
+        names(&expected),
+        names(got)
+    );
+    let is_kept = |row: &StringRecord| {
+        let step = row.get(1).and_then(|step| step.parse().ok());
+        row.len() == expected.len() && step.is_some_and(|step: u64| step <= world_steps)
+    };
+    let rows: Vec<_> = reader.records().collect::<Result<_, _>>()?;
+    Ok(rows.into_iter().filter(is_kept).collect())
+}
+
+fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
+    let counts = [update.number, tick.world_steps].map(|count| count.to_string());
+    // The shortest form that reads back as the same number.
+    let text = |number: f64| format!("{number:?}");
+    let numbers = numbers(tick, update).map(|number| number.map_or(String::new(), text));
+    counts.into_iter().chain(numbers).collect()
+}
+
+/// What stands behind the two counts of a row.
+fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Option<f64>> + 'a {
+    let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
+    let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
+    let numbers = [update.loss, held_out, Some(mean_reward), update.rate];
+    numbers.into_iter().chain(update.more.iter().copied())
+}
+
+/// A step's numbers by column, means over the rows of its updates; without `world_steps`, and without columns that
+/// have no number. `more`: columns of the learner's own.
+pub fn averages(
+    tick: &Tick,
+    updates: &[ModelUpdate],
+    more: &[&'static str],
+) -> Vec<(&'static str, f64)> {
+    let rows = updates.iter().map(|update| numbers(tick, update).collect());
+    let rows: Vec<Vec<Option<f64>>> = rows.collect();
+    let mean = |(column, name): (usize, &&'static str)| {
+        let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
+        let mean = there.iter().sum::<f64>() / there.len() as f64;
+        (!there.is_empty()).then_some((*name, mean))
+    };
+    let names = HEADER[2..].iter().chain(more).enumerate();
+    let counted = updates.last().map(|last| (HEADER[0], last.number as f64));
+    counted.into_iter().chain(names.filter_map(mean)).collect()
+}
+
+/// The rows of a file, as numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rows {
+    names: Vec<String>,
+    rows: Vec<Vec<Option<f64>>>,
+}
+
+impl Rows {
+    /// Reads the file of a folder. What is no number is as if it were not there.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let path = folder.join(METRICS);
+        let read = || {
+            let mut reader = reader(&path)?;
+            let names = reader.headers()?.iter().map(String::from).collect();
+            let numbers = |row: StringRecord| {
+                row.iter()
+                    .map(|field| field.parse().ok())
+                    .collect::<Vec<_>>()
+            };
+            let rows = reader.records().map(|row| row.map(numbers));
+            let rows = rows.collect::<Result<_, _>>()?;
+            anyhow::Ok(Self { names, rows })
+        };
+        read().with_context(|| of_file(&path))
+    }
+
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// A column, one entry per row; nothing but `None` where there is no such column.
+    pub fn column(&self, name: &str) -> Vec<Option<f64>> {
+        let at = self.names.iter().position(|known| known == name);
+        let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());
+        self.rows.iter().map(field).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_belief::estimation::scoring::Score;
+
+    #[test]
+    fn averages_are_over_the_updates_of_a_step() {
+        let update = |loss: f64, more: Option<f64>| ModelUpdate {
+            number: 7,
+            loss: Some(loss),
+            rate: Some(0.1),
+            more: vec![more],
+        };
+        let tick = Tick {
+            world_steps: 32,
+            n_worlds: 16,
+            reward: 48.0,
+            score: Score::default(),
+        };
+        let updates = [update(1.0, None), update(2.0, Some(5.0))];
+        let got = averages(&tick, &updates, &["dqn_loss"]);
+        let expected = [
+            ("update", 7.0),
+            ("loss", 1.5),
+            ("mean_reward", 3.0),
+            ("rate", 0.1),
+            ("dqn_loss", 5.0),
+        ];
+        assert_eq!(got, expected);
+        let without = averages(&tick, &[ModelUpdate::nothing(7, 1)], &["dqn_loss"]);
+        assert_eq!(without, [("update", 7.0), ("mean_reward", 3.0)]);
+    }
+}

@@ -1,0 +1,351 @@
+//! The server's settings and their checks.
+
+use crate::bounds::BOUNDS;
+use crate::states_file::{StatesError, StatesFile};
+use crate::world::{Reach, Recorded};
+use emberwatch_messages::capacity::{MAX_ROBOT_NUMBERS, MAX_TEAM_CELLS};
+use emberwatch_messages::control::CoverageRule;
+use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::instance::Instance;
+use emberwatch_model::ModelError;
+use emberwatch_model::grid::ShapeError;
+use emberwatch_model::task::{Start, Task, TaskError};
+use emberwatch_model::text::read_text;
+use emberwatch_model::{Model, Shape};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Number, Value};
+use std::fmt::Display;
+use std::path::Path;
+use std::sync::Arc;
+use thiserror::Error;
+
+/// The name of the default model.
+const WILDFIRE: &str = "wildfire";
+
+/// Every setting; `config/server.toml` and `flags.rs` explain each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ServerConfig {
+    pub instance: String,
+    pub worlds: u32,
+    pub robots: u32,
+    pub deadline_millis: u64,
+    pub task: String,
+    pub model: String,
+    pub sensor_radius: i64,
+    pub states: String,
+    pub states_symmetries: bool,
+    pub states_offset: u64,
+    pub height: usize,
+    pub width: usize,
+    pub moves: usize,
+    pub seed: u64,
+    pub burn_in: u64,
+    pub max_steps: u64,
+    pub coverage: CoverageRule,
+    pub start: Start,
+    pub publish_truth: bool,
+    pub reveal_model: bool,
+    pub lease_millis: u64,
+    pub threads: usize,
+    pub history: u32,
+    pub restore: String,
+    pub snapshot_every: u64,
+    pub snapshot_dir: String,
+    pub snapshot_keep: u32,
+}
+
+/// Checked settings, with the model and the recorded worlds that they name.
+#[derive(Debug, Clone)]
+pub struct Checked {
+    pub config: ServerConfig,
+    pub instance: Instance,
+    /// The name of the task, if the worlds are one.
+    pub task: Option<String>,
+    /// That of recorded worlds has no changes.
+    pub model: Model,
+    pub shape: Shape,
+    /// What no-fly cells leave to the robots.
+    pub reach: Reach,
+    pub recorded: Option<CheckedStates>,
+}
+
+/// What recorded worlds show.
+#[derive(Debug, Clone)]
+pub struct CheckedStates {
+    /// Their description in TOML.
+    pub description: String,
+    /// CRC-32 of the sequences.
+    pub checksum: u32,
+    pub recorded: Arc<Recorded>,
+}
+
+/// Why settings were refused.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// `what` is `config file` or `model file`.
+    #[error("{what} {path}: {problem}")]
+    File {
+        what: &'static str,
+        path: String,
+        problem: String,
+    },
+    /// A setting out of its range.
+    #[error("{setting}: expected {expected}, got {got}")]
+    Range {
+        setting: &'static str,
+        expected: String,
+        got: String,
+    },
+    /// A setting given by name that is impossible.
+    #[error("{setting}: expected {expected}, got {got}")]
+    Given {
+        setting: String,
+        expected: String,
+        got: String,
+    },
+    #[error(transparent)]
+    Task(#[from] TaskError),
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    #[error(transparent)]
+    Shape(#[from] ShapeError),
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    #[error(transparent)]
+    States(#[from] StatesError),
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        Self {
+            instance: "default".into(),
+            worlds: 1,
+            robots: 1,
+            deadline_millis: 0,
+            task: String::new(),
+            model: WILDFIRE.into(),
+            sensor_radius: -1,
+            states: String::new(),
+            states_symmetries: false,
+            states_offset: 0,
+            height: 64,
+            width: 64,
+            moves: 64,
+            seed: 0,
+            burn_in: 10_000,
+            max_steps: 0,
+            coverage: CoverageRule::Path,
+            start: Start::Corner,
+            publish_truth: false,
+            reveal_model: true,
+            lease_millis: 30_000,
+            threads: 0,
+            history: 256,
+            restore: String::new(),
+            snapshot_every: 0,
+            snapshot_dir: String::new(),
+            snapshot_keep: 3,
+        }
+    }
+}
+
+impl ServerConfig {
+    /// Checks every setting; a task decides all that makes worlds, a states file model, grid and burn-in.
+    pub fn check(mut self) -> Result<Checked, ConfigError> {
+        let instance = Instance::new(&self.instance)?;
+        let task = self.take_task()?;
+        self.check_ranges()?;
+        let (model, recorded) = if self.states.is_empty() {
+            (None, None)
+        } else {
+            self.read_states()
+                .map(|(model, it)| (Some(model), Some(it)))?
+        };
+        let shape = Shape::new(self.height, self.width)?;
+        self.check_robots(shape)?;
+        if let Start::At(cell) = self.start
+            && !shape.contains(cell)
+        {
+            let expected = format!("a cell on the {shape} grid");
+            return Err(ConfigError::Range {
+                setting: "start",
+                expected,
+                got: cell.to_string(),
+            });
+        }
+        let model = model.map_or_else(|| self.read_model(), Ok)?;
+        let model = match usize::try_from(self.sensor_radius) {
+            Ok(radius) => model.with_radius(radius)?,
+            Err(_) => model,
+        };
+        let airspace = model.airspace(shape)?;
+        let wrong = |[expected, got]: [String; 2]| ConfigError::Range {
+            setting: "start",
+            expected,
+            got,
+        };
+        let reach = Reach::of(self.start, &airspace, self.robots as usize).map_err(wrong)?;
+        Ok(Checked {
+            config: self,
+            instance,
+            task,
+            model,
+            shape,
+            reach,
+            recorded,
+        })
+    }
+
+    /// Takes the settings of the task, if there is one; its name.
+    fn take_task(&mut self) -> Result<Option<String>, ConfigError> {
+        if self.task.is_empty() {
+            return Ok(None);
+        }
+        let task = Task::named(&self.task)?;
+        (self.model, self.states) = (task.model, task.states);
+        self.sensor_radius = task.sensor_radius;
+        (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
+        (self.height, self.width) = (task.height, task.width);
+        (self.moves, self.robots) = (task.moves, task.robots);
+        (self.burn_in, self.max_steps, self.start) = (task.burn_in, task.max_steps, task.start);
+        Ok(Some(task.name))
+    }
+
+    fn check_ranges(&self) -> Result<(), ConfigError> {
+        let settings = self.values();
+        // Recorded states decide height and width later; `Shape` checks both.
+        let bounds = BOUNDS
+            .iter()
+            .filter(|(it, ..)| !["height", "width"].contains(it));
+        for &(setting, least, most) in bounds {
+            let number = settings[setting].as_number().and_then(Number::as_i128);
+            let number = number.expect("invariant: bounds are those of integers");
+            in_range(setting, number, least, most)?;
+        }
+        let needs = |setting, expected: &str, got| {
+            let expected = expected.into();
+            Err(ConfigError::Range {
+                setting,
+                expected,
+                got,
+            })
+        };
+        if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
+            let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);
+            return needs("snapshot_every and snapshot_dir", "both or neither", got);
+        }
+        if self.states.is_empty() && (self.states_symmetries || self.states_offset > 0) {
+            let got = format!("{} and {}", self.states_symmetries, self.states_offset);
+            let settings = "states_symmetries and states_offset";
+            return needs(settings, "none without a states file", got);
+        }
+        Ok(())
+    }
+
+    fn check_robots(&self, shape: Shape) -> Result<(), ConfigError> {
+        let (n_robots, n_cells) = (i128::from(self.robots), shape.n_cells() as i128);
+        let n_all = i128::from(self.worlds) * n_robots;
+        in_range("worlds times robots", n_all, 1, MAX_ROBOT_NUMBERS as i128)?;
+        let most = MAX_TEAM_CELLS as i128;
+        in_range("cells times robots", n_cells * n_robots, 1, most)
+    }
+
+    /// The settings by name.
+    pub fn values(&self) -> Map<String, Value> {
+        match serde_json::to_value(self) {
+            Ok(Value::Object(values)) => values,
+            _ => unreachable!("invariant: settings serialise"),
+        }
+    }
+
+    /// The settings of a TOML file.
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        let wrong = |error: &dyn Display| file_error("config file", path, error);
+        let text = read_text(path).map_err(|error| wrong(&error))?;
+        toml::from_str(&text).map_err(|error| wrong(&error))
+    }
+
+    /// The states file, which decides some of the settings.
+    fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
+        let file = StatesFile::named(&self.states)?;
+        (self.height, self.width) = file.shape.dim();
+        (self.burn_in, self.model) = (0, String::new());
+        let checksum = file.sequences.checksum();
+        let (symmetries, offset) = (self.states_symmetries, self.states_offset);
+        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset)
+            .map_err(|most| ConfigError::Range {
+                setting: "states_offset",
+                expected: format!("0 to {most}, as the shortest sequence allows"),
+                got: offset.to_string(),
+            })?;
+        let description = toml::to_string(&file.description);
+        let states = CheckedStates {
+            description: description.expect("invariant: a description was read from TOML"),
+            checksum,
+            recorded: Arc::new(recorded),
+        };
+        Ok((file.model, states))
+    }
+
+    fn read_model(&self) -> Result<Model, ConfigError> {
+        if let Some(model) = Model::built_in(&self.model) {
+            return Ok(model);
+        }
+        let path = Path::new(&self.model);
+        Model::read(path).map_err(|error| match error {
+            // The name may be mistyped.
+            ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
+                let names: Vec<&str> = Model::built_in_names().collect();
+                let problem = format!("{problem}: expected one, or {}", names.join(", "));
+                file_error("model file", path, problem)
+            }
+            ModelError::File { path: of, problem } if Path::new(&of) == path => {
+                file_error("model file", path, problem)
+            }
+            other => file_error("model file", path, other),
+        })
+    }
+}
+
+fn file_error(what: &'static str, path: &Path, problem: impl Display) -> ConfigError {
+    ConfigError::File {
+        what,
+        path: path.display().to_string(),
+        problem: problem.to_string(),
+    }
+}
+
+fn in_range(setting: &'static str, got: i128, least: i128, most: i128) -> Result<(), ConfigError> {
+    if (least..=most).contains(&got) {
+        return Ok(());
+    }
+    Err(ConfigError::Range {
+        setting,
+        expected: format!("{least} to {most}"),
+        got: got.to_string(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_documented_file_holds_the_defaults() {
+        let text = include_str!("../../../config/server.toml");
+        assert_eq!(
+            toml::from_str::<ServerConfig>(text).ok(),
+            Some(ServerConfig::default())
+        );
+        let n_settings = toml::Table::try_from(ServerConfig::default())
+            .expect("serialises")
+            .len();
+        assert_eq!(
+            text.parse::<toml::Table>().expect("TOML").len(),
+            n_settings,
+            "a setting is not listed"
+        );
+    }
+}

@@ -1,0 +1,304 @@
+//! Worlds inside a process that uses them alone: the requests and answers of a server, without channels.
+//!
+//! Threads of its own reset worlds and work on files, so that a wait for them may end early.
+
+#[cfg(test)]
+mod tests;
+
+use crate::config::Checked;
+use crate::limits::{check_memory, n_threads, start};
+use crate::rate::Rate;
+use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
+use crate::simulator::{Simulator, Stepped};
+use crate::snapshot::Job;
+use crate::world::{Episode, Rules};
+use anyhow::Result;
+use emberwatch_messages::control::{Reply, ServerInfo};
+use emberwatch_messages::errors::{ConnectionError, check_status};
+use emberwatch_messages::interrupt::check_interrupt;
+use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_messages::message::{Status, StepReply, StepRequest, VERSION};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+/// The name in errors: no instance can have it.
+pub const INSTANCE: &str = "(embedded)";
+
+/// Jobs on files that may wait, each with its bytes.
+const MAX_FILES: usize = 16;
+
+/// How often a wait looks whether it is interrupted.
+const INTERVAL: Duration = Duration::from_millis(5);
+
+/// A world after its reset.
+type Reset = (usize, Box<Episode>);
+
+/// Worlds inside this process.
+pub struct Embedded {
+    simulator: Simulator,
+    rules: Arc<Rules>,
+    resets: (Sender<Reset>, Receiver<Reset>),
+    /// Apart from the simulator's own, which steps would wait for.
+    reset_threads: ThreadPool,
+    /// One thread: of two snapshots to one file the later one stays.
+    file_thread: ThreadPool,
+    n_files: Arc<AtomicUsize>,
+    publishes_truth: bool,
+    client: ClientId,
+    started: Instant,
+    rate: Rate,
+    is_over: bool,
+}
+
+impl Embedded {
+    /// Begins the worlds of these settings; those about channels and saving by itself are not used.
+    ///
+    /// # Errors
+    /// If the model does not fit the grid, there is too little memory, or no threads can be started.
+    pub fn new(checked: Checked) -> Result<Self> {
+        let config = &checked.config;
+        let n_threads = n_threads(config).min(config.worlds as usize);
+        let publishes_truth = config.publish_truth;
+        let mut n_leases = 0;
+        let next_token = move || {
+            n_leases += 1;
+            n_leases
+        };
+        let (steps, reset_threads) = (threads(n_threads)?, threads(n_threads)?);
+        let file_thread = threads(1)?;
+        check_memory(&checked, n_threads)?;
+        let (simulator, jobs) = Simulator::new(checked, steps, Box::new(next_token))?;
+        let now = Instant::now();
+        let embedded = Self {
+            rules: Arc::new(simulator.spec().rules.clone()),
+            simulator,
+            resets: channel(),
+            reset_threads,
+            file_thread,
+            n_files: Arc::default(),
+            publishes_truth,
+            client: ClientId {
+                node: 0,
+                pid: std::process::id(),
+            },
+            started: now,
+            rate: Rate::since(now),
+            is_over: false,
+        };
+        embedded.start(jobs);
+        Ok(embedded)
+    }
+
+    /// What a server of these worlds would say of itself.
+    pub fn info(&self) -> ServerInfo {
+        self.simulator.info()
+    }
+
+    /// Whether hidden states may be read.
+    pub fn publishes_truth(&self) -> bool {
+        self.publishes_truth
+    }
+
+    /// Answers a control request, JSON with JSON.
+    ///
+    /// # Errors
+    /// If it is refused, not done in time, or interrupted; and after a `shutdown`.
+    pub fn control_text(
+        &mut self,
+        text: &[u8],
+        timeout: Duration,
+    ) -> Result<Vec<u8>, ConnectionError> {
+        let (now, client) = (Instant::now(), self.client);
+        self.begin(now)?;
+        let stats = ServerStats {
+            uptime: now - self.started,
+            steps_per_second: self.rate.per_second,
+            n_clients: 1,
+            n_observers: 0,
+        };
+        let reply = match self.simulator.control(now, client, VERSION, text, &stats) {
+            Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
+            Outcome::Pending(jobs, pending) => {
+                self.start(jobs);
+                self.reset(&pending, timeout)?
+            }
+            Outcome::File(job, pending) => self.file(job, &pending, timeout)?,
+            Outcome::Shutdown => {
+                self.is_over = true;
+                Reply::Done
+            }
+        };
+        if let Reply::Error {
+            status,
+            detail,
+            message,
+        } = reply
+        {
+            let refused = check_status("a control request", status as u32, detail, Some(message));
+            return refused.map(|()| Vec::new());
+        }
+        Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
+    }
+
+    /// Answers a step request: the header, and results of the worlds, results of the robots, frames.
+    ///
+    /// # Errors
+    /// If it is refused; and after a `shutdown`.
+    pub fn step_payload(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
+        let now = Instant::now();
+        self.begin(now)?;
+        let request = StepRequest {
+            version: VERSION,
+            ..request
+        };
+        let mut payload = Vec::new();
+        let stepped = self
+            .simulator
+            .step(now, self.client, &request, body, &mut payload);
+        let Stepped::Reply(mut reply) = stepped else {
+            unreachable!("invariant: the only client names all robots that it holds in a world");
+        };
+        check_status("step", reply.status, reply.detail, None)?;
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        Ok((reply, payload))
+    }
+
+    /// The present episodes of consecutive worlds; `None` if one is missing, or in its reset.
+    ///
+    /// # Errors
+    /// After a `shutdown`.
+    pub fn episodes(
+        &mut self,
+        mut worlds: Range<usize>,
+    ) -> Result<Option<Vec<&Episode>>, ConnectionError> {
+        self.begin(Instant::now())?;
+        let simulator = &self.simulator;
+        Ok(worlds.try_fold(Vec::new(), |mut found, world| {
+            found.push(simulator.episode(world)?);
+            Some(found)
+        }))
+    }
+
+    /// Takes in what an interrupted wait has left, and ends leases that are over.
+    fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
+        if self.is_over {
+            return Err(ConnectionError::ServerGone {
+                instance: INSTANCE.into(),
+            });
+        }
+        while let Ok((world, episode)) = self.resets.1.try_recv() {
+            self.simulator.put(world, episode);
+        }
+        self.simulator.tick(now);
+        self.rate.update(now, self.simulator.n_steps());
+        Ok(())
+    }
+
+    fn start(&self, jobs: Vec<ResetJob>) {
+        for job in jobs {
+            let (rules, sender) = (self.rules.clone(), self.resets.0.clone());
+            self.reset_threads.spawn(move || {
+                let reset = job.run(&rules);
+                if !rules.ended.load(Ordering::Relaxed) {
+                    // Nobody receives it once this is dropped.
+                    drop(sender.send(reset));
+                }
+            });
+        }
+    }
+
+    /// Waits until worlds are ready.
+    fn reset(
+        &mut self,
+        pending: &PendingReply,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        let start = Instant::now();
+        loop {
+            if let Some(reply) = self.simulator.pending_reply(Instant::now(), pending) {
+                return Ok(reply);
+            }
+            match wait_for(&self.resets.1, start, timeout) {
+                Ok((world, episode)) => self.simulator.put(world, episode),
+                Err(ended) => {
+                    self.simulator.cancel_reply(Instant::now(), pending);
+                    return Err(ended);
+                }
+            }
+        }
+    }
+
+    /// Waits for work on a file.
+    fn file(
+        &mut self,
+        job: Job,
+        pending: &PendingFile,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        if self.n_files.fetch_add(1, Ordering::Relaxed) >= MAX_FILES {
+            self.n_files.fetch_sub(1, Ordering::Relaxed);
+            self.simulator.cancel_file(Instant::now(), pending);
+            let message = "too many files at a time: try again later".into();
+            return Ok(Reply::error(Status::BadFile, 0, message));
+        }
+        let (sender, receiver) = channel();
+        let (spec, n_files) = (self.simulator.spec().clone(), self.n_files.clone());
+        self.file_thread.spawn(move || {
+            let done = job.run(&spec);
+            n_files.fetch_sub(1, Ordering::Relaxed);
+            drop(sender.send(done));
+        });
+        let done = wait_for(&receiver, Instant::now(), timeout);
+        let now = Instant::now();
+        if done.is_err() {
+            self.simulator.cancel_file(now, pending);
+        }
+        Ok(self.simulator.file_reply(now, pending, done?))
+    }
+}
+
+impl Drop for Embedded {
+    /// Burn-ins that still run end.
+    fn drop(&mut self) {
+        self.rules.ended.store(true, Ordering::Relaxed);
+    }
+}
+
+/// What another thread sends, unless the time since `start` is over or the wait is interrupted.
+///
+/// # Errors
+/// [`ConnectionError::Timeout`], or of a wait that is interrupted.
+pub fn wait_for<T>(
+    receiver: &Receiver<T>,
+    start: Instant,
+    timeout: Duration,
+) -> Result<T, ConnectionError> {
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        match receiver.recv_timeout(left.min(INTERVAL)) {
+            Ok(next) => return Ok(next),
+            Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
+            // A job that has panicked sends nothing.
+            Err(_) => {
+                return Err(ConnectionError::Timeout {
+                    what: "a control request",
+                    instance: INSTANCE.into(),
+                    timeout,
+                });
+            }
+        }
+    }
+}
+
+/// Starts threads whose jobs may panic: that ends the job, not the process.
+fn threads(n_threads: usize) -> Result<ThreadPool, NoThreads> {
+    start(ThreadPoolBuilder::new().panic_handler(|_| ()), n_threads)
+}

@@ -1,0 +1,164 @@
+//! Moves worlds: at once for the request that completes them, or when a deadline passes or a holder leaves.
+
+use super::answer::Part;
+use super::barrier::{Barrier, Ticket, Waiter};
+use super::lease::Refusal;
+use super::share::share;
+use super::state::{Place, Simulator, Slot};
+use crate::world::{Episode, Flown, Rules};
+use emberwatch_messages::message::{Status, StepReply};
+use std::ops::Range;
+use std::time::Instant;
+
+/// Minimum number of cells in a batch that several threads step. For smaller batches, waking a thread (tens of
+/// microseconds) costs more than it saves at about 2 ns a cell.
+const PARALLEL_CELLS: usize = 1 << 15;
+
+impl Simulator {
+    /// The next deadline of a world that waits for paths.
+    pub fn next_deadline(&self) -> Option<Instant> {
+        let waiting = self.waiting_worlds.iter();
+        let deadlines = waiting.filter_map(|&world| self.places[world].barrier.deadline);
+        deadlines.min()
+    }
+
+    /// Withdraws a request whose client no longer waits for its answer.
+    pub fn cancel_step(&mut self, now: Instant, ticket: Ticket) {
+        for &world in &self.waiting_worlds {
+            let barrier = &mut self.places[world].barrier;
+            for waiter in barrier.withdraw(|waiter| waiter.ticket == ticket) {
+                self.leases.end_wait(now, waiter.request.lease);
+            }
+        }
+        self.forget_idle_worlds();
+    }
+
+    /// The next answer to a request that waited; its results and frames go to `payload`. Take all of them before the
+    /// next request, so that each shows its own step.
+    pub fn next_answer(&mut self, payload: &mut Vec<u8>) -> Option<(Ticket, StepReply)> {
+        let (waiter, outcome) = self.settled.pop_front()?;
+        payload.clear();
+        let reply = match outcome {
+            Ok(()) => {
+                self.fit(&waiter.request, payload);
+                self.write_present(&waiter.request, payload)
+            }
+            Err(refusal) => self.refuse(&waiter.request, refusal),
+        };
+        Some((waiter.ticket, reply))
+    }
+
+    /// The worlds that moved without a request of their own since the last call.
+    pub fn take_moved(&mut self) -> Vec<usize> {
+        std::mem::take(&mut self.moved)
+    }
+
+    /// Withdraws the paths of those who have lost their robots, and moves the worlds that wait for nobody any more.
+    pub(super) fn settle(&mut self, now: Instant) {
+        for world in self.waiting_worlds.clone() {
+            let robots = self.robots_of(world);
+            let (barrier, leases) = (&mut self.places[world].barrier, &self.leases);
+            let missing = |waiter: &Waiter| {
+                waiter.robots & !leases.held_under(waiter.request.lease, robots.clone())
+            };
+            let lost = barrier.withdraw(|waiter| missing(waiter) != 0);
+            let refusal = |waiter: Waiter| {
+                let robot = robots.start + missing(&waiter).trailing_zeros() as usize;
+                let lease = waiter.request.lease;
+                (waiter, leases.not_held(lease, waiter.client, robot))
+            };
+            let refused: Vec<(Waiter, Refusal)> = lost.into_iter().map(refusal).collect();
+            for (waiter, lost) in refused {
+                self.settle_waiter(now, waiter, Err(lost));
+            }
+            if self.is_complete(now, world) {
+                self.advance(now, world..world + 1, None);
+                self.moved.push(world);
+            }
+        }
+        self.forget_idle_worlds();
+    }
+
+    /// Refuses all requests that wait for a world which is reset or replaced.
+    pub(super) fn refuse_waiting(&mut self, now: Instant, world: usize) {
+        for waiter in self.places[world].barrier.withdraw(|_| true) {
+            let refusal = Refusal::new(Status::Resetting, world as u64);
+            self.settle_waiter(now, waiter, Err(refusal));
+        }
+        self.forget_idle_worlds();
+    }
+
+    /// Whether a world moves now.
+    pub(super) fn is_complete(&self, now: Instant, world: usize) -> bool {
+        let held = self.leases.held(self.robots_of(world));
+        self.places[world].barrier.is_complete(held, now)
+    }
+
+    /// Moves worlds once, with the paths that they have. `parts`: where each world's answer is written, by the thread
+    /// that stepped it.
+    pub(super) fn advance(
+        &mut self,
+        now: Instant,
+        worlds: Range<usize>,
+        parts: Option<Vec<Part<'_>>>,
+    ) {
+        let (rules, leases) = (&self.spec.rules, &self.leases);
+        let team = rules.n_robots;
+        let step = |(world, place, part): (usize, &mut Place, Option<Part<'_>>)| {
+            let held = leases.held(world * team..(world + 1) * team);
+            if let Slot::Ready(episode) = &mut place.slot {
+                step(rules, episode, &place.barrier, held);
+                if let Some(part) = part {
+                    part.write(episode);
+                }
+            }
+        };
+        let n_cells = rules.shape.n_cells() + team * rules.n_moves;
+        let places = self.places[worlds.clone()].iter_mut();
+        let parts = parts.into_iter().flatten().map(Some);
+        let parts = parts.chain(std::iter::repeat_with(|| None));
+        let jobs = worlds.clone().zip(places).zip(parts);
+        let jobs = jobs.map(|((world, place), part)| (world, place, part));
+        if worlds.len() > 1 && worlds.len() * n_cells >= PARALLEL_CELLS {
+            share(&self.threads, worlds.len(), jobs, step);
+        } else {
+            jobs.for_each(step);
+        }
+        self.n_steps += worlds.len() as u64;
+        for world in worlds {
+            for waiter in self.places[world].barrier.clear() {
+                self.settle_waiter(now, waiter, Ok(()));
+            }
+        }
+        self.forget_idle_worlds();
+    }
+
+    pub(super) fn new_ticket(&mut self) -> Ticket {
+        self.n_tickets += 1;
+        Ticket(self.n_tickets)
+    }
+
+    fn settle_waiter(&mut self, now: Instant, waiter: Waiter, outcome: Result<(), Refusal>) {
+        self.leases.end_wait(now, waiter.request.lease);
+        self.settled.push_back((waiter, outcome));
+    }
+
+    fn forget_idle_worlds(&mut self) {
+        let places = &self.places;
+        self.waiting_worlds
+            .retain(|&world| !places[world].barrier.waiters.is_empty());
+    }
+}
+
+fn step(rules: &Rules, episode: &mut Episode, barrier: &Barrier, held: u64) {
+    let all = u64::MAX >> (64 - rules.n_robots);
+    let ready = barrier.ready;
+    let flown = Flown {
+        moves: &barrier.moves,
+        ready,
+        full: barrier.full,
+        hovered: all & !(held | ready),
+        late: held & !ready,
+    };
+    episode.step(rules, &flown);
+}

@@ -1,0 +1,94 @@
+//! The barrier of a world: the paths for its next step, and who waits for it. It knows no leases and no clock.
+
+use super::lease::ClientId;
+use emberwatch_messages::message::StepRequest;
+use emberwatch_model::Move;
+use std::time::Instant;
+
+/// A step request that waits for its world to move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Ticket(pub(super) u64);
+
+/// A step request that waits, and the robots whose paths it brought.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Waiter {
+    pub ticket: Ticket,
+    pub client: ClientId,
+    pub request: StepRequest,
+    /// Bit r is robot r of the world.
+    pub robots: u64,
+}
+
+/// The paths for a world's next step. Of each mask, bit r is robot r of the world.
+#[derive(Debug)]
+pub(super) struct Barrier {
+    /// One path for each robot, in order; only those of `ready` count.
+    pub moves: Vec<Move>,
+    /// Robots that have a path.
+    pub ready: u64,
+    /// Those that observe every cell.
+    pub full: u64,
+    /// When the world moves without the others.
+    pub deadline: Option<Instant>,
+    /// In the order of arrival; no robot is in two of them.
+    pub waiters: Vec<Waiter>,
+}
+
+impl Barrier {
+    pub fn new(n_robots: usize, n_moves: usize) -> Self {
+        Self {
+            moves: vec![Move::Up; n_robots * n_moves],
+            ready: 0,
+            full: 0,
+            deadline: None,
+            waiters: Vec::new(),
+        }
+    }
+
+    /// Puts the paths of some robots, the first of them `first`; the bytes are moves.
+    pub fn put(&mut self, first: usize, n_moves: usize, paths: &[u8], is_full: bool) {
+        let n_robots = paths.len() / n_moves;
+        let places = self.moves[first * n_moves..][..paths.len()].iter_mut();
+        for (place, &byte) in places.zip(paths) {
+            *place = Move::from_low_bits(byte.into());
+        }
+        let robots = mask(first, n_robots);
+        self.ready |= robots;
+        self.full &= !robots;
+        if is_full {
+            self.full |= robots;
+        }
+    }
+
+    /// Takes requests out, with all their paths; returns them.
+    pub fn withdraw(&mut self, is_over: impl Fn(&Waiter) -> bool) -> Vec<Waiter> {
+        let over: Vec<Waiter> = self
+            .waiters
+            .extract_if(.., |waiter| is_over(waiter))
+            .collect();
+        for waiter in &over {
+            self.ready &= !waiter.robots;
+        }
+        if self.ready == 0 {
+            self.deadline = None;
+        }
+        over
+    }
+
+    /// Whether the world moves now: someone flies, and nobody else who holds a robot may still send a path.
+    pub fn is_complete(&self, held: u64, now: Instant) -> bool {
+        let is_due = self.deadline.is_some_and(|deadline| deadline <= now);
+        self.ready != 0 && (held & !self.ready == 0 || is_due)
+    }
+
+    /// Begins the next step; returns who waited for this one.
+    pub fn clear(&mut self) -> Vec<Waiter> {
+        (self.ready, self.full, self.deadline) = (0, 0, None);
+        std::mem::take(&mut self.waiters)
+    }
+}
+
+/// Bits of `n` robots from `first` on, of at most 64.
+pub(super) fn mask(first: usize, n: usize) -> u64 {
+    u64::MAX.unbounded_shr(64 - n as u32) << first
+}

@@ -1,0 +1,340 @@
+//! Which client may fly which robots, and until when. Pure: time and tokens are arguments.
+//!
+//! A lease covers consecutive robots, by their numbers. It ends by release, by expiry, with its client's connection or
+//! process, or by a takeover; a robot taken from a lease stays lost to that lease, also when it
+//! is free again.
+
+use emberwatch_messages::message::Status;
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+/// Ended leases that are remembered, to tell "lost" from "never had".
+const REMEMBERED: usize = 1024;
+
+/// The process behind a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClientId {
+    /// iceoryx2's id of the client's node.
+    pub node: u128,
+    /// Its process id.
+    pub pid: u32,
+}
+
+/// A right to act.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Lease {
+    /// Identifies the lease in requests.
+    pub token: u64,
+    pub client: ClientId,
+    /// The robots it was given for.
+    pub robots: Range<usize>,
+    /// It ends this long after its last use.
+    pub time_to_live: Duration,
+    expires: Instant,
+    /// The process that last took a robot from it.
+    taken_by: Option<u32>,
+    /// Requests that wait for resets or for the paths of other clients; it cannot expire meanwhile.
+    n_waiting: u32,
+}
+
+/// Why a request may not act, as a status and its detail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Refusal {
+    pub status: Status,
+    pub detail: u64,
+}
+
+/// All leases of a server.
+#[derive(Debug)]
+pub struct Leases {
+    /// The token that holds each robot.
+    holders: Vec<Option<u64>>,
+    live: HashMap<u64, Lease>,
+    ended: VecDeque<Ended>,
+}
+
+/// A lease that has ended.
+#[derive(Debug)]
+struct Ended {
+    token: u64,
+    first_robot: usize,
+    /// The process that took its last robot, if that was its end.
+    taken_by: Option<u32>,
+}
+
+/// What a client asks for.
+#[derive(Debug, Clone)]
+pub struct Claim {
+    pub client: ClientId,
+    pub robots: Range<usize>,
+    /// Whether to take robots from their holders.
+    pub takeover: bool,
+    /// How long the lease lives without use.
+    pub time_to_live: Duration,
+}
+
+impl Refusal {
+    pub fn new(status: Status, detail: u64) -> Self {
+        Self { status, detail }
+    }
+}
+
+impl Lease {
+    fn has_expired(&self, now: Instant) -> bool {
+        self.n_waiting == 0 && self.expires <= now
+    }
+}
+
+impl Leases {
+    /// No leases on `n_robots` robots.
+    pub fn new(n_robots: usize) -> Self {
+        Self {
+            holders: vec![None; n_robots],
+            live: HashMap::new(),
+            ended: VecDeque::new(),
+        }
+    }
+
+    /// Gives a lease under a new token.
+    ///
+    /// A client that claims robots it holds already gets them again, under the new token.
+    ///
+    /// # Errors
+    /// If there is no such robot, or another client holds one and it is no takeover.
+    pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
+        self.check_robots(&claim.robots)?;
+        self.expire(now);
+        let others = claim.robots.clone().filter_map(|robot| self.holder(robot));
+        let other = others
+            .into_iter()
+            .find(|holder| holder.client != claim.client);
+        if let Some(holder) = other.filter(|_| !claim.takeover) {
+            return Err(Refusal::new(Status::Busy, holder.client.pid.into()));
+        }
+        for robot in claim.robots.clone() {
+            let former = self.holders[robot].replace(token);
+            if let Some(former) = former.and_then(|token| self.live.get_mut(&token)) {
+                former.taken_by = Some(claim.client.pid);
+            }
+        }
+        self.forget_empty_leases();
+        let Claim {
+            client,
+            robots,
+            time_to_live,
+            ..
+        } = claim;
+        let lease = Lease {
+            token,
+            client,
+            robots,
+            time_to_live,
+            expires: now + time_to_live,
+            taken_by: None,
+            n_waiting: 0,
+        };
+        Ok(self.live.entry(token).or_insert(lease))
+    }
+
+    /// Checks that a client may fly robots under a lease, and extends the lease.
+    ///
+    /// # Errors
+    /// If there is no such robot, or the client does not hold one under this lease.
+    pub fn use_lease(
+        &mut self,
+        now: Instant,
+        token: u64,
+        client: ClientId,
+        robots: &Range<usize>,
+    ) -> Result<(), Refusal> {
+        self.check_robots(robots)?;
+        let held = self.holders[robots.clone()]
+            .iter()
+            .position(|holder| *holder != Some(token));
+        if let Some(first) = held {
+            return Err(self.not_held(token, client, robots.start + first));
+        }
+        self.renew(now, token, client).map(|_| ())
+    }
+
+    /// Extends a lease.
+    ///
+    /// # Errors
+    /// If the client does not have this lease, or has lost it.
+    pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
+        let is_live = |lease: &&mut Lease| lease.client == client && !lease.has_expired(now);
+        if self.live.get_mut(&token).filter(is_live).is_none() {
+            let robot = self.first_robot(token).unwrap_or(0);
+            return Err(self.not_held(token, client, robot));
+        }
+        let lease = self.live.get_mut(&token).expect("invariant: found above");
+        lease.expires = now + lease.time_to_live;
+        Ok(lease)
+    }
+
+    /// Checks that a client may replace the world of some robots under a lease, which holds one of them, and extends
+    /// the lease.
+    ///
+    /// # Errors
+    /// If the client holds none of them under this lease, or another client holds one.
+    pub fn use_world(
+        &mut self,
+        now: Instant,
+        token: u64,
+        client: ClientId,
+        robots: Range<usize>,
+    ) -> Result<(), Refusal> {
+        let own = robots
+            .clone()
+            .find(|&robot| self.holders[robot] == Some(token))
+            .unwrap_or(robots.start);
+        self.use_lease(now, token, client, &(own..own + 1))?;
+        let mut holders = robots.filter_map(|robot| self.holder(robot));
+        match holders.find(|holder| holder.client != client) {
+            Some(other) => Err(Refusal::new(Status::Busy, other.client.pid.into())),
+            None => Ok(()),
+        }
+    }
+
+    /// Keeps a lease from expiring while one more request waits.
+    pub fn begin_wait(&mut self, token: u64) {
+        if let Some(lease) = self.live.get_mut(&token) {
+            lease.n_waiting += 1;
+        }
+    }
+
+    /// Ends what [`Self::begin_wait`] began; the lease lives on from now.
+    pub fn end_wait(&mut self, now: Instant, token: u64) {
+        if let Some(lease) = self.live.get_mut(&token) {
+            lease.n_waiting = lease.n_waiting.saturating_sub(1);
+            lease.expires = now + lease.time_to_live;
+        }
+    }
+
+    /// Ends a lease; its robots are free.
+    ///
+    /// # Errors
+    /// If the client does not have this lease, or has lost it.
+    pub fn release(&mut self, now: Instant, token: u64, client: ClientId) -> Result<(), Refusal> {
+        self.renew(now, token, client)?;
+        self.end(token);
+        Ok(())
+    }
+
+    /// Ends the leases that have expired; returns them.
+    pub fn expire(&mut self, now: Instant) -> Vec<Lease> {
+        self.end_where(|lease| lease.has_expired(now))
+    }
+
+    /// Ends the leases of a process that has died; returns them.
+    pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
+        self.end_where(|lease| lease.client.pid == pid)
+    }
+
+    /// Ends the leases of nodes that are not among these; returns them.
+    pub fn end_of_nodes_except(&mut self, nodes: &HashSet<u128>) -> Vec<Lease> {
+        self.end_where(|lease| !nodes.contains(&lease.client.node))
+    }
+
+    /// The robots of a lease that were not taken over.
+    pub fn robots_held(&self, token: u64) -> Vec<usize> {
+        let held = |robot: &usize| self.holders[*robot] == Some(token);
+        let lease = self.live.get(&token);
+        lease.map_or_else(Vec::new, |lease| {
+            lease.robots.clone().filter(held).collect()
+        })
+    }
+
+    /// The lease that holds a robot.
+    pub fn holder(&self, robot: usize) -> Option<&Lease> {
+        self.holders[robot].and_then(|token| self.live.get(&token))
+    }
+
+    /// Which of at most 64 robots are held, bit by bit.
+    pub fn held(&self, robots: Range<usize>) -> u64 {
+        let holders = self.holders[robots].iter();
+        bits(holders.map(Option::is_some))
+    }
+
+    /// Which of at most 64 robots a lease holds, bit by bit.
+    pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
+        let holders = self.holders[robots].iter();
+        bits(holders.map(|holder| *holder == Some(token)))
+    }
+
+    fn check_robots(&self, robots: &Range<usize>) -> Result<(), Refusal> {
+        if robots.start < robots.end && robots.end <= self.holders.len() {
+            return Ok(());
+        }
+        Err(Refusal::new(Status::NoSuchRobot, self.holders.len() as u64))
+    }
+
+    fn first_robot(&self, token: u64) -> Option<usize> {
+        let live = self.live.get(&token).map(|lease| lease.robots.start);
+        live.or_else(|| self.ended(token).map(|ended| ended.first_robot))
+    }
+
+    fn ended(&self, token: u64) -> Option<&Ended> {
+        self.ended.iter().find(|ended| ended.token == token)
+    }
+
+    /// Why a client does not hold a robot under a lease.
+    pub fn not_held(&self, token: u64, client: ClientId, robot: usize) -> Refusal {
+        let is_own = |lease: &&Lease| lease.client == client && lease.robots.contains(&robot);
+        let holder = self.holder(robot).map(|holder| holder.client.pid);
+        let taken_by = match (self.live.get(&token).filter(is_own), self.ended(token)) {
+            (Some(_), _) if self.holders[robot] == Some(token) => None, // It has expired.
+            (Some(lease), _) => holder.or(lease.taken_by),
+            (None, Some(ended)) => ended.taken_by.or(holder),
+            (None, None) => return Refusal::new(Status::NoLease, robot as u64),
+        };
+        Refusal::new(Status::LeaseLost, taken_by.map_or(0, u64::from))
+    }
+
+    fn end_where(&mut self, is_over: impl Fn(&Lease) -> bool) -> Vec<Lease> {
+        let over: Vec<u64> = self
+            .live
+            .values()
+            .filter(|lease| is_over(lease))
+            .map(|lease| lease.token)
+            .collect();
+        over.into_iter()
+            .filter_map(|token| self.end(token))
+            .collect()
+    }
+
+    fn end(&mut self, token: u64) -> Option<Lease> {
+        let lease = self.live.remove(&token)?;
+        let mut held = false;
+        for holder in &mut self.holders[lease.robots.clone()] {
+            held |= *holder == Some(token);
+            holder.take_if(|holder| *holder == token);
+        }
+        if self.ended.len() == REMEMBERED {
+            self.ended.pop_front();
+        }
+        self.ended.push_back(Ended {
+            token,
+            first_robot: lease.robots.start,
+            taken_by: lease.taken_by.filter(|_| !held),
+        });
+        Some(lease)
+    }
+
+    /// Ends leases all of whose robots were taken.
+    fn forget_empty_leases(&mut self) {
+        let holders = self.holders.clone();
+        let is_empty = |lease: &Lease| {
+            holders[lease.robots.clone()]
+                .iter()
+                .all(|holder| *holder != Some(lease.token))
+        };
+        self.end_where(is_empty);
+    }
+}
+
+fn bits(bits: impl Iterator<Item = bool>) -> u64 {
+    bits.enumerate()
+        .fold(0, |mask, (index, bit)| mask | u64::from(bit) << index)
+}

@@ -1,0 +1,248 @@
+//! The worlds and leases of a server.
+
+use super::barrier::{Barrier, Waiter};
+use super::beliefs::Beliefs;
+use super::lease::{Leases, Refusal};
+use crate::config::Checked;
+use crate::snapshot::WorldSpec;
+use crate::world::{Episode, Rules};
+use emberwatch_messages::control::WorldInfo;
+use emberwatch_messages::message::{Status, WorldResult};
+use emberwatch_model::ModelError;
+use rayon::ThreadPool;
+use std::collections::{HashSet, VecDeque};
+use std::ops::Range;
+use std::time::Instant;
+
+/// All worlds and leases of a server: requests in, answers out, no I/O and no clock.
+pub struct Simulator {
+    pub(super) checked: Checked,
+    pub(super) spec: WorldSpec,
+    pub(super) beliefs: Beliefs,
+    pub(super) places: Vec<Place>,
+    pub(super) leases: Leases,
+    /// Worlds for which requests wait.
+    pub(super) waiting_worlds: Vec<usize>,
+    /// Requests whose wait is over, with the refusal of each that is refused.
+    pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
+    /// Worlds that moved without a request of their own.
+    pub(super) moved: Vec<usize>,
+    pub(super) n_tickets: u64,
+    pub(super) threads: ThreadPool,
+    pub(super) next_token: Box<dyn FnMut() -> u64 + Send>,
+    pub(super) n_steps: u64,
+    pub(super) n_refused: u64,
+}
+
+/// A world, and the paths for its next step.
+pub(super) struct Place {
+    pub slot: Slot,
+    pub barrier: Barrier,
+}
+
+/// A world, or what is known of it during its burn-in.
+pub(super) enum Slot {
+    Ready(Box<Episode>),
+    /// `last` and `cells` are its result and its robots before.
+    Resetting {
+        last: WorldResult,
+        cells: Vec<[u32; 2]>,
+        seed: u64,
+        episode: u64,
+    },
+}
+
+/// A world to reset, taken out of the simulator.
+pub struct ResetJob {
+    pub world: usize,
+    /// Its episode, if it had one before.
+    pub before: Option<Box<Episode>>,
+    /// The number of its new one, if it had none.
+    pub episode: u64,
+    pub seed: u64,
+}
+
+impl Simulator {
+    /// The worlds of a server and the jobs that start them; `next_token` makes the tokens of leases.
+    pub fn new(
+        checked: Checked,
+        threads: ThreadPool,
+        next_token: Box<dyn FnMut() -> u64 + Send>,
+    ) -> Result<(Self, Vec<ResetJob>), ModelError> {
+        let config = &checked.config;
+        let (n_worlds, team) = (config.worlds as usize, config.robots as usize);
+        let start = |world: usize| ResetJob {
+            world,
+            before: None,
+            episode: 0,
+            seed: config.seed.wrapping_add(world as u64),
+        };
+        let jobs: Vec<ResetJob> = (0..n_worlds).map(start).collect();
+        let place = |job| Place {
+            slot: Slot::resetting(job, team),
+            barrier: Barrier::new(team, config.moves),
+        };
+        let (n_robots, n_cells) = (n_worlds * team, checked.shape.n_cells());
+        let simulator = Self {
+            spec: WorldSpec::of(&checked)?,
+            beliefs: Beliefs::new(n_robots, n_cells, checked.model.n_states()),
+            places: jobs.iter().map(place).collect(),
+            leases: Leases::new(n_robots),
+            checked,
+            waiting_worlds: Vec::new(),
+            settled: VecDeque::new(),
+            moved: Vec::new(),
+            n_tickets: 0,
+            threads,
+            next_token,
+            n_steps: 0,
+            n_refused: 0,
+        };
+        Ok((simulator, jobs))
+    }
+
+    /// Replaces a world, for example by the same one after its reset.
+    pub fn put(&mut self, world: usize, episode: Box<Episode>) {
+        self.places[world].slot = Slot::Ready(episode);
+        self.beliefs.forget(self.robots_of(world));
+    }
+
+    /// What worlds must fit.
+    pub fn spec(&self) -> &WorldSpec {
+        &self.spec
+    }
+
+    /// Whether its worlds were recorded.
+    pub fn is_recorded(&self) -> bool {
+        self.checked.recorded.is_some()
+    }
+
+    /// Ends leases that have expired, and moves worlds whose deadline has passed; returns the pid of each such lease.
+    pub fn tick(&mut self, now: Instant) -> Vec<u32> {
+        let expired = self.leases.expire(now);
+        self.settle(now);
+        expired.iter().map(|lease| lease.client.pid).collect()
+    }
+
+    /// Ends the leases of a process that has died; returns how many there were.
+    pub fn end_of_process(&mut self, now: Instant, pid: u32) -> usize {
+        let n_leases = self.leases.end_of_process(pid).len();
+        self.settle(now);
+        n_leases
+    }
+
+    /// Ends the leases of connections that were closed: of nodes that are not among these.
+    pub fn end_of_connections(&mut self, now: Instant, nodes: &HashSet<u128>) -> usize {
+        let n_leases = self.leases.end_of_nodes_except(nodes).len();
+        self.settle(now);
+        n_leases
+    }
+
+    /// The episode of a world that is not being reset.
+    pub fn episode(&self, world: usize) -> Option<&Episode> {
+        match &self.places.get(world)?.slot {
+            Slot::Ready(episode) => Some(episode),
+            Slot::Resetting { .. } => None,
+        }
+    }
+
+    /// Every world.
+    pub fn worlds(&self) -> Range<usize> {
+        0..self.places.len()
+    }
+
+    /// World steps so far.
+    pub fn n_steps(&self) -> u64 {
+        self.n_steps
+    }
+
+    /// Worlds by their numbers.
+    pub(super) fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
+        checked(first, n_worlds, self.places.len(), Status::NoSuchWorld)
+    }
+
+    /// Robots by their numbers.
+    pub(super) fn robot_range(&self, first: u32, n_robots: u32) -> Result<Range<usize>, Refusal> {
+        let n_all = self.places.len() * self.spec.rules.n_robots;
+        checked(first, n_robots, n_all, Status::NoSuchRobot)
+    }
+
+    /// The worlds of some robots.
+    pub fn worlds_of(&self, robots: &Range<usize>) -> Range<usize> {
+        let team = self.spec.rules.n_robots;
+        robots.start / team..robots.end.div_ceil(team)
+    }
+
+    /// The robots of a world.
+    pub(super) fn robots_of(&self, world: usize) -> Range<usize> {
+        let team = self.spec.rules.n_robots;
+        world * team..(world + 1) * team
+    }
+
+    pub(super) fn check_present(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
+        let resetting = worlds.clone().find(|&world| self.episode(world).is_none());
+        resetting.map_or(Ok(()), |world| {
+            Err(Refusal::new(Status::Resetting, world as u64))
+        })
+    }
+
+    pub(super) fn world_info(&self, world: usize) -> WorldInfo {
+        let (result, robots) = match &self.places[world].slot {
+            Slot::Ready(episode) => (episode.result(), cells(episode)),
+            Slot::Resetting { last, cells, .. } => (last, cells.clone()),
+        };
+        WorldInfo {
+            world: world as u32,
+            step: result.step,
+            seed: result.seed,
+            episode: result.episode,
+            robots,
+        }
+    }
+}
+
+fn checked(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<usize>, Refusal> {
+    let (first, end) = (first as usize, first as usize + n as usize);
+    if first < end && end <= n_all {
+        return Ok(first..end);
+    }
+    Err(Refusal::new(otherwise, n_all as u64))
+}
+
+/// Which of a world's robots, by their place in it, are among some robots.
+pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usize> {
+    let (first, end) = (of_world.start, of_world.end);
+    robots.start.max(first) - first..robots.end.min(end) - first
+}
+
+/// `[row, col]` of each robot.
+pub(super) fn cells(episode: &Episode) -> Vec<[u32; 2]> {
+    let robots = episode.robots().iter();
+    let cell = robots.map(|robot| [robot.result().row, robot.result().col]);
+    cell.collect()
+}
+
+impl Slot {
+    pub(super) fn resetting(job: &ResetJob, n_robots: usize) -> Self {
+        Self::Resetting {
+            last: WorldResult::default(),
+            cells: vec![[0, 0]; n_robots],
+            seed: job.seed,
+            episode: job.episode,
+        }
+    }
+}
+
+impl ResetJob {
+    /// Simulates the burn-in: the slow part, for any thread.
+    pub fn run(self, rules: &Rules) -> (usize, Box<Episode>) {
+        let episode = match self.before {
+            None => Box::new(Episode::numbered(rules, self.seed, self.episode)),
+            Some(mut episode) => {
+                episode.reset(rules, self.seed);
+                episode
+            }
+        };
+        (self.world, episode)
+    }
+}

@@ -1,0 +1,159 @@
+//! Snapshot files: written whole or not at all.
+
+use super::error::SnapshotError;
+use super::format::{HEADER_BYTES, MAGIC, MAX_BYTES, Snapshot, checked_length, decode};
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read, Write};
+#[cfg(unix)]
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use thiserror::Error;
+
+/// What is wrong with pipes, devices, folders and links.
+const NOT_A_FILE: &str = "expected a regular file, got something else";
+
+/// Ending of the name of a file that is being written.
+pub(super) const PART: &str = ".part";
+
+static N_PARTS: AtomicU64 = AtomicU64::new(0);
+
+/// A file that could not be written or is refused.
+#[derive(Debug, Error)]
+#[error("snapshot file {path}: {problem}")]
+pub struct FileError {
+    /// The file, or its folder.
+    pub path: String,
+    pub problem: String,
+    /// Whether this file is damaged, so that an older one may be used.
+    pub is_damaged: bool,
+}
+
+/// What a file that was just written survives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Durability {
+    /// The death of any process.
+    Kill,
+    /// A loss of power, too: the disk has it. Takes some milliseconds.
+    PowerLoss,
+}
+
+/// Writes a file under another name first, so that there is never half of it; mode 0600.
+pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), FileError> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    // Several threads of a process may write one file.
+    let n = N_PARTS.fetch_add(1, Ordering::Relaxed);
+    name.push(format!(".{}-{n}{PART}", std::process::id()));
+    let part = path.with_file_name(name);
+    may_be_replaced(path).map_err(|error| failed(path, error))?;
+    let written = create(&part).and_then(|mut file| {
+        file.write_all(bytes)?;
+        if durability == Durability::Kill {
+            return std::fs::rename(&part, path);
+        }
+        file.sync_data()?;
+        std::fs::rename(&part, path)?;
+        sync_folder_of(path)
+    });
+    written.map_err(|error| {
+        let _ = std::fs::remove_file(&part);
+        failed(path, error)
+    })
+}
+
+/// Waits for the disk to have the folder, too, so that the new name survives a loss of power.
+fn sync_folder_of(path: &Path) -> io::Result<()> {
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty());
+    // Other systems do not open folders.
+    if cfg!(unix) {
+        File::open(folder.unwrap_or(Path::new(".")))?.sync_all()?;
+    }
+    Ok(())
+}
+
+/// Reads a snapshot file.
+pub fn read(path: &Path) -> Result<Snapshot, FileError> {
+    let bytes = read_bytes(path).map_err(|error| failed(path, error))?;
+    let snapshot = bytes.and_then(|bytes| decode(&bytes));
+    snapshot.map_err(|error| refused(path, error))
+}
+
+/// The error of a file whose contents are refused.
+pub fn refused(path: &Path, error: SnapshotError) -> FileError {
+    FileError {
+        path: path.display().to_string(),
+        problem: error.to_string(),
+        is_damaged: matches!(error, SnapshotError::Damaged(_)),
+    }
+}
+
+/// A new file; anything of its name, such as a link or a pipe, is removed and not opened.
+pub(super) fn create(path: &Path) -> io::Result<File> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    options.mode(0o600);
+    options.open(path)
+}
+
+/// Checks that nothing but a snapshot is replaced: no other file, no device, no link.
+fn may_be_replaced(path: &Path) -> io::Result<()> {
+    if path.file_name().is_none() {
+        return Err(io::Error::other(NOT_A_FILE));
+    }
+    match path.symlink_metadata() {
+        Err(_) => Ok(()),
+        Ok(old) if !old.is_file() => Err(io::Error::other(NOT_A_FILE)),
+        Ok(_) => {
+            let mut magic = [0; MAGIC.len()];
+            let _ = open(path)?.read(&mut magic)?;
+            if magic == MAGIC {
+                Ok(())
+            } else {
+                Err(io::Error::other(
+                    "expected no file or a snapshot to replace, got another kind of file",
+                ))
+            }
+        }
+    }
+}
+
+fn open(path: &Path) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.read(true);
+    // Opening a pipe would wait for its writer.
+    #[cfg(unix)]
+    options.custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32);
+    options.open(path)
+}
+
+/// All of a regular file whose header fits it: a pipe would block, and a device might never end.
+fn read_bytes(path: &Path) -> io::Result<Result<Vec<u8>, SnapshotError>> {
+    let mut file = open(path)?;
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        return Err(io::Error::other(NOT_A_FILE));
+    }
+    let mut bytes = Vec::new();
+    let mut header = Read::by_ref(&mut file).take(HEADER_BYTES as u64);
+    header.read_to_end(&mut bytes)?;
+    if let Err(error) = checked_length(&bytes, metadata.len().saturating_sub(HEADER_BYTES as u64)) {
+        return Ok(Err(error));
+    }
+    file.take(MAX_BYTES).read_to_end(&mut bytes)?;
+    Ok(Ok(bytes))
+}
+
+pub(super) fn failed(path: &Path, error: io::Error) -> FileError {
+    FileError {
+        path: path.display().to_string(),
+        problem: error.to_string(),
+        is_damaged: false,
+    }
+}

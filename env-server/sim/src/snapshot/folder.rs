@@ -1,0 +1,124 @@
+//! A folder of an instance's last snapshot files.
+
+use super::file::{Durability, FileError, PART, create, failed, write};
+use emberwatch_messages::instance::Instance;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Digits of a file's number.
+const DIGITS: usize = 12;
+
+/// How the files of a folder end.
+const EXTENSION: &str = "snapshot";
+
+/// A folder with the last snapshots of an instance, numbered.
+#[derive(Debug, Clone)]
+pub struct Folder {
+    path: PathBuf,
+    instance: String,
+}
+
+impl Folder {
+    /// The files of an instance; does not read the folder.
+    pub fn new(path: &Path, instance: &Instance) -> Self {
+        Self {
+            path: path.into(),
+            instance: instance.name().into(),
+        }
+    }
+
+    /// Makes the folder and checks that files can be made in it.
+    pub fn prepare(&self) -> Result<(), FileError> {
+        let probe = self.path.join(format!(".{}.probe", self.instance));
+        let made = std::fs::create_dir_all(&self.path)
+            .and_then(|()| create(&probe))
+            .and_then(|_| std::fs::remove_file(&probe))
+            .and_then(|()| self.remove_parts());
+        made.map_err(|error| failed(&self.path, error))
+    }
+
+    /// The error of a folder with another run's files, which would be replaced one by one.
+    pub fn not_empty(&self, n_files: usize) -> FileError {
+        let instance = &self.instance;
+        FileError {
+            path: self.path.display().to_string(),
+            problem: format!(
+                "expected none of instance {instance:?}, or --restore, got {n_files} of another run"
+            ),
+            is_damaged: false,
+        }
+    }
+
+    /// Removes unfinished files of servers that were killed.
+    fn remove_parts(&self) -> io::Result<()> {
+        for entry in std::fs::read_dir(&self.path)?.flatten() {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            let is_own = name
+                .strip_prefix(&*self.instance)
+                .is_some_and(|rest| rest.starts_with('-'));
+            if is_own && name.ends_with(PART) {
+                std::fs::remove_file(entry.path())?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The instance's files, the oldest first.
+    pub fn files(&self) -> Result<Vec<(u64, PathBuf)>, FileError> {
+        let entries = std::fs::read_dir(&self.path).map_err(|error| failed(&self.path, error))?;
+        let number = |path: &Path| {
+            let name = path.file_name()?.to_str()?;
+            let number = name.strip_prefix(&self.instance)?.strip_prefix('-')?;
+            let number = number.strip_suffix(EXTENSION)?.strip_suffix('.')?;
+            (number.len() == DIGITS).then(|| number.parse().ok())?
+        };
+        let paths = entries.flatten().map(|entry| entry.path());
+        let mut files: Vec<(u64, PathBuf)> = paths
+            .filter_map(|path| Some((number(&path)?, path)))
+            .collect();
+        files.sort_unstable();
+        Ok(files)
+    }
+
+    /// How the instance's files are named.
+    pub fn pattern(&self) -> String {
+        format!("{}-<{DIGITS} digits>.{EXTENSION}", self.instance)
+    }
+
+    /// The names of the folder's snapshots of all instances, by their ending.
+    pub fn snapshots(&self) -> Vec<String> {
+        let entries = std::fs::read_dir(&self.path)
+            .into_iter()
+            .flatten()
+            .flatten();
+        let paths = entries.map(|entry| entry.path());
+        let mut names: Vec<String> = paths
+            .filter(|path| path.extension().is_some_and(|end| end == EXTENSION))
+            .filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned()))
+            .collect();
+        names.sort_unstable();
+        names
+    }
+
+    /// Writes the next file and removes all but the last few and `also_keep`.
+    pub fn save(
+        &self,
+        bytes: &[u8],
+        durability: Durability,
+        keep: usize,
+        also_keep: Option<&Path>,
+    ) -> Result<PathBuf, FileError> {
+        let files = self.files()?;
+        let number = files.last().map_or(1, |(number, _)| number + 1);
+        let name = format!("{}-{number:0DIGITS$}.{EXTENSION}", self.instance);
+        let path = self.path.join(name);
+        write(&path, bytes, durability)?;
+        let n_old = (files.len() + 1).saturating_sub(keep);
+        let old_files = files[..n_old].iter().map(|(_, old)| old);
+        for old in old_files.filter(|old| Some(old.as_path()) != also_keep) {
+            let _ = std::fs::remove_file(old); // It may have been removed meanwhile.
+        }
+        Ok(path)
+    }
+}

@@ -1,0 +1,323 @@
+//! Worlds as bytes: everything that decides their future, in a versioned file with a checksum.
+//!
+//! A file is [`MAGIC`], the version, the CRC-32 of the rest, its length, and the rest: [`Settings`] and
+//! worlds as bincode writes them. All of it is in the byte order of the host; a file of the other order
+//! is one of an unknown version.
+
+use super::error::SnapshotError;
+use super::settings::{Settings, WorldSpec};
+use crate::world::{Episode, InvalidWorld, PastRobot, PastStep, Robot, SavedRobot, SavedWorld};
+use bincode::config::{Configuration, Fixint, LittleEndian};
+use bincode::error::DecodeError;
+use bincode::{Decode, Encode};
+use bytemuck::AnyBitPattern;
+use emberwatch_messages::limits::memory::in_words;
+use emberwatch_model::Grid;
+use emberwatch_model::path::path_to_bytes;
+
+/// What every snapshot begins with.
+pub const MAGIC: [u8; 8] = *b"EMBRSNAP";
+
+/// The version of the file's form.
+pub const VERSION: u32 = 2;
+
+/// Magic, version, checksum and length.
+pub(super) const HEADER_BYTES: usize = 8 + 4 + 4 + 8;
+
+/// Largest file: 4 GiB.
+pub const MAX_BYTES: u64 = 1 << 32;
+
+/// How bincode writes: integers of fixed size.
+const FORM: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
+
+/// Worlds of a server, and the settings that they follow.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    pub settings: Settings,
+    pub worlds: Vec<SnapshotWorld<Box<SavedWorld>>>,
+}
+
+/// A world at some step, or one that is yet to be simulated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum SnapshotWorld<T> {
+    Ready(T),
+    /// In its burn-in.
+    New(NewEpisode),
+}
+
+/// An episode before its burn-in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NewEpisode {
+    pub seed: u64,
+    /// Its number.
+    pub episode: u64,
+}
+
+/// A world in the order of its bytes.
+#[derive(Encode)]
+struct EncodedWorld<'a> {
+    result: &'a [u8],
+    states: &'a [u8],
+    first_states: &'a [u8],
+    /// Result, frame and path of each robot.
+    robots: Vec<(&'a [u8], &'a [u8], Vec<u8>)>,
+    history: Vec<Past<&'a [u8]>>,
+}
+
+/// A step's result; result, cells and values of its robots.
+type Past<B> = (B, Vec<[B; 3]>);
+
+/// The same, out of a file.
+#[derive(Decode)]
+struct DecodedWorld {
+    result: Vec<u8>,
+    states: Vec<u8>,
+    first_states: Vec<u8>,
+    robots: Vec<(Vec<u8>, Vec<u8>, Vec<u8>)>,
+    history: Vec<Past<Vec<u8>>>,
+}
+
+/// Worlds as the bytes of a file.
+pub fn encode(
+    settings: &Settings,
+    worlds: &[SnapshotWorld<&Episode>],
+) -> Result<Vec<u8>, SnapshotError> {
+    let n_bytes: u64 = worlds.iter().map(SnapshotWorld::n_bytes).sum();
+    check_size(n_bytes)?;
+    let worlds: Vec<_> = worlds.iter().map(SnapshotWorld::encoded).collect();
+    let mut bytes = Vec::new();
+    let reserved = bytes.try_reserve(n_bytes as usize + HEADER_BYTES + settings.model.len());
+    reserved.map_err(|_| {
+        SnapshotError::Unfit(format!(
+            "expected memory for {}, got less",
+            in_words(n_bytes)
+        ))
+    })?;
+    bytes.resize(HEADER_BYTES, 0);
+    // Only a writer can fail, and memory does not.
+    let _ = bincode::encode_into_std_write((settings, worlds), &mut bytes, FORM);
+    let body = &bytes[HEADER_BYTES..];
+    let (checksum, length) = (crc32fast::hash(body), body.len() as u64);
+    bytes[..8].copy_from_slice(&MAGIC);
+    bytes[8..12].copy_from_slice(&VERSION.to_ne_bytes());
+    bytes[12..16].copy_from_slice(&checksum.to_ne_bytes());
+    bytes[16..24].copy_from_slice(&length.to_ne_bytes());
+    Ok(bytes)
+}
+
+/// The worlds in the bytes of a file, whole or not at all; [`Snapshot::restore`] checks their values.
+pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
+    let malformed = |problem: String| SnapshotError::Unfit(format!("malformed: {problem}"));
+    let body = checked_body(bytes)?;
+    let ((settings, worlds), length) =
+        decode_body(body).map_err(|error| malformed(error.to_string()))?;
+    if length != body.len() {
+        let rest = body.len() - length;
+        return Err(malformed(format!("{rest} bytes behind the last world")));
+    }
+    let decoded = |(seed, episode, world): (u64, u64, Option<DecodedWorld>)| {
+        Ok(match world {
+            None => SnapshotWorld::New(NewEpisode { seed, episode }),
+            Some(world) => SnapshotWorld::Ready(Box::new(world.into_saved()?)),
+        })
+    };
+    Ok(Snapshot {
+        settings,
+        worlds: each_world(worlds, decoded)?,
+    })
+}
+
+/// Converts every world of a file; the error names the first that is invalid.
+fn each_world<T, U>(
+    worlds: Vec<T>,
+    convert: impl Fn(T) -> Result<U, InvalidWorld>,
+) -> Result<Vec<U>, SnapshotError> {
+    let worlds = worlds.into_iter().enumerate().map(|(index, world)| {
+        let invalid = |error| SnapshotError::Unfit(format!("world {index} of the file: {error}"));
+        convert(world).map_err(invalid)
+    });
+    worlds.collect()
+}
+
+fn check_size(n_bytes: u64) -> Result<(), SnapshotError> {
+    if n_bytes <= MAX_BYTES {
+        return Ok(());
+    }
+    Err(SnapshotError::Unfit(format!(
+        "expected a snapshot of at most {MAX_BYTES} bytes, got worlds of {n_bytes}"
+    )))
+}
+
+/// What a file holds.
+type Contents = (Settings, Vec<(u64, u64, Option<DecodedWorld>)>);
+
+/// Reads contents; returns how many bytes they took, too. bincode accepts lengths up to a limit, which is part of its
+/// types: the smallest sufficient one, so that a small file cannot ask for much memory.
+fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
+    match body.len() {
+        0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),
+        0x1_0000..0x100_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x1000_0000>()),
+        _ => bincode::decode_from_slice(body, FORM.with_limit::<{ 8 * MAX_BYTES as usize }>()),
+    }
+}
+
+fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
+    let (header, body) = bytes.split_at(HEADER_BYTES.min(bytes.len()));
+    let expected = checked_length(header, body.len() as u64)?;
+    let got = crc32fast::hash(body);
+    if expected != got {
+        return Err(SnapshotError::Damaged(format!(
+            "damaged: expected the checksum {expected:08x}, got {got:08x}"
+        )));
+    }
+    Ok(body)
+}
+
+/// Checks a header, with the number of bytes behind it; returns their checksum.
+pub(super) fn checked_length(header: &[u8], got: u64) -> Result<u32, SnapshotError> {
+    if header.len() < HEADER_BYTES || header[..8] != MAGIC {
+        let problem =
+            "expected a snapshot, which begins with \"EMBRSNAP\", got another kind of file";
+        return Err(SnapshotError::Damaged(problem.into()));
+    }
+    let word = |from: usize| {
+        let bytes = header[from..from + 4].try_into();
+        u32::from_ne_bytes(bytes.expect("invariant: four bytes"))
+    };
+    if word(8) != VERSION {
+        let got = word(8);
+        return Err(SnapshotError::Unfit(format!(
+            "expected a snapshot of version {VERSION}, got version {got}"
+        )));
+    }
+    let length = header[16..24].try_into().expect("invariant: eight bytes");
+    let expected = u64::from_ne_bytes(length);
+    if expected != got {
+        return Err(SnapshotError::Damaged(format!(
+            "damaged: expected {expected} bytes, got {got}"
+        )));
+    }
+    check_size(got)?;
+    Ok(word(12))
+}
+
+impl<'a> SnapshotWorld<&'a Episode> {
+    fn n_bytes(&self) -> u64 {
+        match self {
+            Self::Ready(episode) => episode.n_bytes() as u64,
+            Self::New(_) => 24,
+        }
+    }
+
+    fn encoded(&self) -> (u64, u64, Option<EncodedWorld<'a>>) {
+        match *self {
+            Self::New(NewEpisode { seed, episode }) => (seed, episode, None),
+            Self::Ready(episode) => {
+                let result = episode.result();
+                (result.seed, result.episode, Some(EncodedWorld::of(episode)))
+            }
+        }
+    }
+}
+
+impl<'a> EncodedWorld<'a> {
+    fn of(episode: &'a Episode) -> Self {
+        fn bytes(states: &Grid<u8>) -> &[u8] {
+            states.as_slice().expect("invariant: states are row-major")
+        }
+        let robot = |robot: &'a Robot| {
+            let result = bytemuck::bytes_of(robot.result());
+            (
+                result,
+                robot.frame().as_bytes(),
+                path_to_bytes(robot.path()),
+            )
+        };
+        let past_robot = |past: &'a PastRobot| {
+            let cells = bytemuck::cast_slice(&past.cells);
+            [bytemuck::bytes_of(&past.result), cells, &past.values[..]]
+        };
+        let past = |past: &'a PastStep| {
+            let robots = past.robots.iter().map(past_robot);
+            (bytemuck::bytes_of(&past.result), robots.collect())
+        };
+        Self {
+            result: bytemuck::bytes_of(episode.result()),
+            states: bytes(episode.states()),
+            first_states: bytes(episode.first_states()),
+            robots: episode.robots().iter().map(robot).collect(),
+            history: episode.history().map(past).collect(),
+        }
+    }
+}
+
+impl Snapshot {
+    /// The worlds, ready to continue on a server.
+    pub fn restore(
+        self,
+        spec: &WorldSpec,
+    ) -> Result<Vec<SnapshotWorld<Box<Episode>>>, SnapshotError> {
+        self.settings.check(&spec.settings)?;
+        each_world(self.worlds, |world| {
+            Ok(match world {
+                SnapshotWorld::New(new) => SnapshotWorld::New(new),
+                SnapshotWorld::Ready(saved) => {
+                    SnapshotWorld::Ready(Box::new(Episode::restore(&spec.rules, *saved)?))
+                }
+            })
+        })
+    }
+}
+
+impl DecodedWorld {
+    fn into_saved(self) -> Result<SavedWorld, InvalidWorld> {
+        let robots = self.robots.into_iter().map(|(result, frame, path)| {
+            let result = read(&result)?;
+            Ok(SavedRobot {
+                result,
+                frame,
+                path,
+            })
+        });
+        let history = self.history.into_iter().map(|(result, robots)| {
+            let robots = robots.into_iter().map(|[result, cells, values]| {
+                Ok(PastRobot {
+                    result: read(&result)?,
+                    cells: read_cells(&cells)?,
+                    values,
+                })
+            });
+            Ok(PastStep {
+                result: read(&result)?,
+                robots: robots.collect::<Result<_, _>>()?,
+            })
+        });
+        Ok(SavedWorld {
+            result: read(&self.result)?,
+            states: self.states,
+            first_states: self.first_states,
+            robots: robots.collect::<Result<_, _>>()?,
+            history: history.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+fn read<T: AnyBitPattern>(bytes: &[u8]) -> Result<T, InvalidWorld> {
+    let result = bytemuck::try_pod_read_unaligned(bytes);
+    result.map_err(|_| {
+        let (expected, got) = (size_of::<T>(), bytes.len());
+        InvalidWorld(format!("result: expected {expected} bytes, got {got}"))
+    })
+}
+
+fn read_cells(bytes: &[u8]) -> Result<Vec<u32>, InvalidWorld> {
+    let (cells, rest) = bytes.as_chunks::<4>();
+    if rest.is_empty() {
+        return Ok(cells.iter().map(|&cell| u32::from_ne_bytes(cell)).collect());
+    }
+    let got = bytes.len();
+    Err(InvalidWorld(format!(
+        "history: expected cells of 4 bytes, got {got} bytes"
+    )))
+}

@@ -1,0 +1,149 @@
+//! The settings that a server's worlds depend on: a snapshot fits a server with the same ones.
+
+use super::error::SnapshotError;
+use crate::config::Checked;
+use crate::world::Rules;
+use bincode::{Decode, Encode};
+use emberwatch_model::ModelError;
+use sha2::{Digest, Sha256};
+use std::fmt::Display;
+
+/// Names the task; it stands last, and only where the worlds are one.
+const TASK: &str = "task";
+
+/// Raised whenever the same settings and seed give another trajectory or another reward.
+const WORLDS: u32 = 1;
+
+/// The settings of a server that its worlds depend on.
+#[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
+pub struct Settings {
+    /// The model file as TOML.
+    pub model: String,
+    /// Every other setting by name.
+    pub others: Vec<(String, String)>,
+}
+
+/// What the worlds of a server must fit.
+#[derive(Debug, Clone)]
+pub struct WorldSpec {
+    pub settings: Settings,
+    pub rules: Rules,
+}
+
+impl WorldSpec {
+    /// Those of a server.
+    pub fn of(checked: &Checked) -> Result<Self, ModelError> {
+        let Checked {
+            config,
+            model,
+            shape,
+            recorded,
+            ..
+        } = checked;
+        let mut rules = Rules::new(
+            model,
+            *shape,
+            config.burn_in,
+            config.max_steps,
+            config.start,
+        )?;
+        (rules.history, rules.n_moves) = (config.history as usize, config.moves);
+        rules.n_robots = config.robots as usize;
+        if let Some(states) = recorded {
+            rules = rules.with_recorded(states.recorded.clone());
+        }
+        let settings = Settings::of(checked);
+        Ok(Self { settings, rules })
+    }
+}
+
+impl Settings {
+    /// The settings of a server.
+    pub fn of(checked: &Checked) -> Self {
+        let config = &checked.config;
+        let model = toml::to_string(checked.model.file());
+        let text = |value: &dyn Display| value.to_string();
+        let others: [(&str, String); 8] = [
+            ("height", text(&checked.shape.height())),
+            ("width", text(&checked.shape.width())),
+            ("moves", text(&config.moves)),
+            ("robots", text(&config.robots)),
+            ("burn_in", text(&config.burn_in)),
+            ("max_steps", text(&config.max_steps)),
+            ("coverage", format!("{:?}", config.coverage).to_lowercase()),
+            ("start", format!("{:?}", config.start).to_lowercase()),
+        ];
+        let of_states = checked.recorded.iter().flat_map(|states| {
+            let n_sequences = states.recorded.n_sequences();
+            let sequences = format!("{n_sequences} sequences of CRC-32 {:08x}", states.checksum);
+            [
+                ("states", sequences),
+                ("states_symmetries", text(&config.states_symmetries)),
+                ("states_offset", text(&config.states_offset)),
+            ]
+        });
+        let task = checked.task.iter().map(|task| (TASK, task.clone()));
+        let others = others.into_iter().chain(of_states).chain(task);
+        Self {
+            model: model.expect("invariant: a model was read from TOML"),
+            others: others.map(|(name, value)| (name.into(), value)).collect(),
+        }
+    }
+
+    /// Returns 16 hexadecimal digits that identify the worlds: results can be compared only where they are equal.
+    ///
+    /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see every
+    /// cell. It leaves out the task's name and `max_steps`: a result has its own number of steps.
+    pub fn worlds_fingerprint(&self) -> String {
+        let mut hash = Sha256::new();
+        hash.update(format!("worlds {WORLDS}\n{}\n", self.model));
+        for (name, value) in &self.others {
+            // The path's cells are seen, unless a client asks for more.
+            let value = if value == "client" { "path" } else { value };
+            if name != TASK && name != "max_steps" {
+                hash.update(format!("{name} = {value}\n"));
+            }
+        }
+        let digits = hash.finalize();
+        digits[..8]
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
+    }
+
+    /// Checks that these settings of a file are those of a server.
+    pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
+        let other = |setting: &str, expected: &str, got: &str| {
+            let problem = format!("{setting}: expected {expected} as this server's, got {got}");
+            SnapshotError::Unfit(problem)
+        };
+        if self.model != server.model {
+            let pairs = server.model.lines().zip(self.model.lines());
+            let line = pairs.into_iter().find(|(expected, got)| expected != got);
+            let (expected, got) = line.unwrap_or(("its model", "a longer or shorter one"));
+            return Err(other(
+                "model",
+                &format!("{:?}", start_of(expected)),
+                &format!("{:?}", start_of(got)),
+            ));
+        }
+        // The same worlds have the same settings, whether by a task or by flags.
+        let others = server.others.iter().filter(|(name, _)| name != TASK);
+        for (index, (setting, expected)) in others.enumerate() {
+            let got = self
+                .others
+                .get(index)
+                .filter(|(name, _)| name == setting)
+                .map_or("nothing", |(_, value)| value);
+            if got != expected {
+                return Err(other(setting, expected, got));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A line of a model file in an error; that of a map may be long.
+fn start_of(line: &str) -> String {
+    line.chars().take(80).collect()
+}

@@ -1,0 +1,374 @@
+//! One world with its robots: reset, step, reward, truncation.
+//!
+//! A step flies the paths, moves the world from X_k to X_{k+1}, and observes the visited cells of
+//! X_{k+1} (paper Algorithm 1; the order is the authors').
+
+use super::flown::Flown;
+use super::hidden::World;
+use super::history::{History, PastStep};
+use super::reward::pay;
+use super::robot::{Robot, Scratch};
+use super::rules::Rules;
+use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
+use super::sensor::{Sensor, path_cells};
+use emberwatch_messages::message::WorldResult;
+use emberwatch_model::path::path_from_bytes;
+use emberwatch_model::{Coverage, Frame, Grid};
+
+/// One world's episode.
+#[derive(Debug, Clone)]
+pub struct Episode {
+    world: World,
+    /// The world at k = 0, so that the next reset to the same seed needs no burn-in.
+    beginning: World,
+    robots: Vec<Robot>,
+    result: WorldResult,
+    /// A 0 for each cell, for [`pay`].
+    counts: Vec<u8>,
+    scratch: Scratch,
+    history: History,
+}
+
+impl Episode {
+    /// A new world at k = 0.
+    pub fn new(rules: &Rules, seed: u64) -> Self {
+        Self::numbered(rules, seed, 0)
+    }
+
+    /// A new world at k = 0 that was reset before.
+    pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
+        let world = World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended);
+        Self::beginning(rules, world, episode)
+    }
+
+    /// Starts over with a seed: frames are empty, robots at their starts, k = 0.
+    pub fn reset(&mut self, rules: &Rules, seed: u64) {
+        let world = if self.beginning.seed() == seed {
+            self.beginning.clone()
+        } else {
+            World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended)
+        };
+        *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
+    }
+
+    /// Flies paths and moves the world once.
+    pub fn step(&mut self, rules: &Rules, flown: &Flown<'_>) {
+        let n_moves = flown.moves.len() / self.robots.len();
+        for (r, robot) in self.robots.iter_mut().enumerate() {
+            let path = match flown.coverage(r) {
+                Coverage::Empty => &[],
+                _ => &flown.moves[r * n_moves..][..n_moves],
+            };
+            let coverage = flown.coverage(r);
+            robot.fly(&rules.airspace, path, coverage, &mut self.scratch);
+        }
+        self.world.advance();
+        self.observe(rules);
+        let (states, step) = (self.world.states(), self.world.step());
+        self.result.step = step;
+        self.result.hovered = flown.hovered;
+        self.result.late = flown.late;
+        self.result.n_target_cells = count(states, rules.target_state);
+        self.result.truncated = u16::from(rules.truncates(self.result.seed, step));
+        let states = states.as_slice().expect("invariant: states are row-major");
+        pay(
+            rules,
+            states,
+            &mut self.robots,
+            &mut self.counts,
+            &mut self.result,
+        );
+        self.history.push(&self.result, &self.robots);
+    }
+
+    /// What the last step gave, or the beginning after a reset.
+    pub fn result(&self) -> &WorldResult {
+        &self.result
+    }
+
+    /// Its robots, in order.
+    pub fn robots(&self) -> &[Robot] {
+        &self.robots
+    }
+
+    /// What step k showed.
+    ///
+    /// # Errors
+    /// If it is not kept; the error is the nearest step that is, the oldest or the present.
+    pub fn recall(&self, step: u64) -> Result<&PastStep, u64> {
+        let oldest = self.history.all().next().map(|past| past.result.step);
+        let present = self.result.step;
+        let nearest = oldest.filter(|_| step < present).unwrap_or(present);
+        self.history.step(step).ok_or(nearest)
+    }
+
+    /// About how many bytes a snapshot of it takes.
+    pub fn n_bytes(&self) -> usize {
+        let of_robot = |robot: &Robot| robot.frame.as_bytes().len() + robot.path.len() + 128;
+        let robots: usize = self.robots.iter().map(of_robot).sum();
+        2 * self.counts.len() + robots + self.history.n_bytes() + 256
+    }
+
+    /// The hidden states, shape `[H, W]`.
+    pub fn states(&self) -> &Grid<u8> {
+        self.world.states()
+    }
+
+    /// Whether the episode was truncated: it takes no step before it is reset.
+    pub fn is_over(&self) -> bool {
+        self.result.truncated != 0
+    }
+
+    /// The hidden states at k = 0, shape `[H, W]`.
+    pub fn first_states(&self) -> &Grid<u8> {
+        self.beginning.states()
+    }
+
+    /// The last steps, the oldest first.
+    pub fn history(&self) -> impl ExactSizeIterator<Item = &PastStep> {
+        self.history.all()
+    }
+
+    /// The episode that was saved: it continues bit for bit as the original.
+    pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
+        saved.check(rules)?;
+        let SavedWorld {
+            result,
+            states,
+            first_states,
+            robots,
+            history,
+        } = saved;
+        let grid = |states| Grid::from_shape_vec(rules.shape.dim(), states);
+        let world = |step, states| {
+            let states = grid(states).expect("invariant: the length was checked");
+            World::at(
+                rules.source.clone(),
+                result.seed,
+                rules.burn_in,
+                step,
+                states,
+            )
+        };
+        let mut kept = History::new(rules.history, rules.n_robots, rules.most_seen());
+        history.into_iter().for_each(|past| kept.keep(past));
+        let robots = robots.into_iter().map(|robot| restored(rules, &robot));
+        Ok(Self {
+            world: world(result.step, states),
+            beginning: world(0, first_states),
+            robots: robots.collect::<Result<_, _>>()?,
+            result,
+            counts: vec![0; rules.shape.n_cells()],
+            scratch: Scratch::default(),
+            history: kept,
+        })
+    }
+
+    fn beginning(rules: &Rules, world: World, episode: u64) -> Self {
+        let start = |robot| Robot::at(&rules.airspace, rules.start_cell(world.seed(), robot));
+        let robots: Vec<Robot> = (0..rules.n_robots).map(start).collect();
+        let result = WorldResult {
+            seed: world.seed(),
+            episode,
+            n_target_cells: count(world.states(), rules.target_state),
+            ..WorldResult::default()
+        };
+        let mut history = History::new(rules.history, rules.n_robots, rules.most_seen());
+        history.push(&result, &robots);
+        Self {
+            beginning: world.clone(),
+            world,
+            robots,
+            result,
+            counts: vec![0; rules.shape.n_cells()],
+            scratch: Scratch::default(),
+            history,
+        }
+    }
+
+    fn observe(&mut self, rules: &Rules) {
+        let (sensor, states) = (&rules.sensor, self.world.states());
+        let key = Sensor::key(self.world.seed(), self.world.absolute_step());
+        for Robot {
+            result,
+            frame,
+            seen,
+            ..
+        } in &mut self.robots
+        {
+            if result.coverage == Coverage::Full as u32 {
+                sensor.observe(key, states, path_cells(0..rules.shape.n_cells()), frame);
+            } else {
+                sensor.observe(key, states, seen.iter().copied(), frame);
+            }
+        }
+    }
+}
+
+fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
+    let frame = Frame::from_bytes(rules.shape, rules.n_observations, &saved.frame);
+    Ok(Robot {
+        result: saved.result,
+        frame: frame.map_err(|error| InvalidWorld(error.to_string()))?,
+        path: path_from_bytes(&saved.path).map_err(|error| InvalidWorld(error.to_string()))?,
+        visited: Vec::new(),
+        seen: Vec::new(),
+        paying: None,
+    })
+}
+
+fn count(states: &Grid<u8>, wanted: u8) -> u32 {
+    // Bytes summed in chunks that cannot overflow: the compiler makes vector code of it.
+    let states = states.as_slice().expect("invariant: states are row-major");
+    let of_chunk = |chunk: &[u8]| {
+        u32::from(
+            chunk
+                .iter()
+                .map(|state| u8::from(*state == wanted))
+                .sum::<u8>(),
+        )
+    };
+    states.chunks(255).map(of_chunk).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_model::path::fly;
+    use emberwatch_model::task::Start;
+    use emberwatch_model::{Cell, Model, Move, Shape};
+
+    fn rules(max_steps: u64, start: Start) -> Rules {
+        let shape = Shape::new(12, 20).expect("test shape");
+        Rules::new(&Model::wildfire(), shape, 2000, max_steps, start).expect("valid model")
+    }
+
+    fn path(bytes: &[u8]) -> Vec<Move> {
+        path_from_bytes(bytes).expect("test path")
+    }
+
+    /// Flies the only robot.
+    fn step(episode: &mut Episode, rules: &Rules, moves: &[u8], full: u64) {
+        let flown = Flown {
+            moves: &path(moves),
+            ready: 1,
+            full,
+            hovered: 0,
+            late: 0,
+        };
+        episode.step(rules, &flown);
+    }
+
+    #[test]
+    fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
+        let rules = rules(0, Start::Centre);
+        let mut episode = Episode::new(&rules, 0);
+        let mut total = 0;
+        for k in 0..2000 {
+            if k % 50 == 0 {
+                episode.reset(&rules, k);
+            }
+            let there_and_back = [3, 3, 0, 1, 2, 2];
+            let start = episode.robots()[0].cell();
+            let flight = fly(rules.shape, start, &path(&there_and_back));
+            step(&mut episode, &rules, &there_and_back, 0);
+            let states = episode.states().as_slice().expect("row-major");
+            let is_fire = |cell: &&usize| states[**cell] == 2;
+            let fires = flight.visited.iter().filter(is_fire).count();
+            let (world, robot) = (episode.result(), episode.robots()[0].result());
+            for reward in [world.reward, robot.reward, robot.marginal] {
+                assert_eq!(reward, fires as f64);
+            }
+            assert_eq!((world.n_hits, robot.n_hits), (fires as u32, fires as u32));
+            let n_visited = flight.visited.len() as u32;
+            assert_eq!((world.n_visited, robot.n_visited), (n_visited, n_visited));
+            let n_fires = states.iter().filter(|state| **state == 2).count();
+            assert_eq!(world.n_target_cells as usize, n_fires);
+            total += fires;
+        }
+        assert!(total > 0, "the test saw no fire");
+    }
+
+    #[test]
+    fn a_frame_shows_the_visited_cells_and_no_others() {
+        let rules = rules(0, Start::Corner);
+        let mut episode = Episode::new(&rules, 1);
+        step(&mut episode, &rules, &[1, 3, 3], 0);
+        let seen = |episode: &Episode| episode.robots()[0].frame().clone();
+        let masked = seen(&episode);
+        let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
+        assert_eq!(cells, [20, 21, 22]);
+        let mut other = Episode::new(&rules, 1);
+        step(&mut other, &rules, &[0, 0, 0], 1);
+        assert_eq!(seen(&other).observed().count(), 240);
+        for (cell, value) in masked.observed() {
+            assert_eq!(
+                seen(&other).as_bytes()[cell],
+                value,
+                "a reading depends on the path"
+            );
+        }
+        assert_eq!(
+            other.states(),
+            episode.states(),
+            "the world depends on the path"
+        );
+    }
+
+    #[test]
+    fn robots_that_stay_see_nothing_and_do_not_move() {
+        let mut rules = rules(0, Start::Corner);
+        rules.n_robots = 4;
+        let mut episode = Episode::new(&rules, 1);
+        let starts: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
+        let corners = [(0, 0), (11, 19), (0, 19), (11, 0)].map(|(row, col)| Cell { row, col });
+        assert_eq!(starts, corners);
+        let flown = Flown {
+            moves: &path(&[1, 1, 0, 0, 2, 2, 3, 3]),
+            ready: 0b0110,
+            full: 0,
+            hovered: 0b0001,
+            late: 0b1000,
+        };
+        episode.step(&rules, &flown);
+        let cells: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
+        let moved = [(0, 0), (9, 19), (0, 17), (11, 0)].map(|(row, col)| Cell { row, col });
+        assert_eq!(cells, moved);
+        let n_seen = |robot: &Robot| robot.frame().observed().count();
+        let n_seen: Vec<usize> = episode.robots().iter().map(n_seen).collect();
+        assert_eq!(n_seen, [0, 2, 2, 0]);
+        let n_moves = |robot: &Robot| robot.result().n_moves;
+        let n_moves: Vec<u32> = episode.robots().iter().map(n_moves).collect();
+        assert_eq!(n_moves, [0, 2, 2, 0]);
+        assert_eq!((episode.result().hovered, episode.result().late), (1, 8));
+    }
+
+    #[test]
+    fn a_reset_repeats_the_episode_of_its_seed() {
+        let rules = rules(0, Start::Random);
+        let mut episode = Episode::new(&rules, 9);
+        let first = episode.clone();
+        step(&mut episode, &rules, &[1, 1, 1], 0);
+        for seed in [9, 10, 9] {
+            episode.reset(&rules, seed);
+            assert_eq!(episode.states(), Episode::new(&rules, seed).states());
+            let n_seen = episode.robots()[0].frame().observed().count();
+            assert_eq!((episode.result().step, n_seen), (0, 0));
+        }
+        assert_eq!(episode.robots()[0].cell(), first.robots()[0].cell());
+        assert_eq!(episode.result().episode, 3);
+    }
+
+    #[test]
+    fn an_episode_is_truncated_at_max_steps_and_never_terminated() {
+        let rules = rules(3, Start::Corner);
+        let mut episode = Episode::new(&rules, 1);
+        for k in 1..=3 {
+            assert!(!episode.is_over());
+            step(&mut episode, &rules, &[1], 0);
+            assert_eq!(episode.result().step, k);
+            assert_eq!(episode.result().terminated, 0);
+        }
+        assert!(episode.is_over());
+    }
+}

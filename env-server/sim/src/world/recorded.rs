@@ -1,0 +1,218 @@
+//! Hidden states that were recorded: which sequence a world shows, how it is turned, and from which recorded step on.
+
+use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::{Grid, Shape};
+use ndarray::{Array3, ArrayView2, Axis};
+use rand::RngExt;
+
+/// What the worlds of a server show.
+#[derive(Debug)]
+pub struct Recorded {
+    /// Each of shape `[K, H, W]`, row-major, K at least 2.
+    sequences: Vec<Array3<u8>>,
+    shape: Shape,
+    with_symmetries: bool,
+    /// Largest recorded step to begin with.
+    most_offset: u64,
+}
+
+/// What the world of a seed shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Choice {
+    sequence: usize,
+    symmetry: u64,
+    offset: u64,
+}
+
+impl Recorded {
+    /// Sequences of one shape; an episode begins at a recorded step of `0..=most_offset`.
+    ///
+    /// # Errors
+    /// If an episode could begin at the last recorded step; the error is the largest possible offset.
+    ///
+    /// # Panics
+    /// If there is no sequence, or one has another shape or fewer than two recorded steps.
+    pub fn new(
+        sequences: Vec<Array3<u8>>,
+        shape: Shape,
+        with_symmetries: bool,
+        most_offset: u64,
+    ) -> Result<Self, u64> {
+        let is_right = |sequence: &Array3<u8>| {
+            let (n_recorded, height, width) = sequence.dim();
+            n_recorded >= 2 && (height, width) == shape.dim()
+        };
+        assert!(!sequences.is_empty() && sequences.iter().all(is_right));
+        let recorded = Self {
+            sequences,
+            shape,
+            with_symmetries,
+            most_offset,
+        };
+        let possible = recorded.shortest() - 2;
+        (most_offset <= possible)
+            .then_some(recorded)
+            .ok_or(possible)
+    }
+
+    /// Number of sequences.
+    pub fn n_sequences(&self) -> usize {
+        self.sequences.len()
+    }
+
+    /// Steps of the shortest possible episode.
+    pub fn n_steps(&self) -> u64 {
+        self.shortest() - 1 - self.most_offset
+    }
+
+    /// The last step of an episode.
+    pub(super) fn last_step(&self, seed: u64) -> u64 {
+        let Choice {
+            sequence, offset, ..
+        } = self.choice(seed);
+        self.sequences[sequence].len_of(Axis(0)) as u64 - 1 - offset
+    }
+
+    /// The hidden states of a seed's world at a step of its episode, shape `[H, W]`.
+    pub(super) fn states(&self, seed: u64, step: u64) -> Grid<u8> {
+        let mut states = Grid::zeros(self.shape.dim());
+        self.show(seed, step, &mut states);
+        states
+    }
+
+    /// [`Self::states`] in the place of others.
+    ///
+    /// # Panics
+    /// If the episode ends before the step.
+    pub(super) fn show(&self, seed: u64, step: u64, states: &mut Grid<u8>) {
+        let choice = self.choice(seed);
+        let recorded = self.sequences[choice.sequence].view();
+        let recorded = recorded.index_axis_move(Axis(0), (choice.offset + step) as usize);
+        states.assign(&turned(recorded, choice.symmetry));
+    }
+
+    fn shortest(&self) -> u64 {
+        let lengths = self.sequences.iter().map(|it| it.len_of(Axis(0)) as u64);
+        lengths.min().expect("invariant: there is a sequence")
+    }
+
+    fn choice(&self, seed: u64) -> Choice {
+        let n_sequences = self.sequences.len() as u64;
+        let n_symmetries = if !self.with_symmetries {
+            1
+        } else if self.shape.height() == self.shape.width() {
+            8
+        } else {
+            4
+        };
+        let mut random = stream(seed, Purpose::Offset, 0);
+        Choice {
+            sequence: (seed % n_sequences) as usize,
+            symmetry: seed / n_sequences % n_symmetries,
+            offset: random.random_range(0..=self.most_offset),
+        }
+    }
+}
+
+/// One of the symmetries of a square: from 4 on transposed, then bit 0 reverses the rows and bit 1 the columns.
+fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> ArrayView2<'_, u8> {
+    let mut turned = match symmetry & 4 {
+        0 => states,
+        _ => states.reversed_axes(),
+    };
+    for axis in [0, 1].into_iter().filter(|axis| symmetry >> axis & 1 != 0) {
+        turned.invert_axis(Axis(axis));
+    }
+    turned
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::array;
+
+    fn recorded(
+        lengths: &[usize],
+        side: (usize, usize),
+        symmetries: bool,
+        offset: u64,
+    ) -> Recorded {
+        let shape = Shape::new(side.0, side.1).expect("test shape");
+        let sequence = |(index, &length): (usize, &usize)| {
+            Array3::from_shape_fn((length, side.0, side.1), |(k, row, col)| {
+                (50 * index + 10 * k + side.1 * row + col) as u8
+            })
+        };
+        let sequences = lengths.iter().enumerate().map(sequence).collect();
+        Recorded::new(sequences, shape, symmetries, offset).expect("valid")
+    }
+
+    #[test]
+    fn symmetries_are_those_of_the_square() {
+        let states = array![[1, 2], [3, 4]];
+        let expected = [
+            [[1, 2], [3, 4]],
+            [[3, 4], [1, 2]],
+            [[2, 1], [4, 3]],
+            [[4, 3], [2, 1]],
+            [[1, 3], [2, 4]],
+            [[2, 4], [1, 3]],
+            [[3, 1], [4, 2]],
+            [[4, 2], [3, 1]],
+        ];
+        for (symmetry, expected) in (0..).zip(expected) {
+            let expected = ndarray::arr2(&expected);
+            assert_eq!(turned(states.view(), symmetry), expected, "{symmetry}");
+        }
+    }
+
+    #[test]
+    fn seeds_go_through_sequences_then_symmetries() {
+        let square = recorded(&[2, 3], (2, 2), true, 0);
+        let oblong = recorded(&[2, 3], (1, 3), true, 0);
+        let plain = recorded(&[2, 3], (2, 2), false, 0);
+        for seed in 0..40 {
+            let chosen = |of: &Recorded| {
+                let choice = of.choice(seed);
+                (choice.sequence as u64, choice.symmetry)
+            };
+            assert_eq!(chosen(&square), (seed % 2, seed / 2 % 8));
+            assert_eq!(chosen(&oblong), (seed % 2, seed / 2 % 4));
+            assert_eq!(chosen(&plain), (seed % 2, 0));
+            assert_eq!(square.last_step(seed), 1 + seed % 2);
+        }
+    }
+
+    #[test]
+    fn offsets_are_uniform_and_leave_a_step() {
+        let recorded = recorded(&[5, 9], (1, 1), false, 3);
+        let mut counts = [0.0_f64; 4];
+        for seed in 0..4000 {
+            let Choice {
+                offset, sequence, ..
+            } = recorded.choice(seed);
+            counts[offset as usize] += 1.0;
+            assert_eq!(recorded.last_step(seed), [4, 8][sequence] - offset);
+            assert_eq!(
+                recorded.states(seed, 0)[[0, 0]],
+                (50 * sequence as u64 + 10 * offset) as u8
+            );
+        }
+        assert_eq!(recorded.n_steps(), 1);
+        // 4,000 independent draws of 1 in 4: 4.5 standard errors, 1 in 150,000 for each of 4.
+        let bound = 4.5 * (4000.0_f64 * 0.25 * 0.75).sqrt();
+        assert!(
+            counts.iter().all(|count| (count - 1000.0).abs() < bound),
+            "{counts:?}"
+        );
+    }
+
+    #[test]
+    fn an_offset_that_leaves_no_step_is_refused() {
+        let sequences = || vec![Array3::zeros((4, 1, 2)), Array3::zeros((7, 1, 2))];
+        let shape = Shape::new(1, 2).expect("test shape");
+        let new = |offset| Recorded::new(sequences(), shape, false, offset);
+        assert_eq!(new(2).map(|it| it.n_steps()).ok(), Some(1));
+        assert_eq!(new(3).err(), Some(2));
+    }
+}

@@ -1,0 +1,134 @@
+//! What a step pays: a cell that several robots visit pays once, or see where seeing pays.
+
+use super::robot::Robot;
+use super::rules::Rules;
+use emberwatch_messages::message::WorldResult;
+use emberwatch_model::Pays;
+
+/// Set in the count of a cell that the team was paid for.
+const PAID: u8 = 0x80;
+
+/// Counts the paying cells of robots in `states`, X_{k+1}: for each its share and its marginal reward, for the
+/// world the team's. `counts` has a 0 for each cell, before and after.
+pub(super) fn pay(
+    rules: &Rules,
+    states: &[u8],
+    robots: &mut [Robot],
+    counts: &mut [u8],
+    team: &mut WorldResult,
+) {
+    (team.reward, team.n_visited, team.n_hits) = (0.0, 0, 0);
+    for robot in &*robots {
+        robot.paying().iter().for_each(|&cell| counts[cell] += 1);
+    }
+    for Robot {
+        visited,
+        paying,
+        result,
+        ..
+    } in &mut *robots
+    {
+        for &cell in paying.as_ref().unwrap_or(visited) {
+            let reward = rules.reward[usize::from(states[cell])];
+            let is_hit = u32::from(states[cell] == rules.target_state);
+            let n_visitors = counts[cell] & !PAID;
+            result.n_hits += is_hit;
+            result.reward += reward / f64::from(n_visitors);
+            if n_visitors == 1 {
+                result.marginal += reward;
+            }
+            if counts[cell] & PAID == 0 {
+                counts[cell] |= PAID;
+                team.reward += reward;
+                team.n_visited += 1;
+                team.n_hits += is_hit;
+            }
+        }
+    }
+    for robot in &*robots {
+        robot.paying().iter().for_each(|&cell| counts[cell] = 0);
+    }
+    if rules.airspace.pays() == Pays::Seen {
+        team.n_visited = n_distinct(robots, counts);
+    }
+}
+
+/// Distinct cells that any robot visited.
+fn n_distinct(robots: &[Robot], counts: &mut [u8]) -> u32 {
+    let mut n_visited = 0;
+    for &cell in robots.iter().flat_map(|robot| &robot.visited) {
+        n_visited += u32::from(counts[cell] == 0);
+        counts[cell] = 1;
+    }
+    let visited = robots.iter().flat_map(|robot| &robot.visited);
+    visited.for_each(|&cell| counts[cell] = 0);
+    n_visited
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::robot::Scratch;
+    use emberwatch_model::randomness::split_mix;
+    use emberwatch_model::task::Start;
+    use emberwatch_model::{Coverage, Model, Move, Shape};
+    use std::collections::BTreeSet;
+
+    /// The reward of a set of cells.
+    fn reward(rules: &Rules, states: &[u8], cells: &BTreeSet<usize>) -> f64 {
+        let of_cell = |&cell: &usize| rules.reward[usize::from(states[cell])];
+        cells.iter().map(of_cell).sum()
+    }
+
+    #[test]
+    fn shares_and_marginal_rewards_are_those_of_sets_of_cells() {
+        let shape = Shape::new(4, 5).expect("shape");
+        let model = Model::wildfire();
+        let mut rules = Rules::new(&model, shape, 0, 0, Start::Random).expect("valid model");
+        rules.reward = vec![-0.5, 0.25, 1.0];
+        let mut counts = vec![0; shape.n_cells()];
+        for case in 0..2_000 {
+            let draw = |index: usize| split_mix(case, index as u64);
+            let states: Vec<u8> = (0..20).map(|cell| (draw(cell) % 3) as u8).collect();
+            let fly = |r: usize| {
+                let mut robot = Robot::at(&rules.airspace, shape.cell(draw(100 + r) as usize % 20));
+                let n_moves = draw(200 + r) as usize % 8; // 0: it stays.
+                let moves = (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) >> 9));
+                let moves: Vec<Move> = moves.collect();
+                robot.fly(
+                    &rules.airspace,
+                    &moves,
+                    Coverage::Path,
+                    &mut Scratch::default(),
+                );
+                robot
+            };
+            let mut robots: Vec<Robot> = (0..1 + case as usize % 6).map(fly).collect();
+            let mut team = WorldResult::default();
+            pay(&rules, &states, &mut robots, &mut counts, &mut team);
+            assert!(counts.iter().all(|&count| count == 0));
+
+            let visited = |robots: &mut dyn Iterator<Item = &Robot>| -> BTreeSet<usize> {
+                robots.flat_map(|robot| robot.visited.clone()).collect()
+            };
+            let all = visited(&mut robots.iter());
+            let expected = reward(&rules, &states, &all);
+            assert!((team.reward - expected).abs() < 1e-12);
+            assert_eq!(team.n_visited as usize, all.len());
+            let shares: f64 = robots.iter().map(|robot| robot.result.reward).sum();
+            assert!((shares - expected).abs() < 1e-12);
+            for (r, robot) in robots.iter().enumerate() {
+                let mut others = robots.iter().enumerate().filter(|(o, _)| *o != r);
+                let without = visited(&mut others.by_ref().map(|(_, other)| other));
+                let marginal = expected - reward(&rules, &states, &without);
+                assert!((robot.result.marginal - marginal).abs() < 1e-12);
+                let visitors =
+                    |cell: &usize| robots.iter().filter(|o| o.visited.contains(cell)).count();
+                let of_cell =
+                    |cell: &usize| rules.reward[usize::from(states[*cell])] / visitors(cell) as f64;
+                let share: f64 = robot.visited.iter().map(of_cell).sum();
+                assert!((robot.result.reward - share).abs() < 1e-12);
+            }
+        }
+    }
+}

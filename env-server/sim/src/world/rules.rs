@@ -1,0 +1,115 @@
+//! What all episodes of a server share: the model, the grid, and the settings that decide a world's future.
+
+use super::hidden::Source;
+use super::recorded::Recorded;
+use super::sensor::Sensor;
+use super::starts::{fixed_start, random_starts};
+use emberwatch_model::ModelError;
+use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::task::Start;
+use emberwatch_model::{Airspace, Cell, Dynamics, Model, Shape};
+use rand::RngExt;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// What all episodes of a server share.
+#[derive(Debug, Clone)]
+pub struct Rules {
+    pub shape: Shape,
+    pub airspace: Airspace,
+    /// Cells where random starts may be; `None`: all.
+    starts: Option<Arc<Vec<usize>>>,
+    /// Reward for each distinct cell that pays, by state.
+    pub reward: Vec<f64>,
+    /// The state that pays most.
+    pub target_state: u8,
+    /// Number of states S.
+    pub n_states: usize,
+    /// Number of observations O.
+    pub n_observations: usize,
+    /// Steps simulated before k = 0.
+    pub burn_in: u64,
+    /// Episode length; 0: never truncated.
+    pub max_steps: u64,
+    pub start: Start,
+    /// Steps whose frames are kept.
+    pub history: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// Robots of a world.
+    pub n_robots: usize,
+    /// Set when nobody wants the worlds any more: burn-ins that still run end at once, and are not to be used.
+    pub ended: Arc<AtomicBool>,
+    pub(super) sensor: Sensor,
+    pub(super) source: Source,
+}
+
+impl Rules {
+    /// The rules under a model, for one robot; `history` and `n_moves` are 0.
+    pub fn new(
+        model: &Model,
+        shape: Shape,
+        burn_in: u64,
+        max_steps: u64,
+        start: Start,
+    ) -> Result<Self, ModelError> {
+        let airspace = model.airspace(shape)?;
+        Ok(Self {
+            shape,
+            starts: random_starts(&airspace).map(Arc::new),
+            airspace,
+            reward: model.reward().to_vec(),
+            target_state: model.target_state() as u8,
+            n_states: model.n_states(),
+            n_observations: model.n_observations(),
+            burn_in,
+            max_steps,
+            start,
+            history: 0,
+            n_moves: 0,
+            n_robots: 1,
+            ended: Arc::default(),
+            sensor: Sensor::new(model),
+            source: Source::Simulated(Dynamics::new(model, shape)?),
+        })
+    }
+
+    /// The same, of worlds whose hidden states were recorded.
+    pub fn with_recorded(mut self, recorded: Arc<Recorded>) -> Self {
+        self.source = Source::Recorded(recorded);
+        self
+    }
+
+    /// Whether the episode of a seed is truncated at a step.
+    pub(super) fn truncates(&self, seed: u64, step: u64) -> bool {
+        let last = self.source.last_step(seed);
+        (self.max_steps > 0 && step >= self.max_steps) || last.is_some_and(|last| step >= last)
+    }
+
+    pub(super) fn start_cell(&self, seed: u64, robot: usize) -> Cell {
+        fixed_start(self.start, self.shape, robot).unwrap_or_else(|| {
+            let mut stream = stream(seed, Purpose::Start, robot as u64);
+            let index = match &self.starts {
+                None => stream.random_range(0..self.shape.n_cells()),
+                Some(starts) => starts[stream.random_range(0..starts.len())],
+            };
+            self.shape.cell(index)
+        })
+    }
+
+    /// The maximum number of cells that a robot sees in a step.
+    pub(super) fn most_seen(&self) -> usize {
+        most_seen(self.airspace.radius(), self.n_moves, self.shape.n_cells())
+    }
+}
+
+/// The maximum number of cells that a robot sees from a path, with a sensor of this radius.
+pub fn most_seen(radius: usize, n_moves: usize, n_cells: usize) -> usize {
+    match radius {
+        0 => n_moves,
+        radius => {
+            let side = 2 * radius + 1;
+            (side * (n_moves + side)).min(n_cells)
+        }
+    }
+}

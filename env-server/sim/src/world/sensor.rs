@@ -1,0 +1,146 @@
+//! Observation noise: what a sensor reads where it looks (paper eq. 1).
+//!
+//! The reading at (seed, step, cell, ring) is a pure function, so two agents that look at one cell at one
+//! step from one ring see the same. One ChaCha8 draw keys the step, SplitMix64 of that key gives each cell's
+//! number: constant work per cell looked at, nothing for the others.
+
+use emberwatch_model::SeenCell;
+use emberwatch_model::randomness::{Purpose, split_mix, stream};
+use emberwatch_model::{Frame, Grid, Model};
+use rand_chacha::rand_core::Rng;
+
+/// `P(y | x)` as thresholds on a 32-bit number.
+#[derive(Debug, Clone)]
+pub struct Sensor {
+    /// `thresholds[(x * n_rings + ring) * n_named + y]`: upper end of `y`'s share, of 2^32.
+    thresholds: Vec<u64>,
+    n_rings: usize,
+    /// Observations without regard to the ring.
+    n_named: usize,
+}
+
+impl Sensor {
+    /// The sensor of a model.
+    pub fn new(model: &Model) -> Self {
+        let (n_rings, n_named) = (model.n_rings(), model.n_observations() / model.n_rings());
+        let cumulative = |row: &[f64]| {
+            let mut sum = 0.0;
+            let mut thresholds: Vec<u64> = row
+                .iter()
+                .map(|p| {
+                    sum += p;
+                    (sum * 2f64.powi(32)).round() as u64
+                })
+                .collect();
+            // Rounding must leave no number without an observation.
+            let last = row.iter().rposition(|p| *p > 0.0).unwrap_or(row.len() - 1);
+            thresholds[last..].fill(1 << 32);
+            thresholds
+        };
+        let likelihood = model.likelihood().as_standard_layout();
+        let of_rings = likelihood.as_slice().expect("invariant: row-major");
+        let of_rings = of_rings.chunks_exact(n_named);
+        Self {
+            thresholds: of_rings.flat_map(cumulative).collect(),
+            n_rings,
+            n_named,
+        }
+    }
+
+    /// The key of all readings in one step of a world.
+    pub fn key(seed: u64, absolute_step: u64) -> u64 {
+        stream(seed, Purpose::Sensor, absolute_step).next_u64()
+    }
+
+    /// Looks at cells and records the readings in the frame; `key` is the step's.
+    pub fn observe(
+        &self,
+        key: u64,
+        states: &Grid<u8>,
+        cells: impl IntoIterator<Item = SeenCell>,
+        frame: &mut Frame,
+    ) {
+        let states = states.as_slice().expect("invariant: states are row-major");
+        for SeenCell { cell, ring } in cells {
+            let number = split_mix(key, cell as u64) >> 32;
+            let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
+            let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
+            // All of them, in order or not: stopping at the first mispredicts at every latent cell.
+            let passed = of_state.iter().filter(|threshold| number >= **threshold);
+            let reading = passed.count() + usize::from(ring) * self.n_named;
+            frame.observe(cell, reading as u8);
+        }
+    }
+}
+
+/// Cells that are seen from themselves.
+pub(super) fn path_cells(cells: impl Iterator<Item = usize>) -> impl Iterator<Item = SeenCell> {
+    cells.map(|cell| SeenCell { cell, ring: 0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_model::Shape;
+
+    #[test]
+    fn readings_follow_the_observation_matrix() {
+        let (sensor, shape) = (
+            Sensor::new(&Model::wildfire()),
+            Shape::new(100, 100).expect("shape"),
+        );
+        for (state, expected) in [
+            [0.98_f64, 0.01, 0.01],
+            [0.80, 0.15, 0.05],
+            [0.01, 0.01, 0.98],
+        ]
+        .iter()
+        .enumerate()
+        {
+            let states = Grid::from_elem(shape.dim(), state as u8);
+            let mut counts = [0.0_f64; 3];
+            for step in 0..20 {
+                let mut frame = Frame::empty(shape);
+                sensor.observe(
+                    Sensor::key(7, step),
+                    &states,
+                    path_cells(0..shape.n_cells()),
+                    &mut frame,
+                );
+                frame
+                    .as_bytes()
+                    .iter()
+                    .for_each(|y| counts[usize::from(*y)] += 1.0);
+            }
+            let n = 20.0 * 10_000.0;
+            for (count, &p) in counts.iter().zip(expected) {
+                // 200,000 independent draws: 4.5 standard errors, 1 in 150,000 for each of 9.
+                let bound = 4.5 * (p * (1.0 - p) / n).sqrt();
+                assert!((count / n - p).abs() < bound, "state {state}: {counts:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_reading_does_not_depend_on_where_else_the_robot_looks() {
+        let (sensor, shape) = (
+            Sensor::new(&Model::wildfire()),
+            Shape::new(8, 8).expect("shape"),
+        );
+        let states = Grid::from_elem(shape.dim(), 1);
+        let look = |cells: &[usize]| {
+            let mut frame = Frame::empty(shape);
+            sensor.observe(
+                Sensor::key(1, 2),
+                &states,
+                path_cells(cells.iter().copied()),
+                &mut frame,
+            );
+            frame
+        };
+        let all: Vec<usize> = (0..64).collect();
+        for (cell, value) in look(&[3, 17, 60]).observed() {
+            assert_eq!(look(&all).as_bytes()[cell], value);
+        }
+    }
+}

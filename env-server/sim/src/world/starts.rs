@@ -1,0 +1,191 @@
+//! Where robots start, and how much of the free cells they can reach from there.
+
+use emberwatch_model::Parts;
+use emberwatch_model::task::Start;
+use emberwatch_model::{Airspace, Cell, Shape};
+use std::collections::BTreeSet;
+use std::fmt::{Display, Formatter};
+
+/// What no-fly cells leave to the robots of a world.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Reach {
+    /// Number of free cells.
+    pub n_free: usize,
+    /// Free cells outside the largest connected part, in which random starts are.
+    pub n_cut_off: usize,
+    /// The fixed starts outside it.
+    pub closed_in: Vec<ClosedIn>,
+}
+
+/// A fixed start from which most free cells cannot be reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClosedIn {
+    cell: Cell,
+    n_reached: usize,
+    n_free: usize,
+}
+
+impl Reach {
+    /// Checks that so many robots can start in an airspace and leave their start.
+    ///
+    /// # Errors
+    /// What was expected of the start, and what was got.
+    pub fn of(start: Start, airspace: &Airspace, n_robots: usize) -> Result<Self, [String; 2]> {
+        if airspace.is_open() {
+            let n_free = airspace.shape().n_cells();
+            return Ok(Self {
+                n_free,
+                ..Self::default()
+            });
+        }
+        let parts = Parts::of(airspace);
+        if parts.n_largest() < 2 {
+            let got = "a no-fly map that leaves none".into();
+            return Err(["a cell that robots can leave".into(), got]);
+        }
+        let n_free = parts.n_free();
+        let places = (0..n_robots).filter_map(|robot| fixed_start(start, airspace.shape(), robot));
+        let mut closed_in = Vec::new();
+        for cell in places.collect::<BTreeSet<Cell>>() {
+            let n_reached = parts.n_around(cell);
+            if n_reached == 0 {
+                let got = format!("{cell}, a no-fly cell");
+                return Err(["a cell where robots may be".into(), got]);
+            }
+            if n_reached == 1 {
+                let got = format!("{cell}, which no-fly cells cut off");
+                return Err(["a cell that robots can leave".into(), got]);
+            }
+            if n_reached < parts.n_largest() {
+                closed_in.push(ClosedIn {
+                    cell,
+                    n_reached,
+                    n_free,
+                });
+            }
+        }
+        Ok(Self {
+            n_free,
+            n_cut_off: n_free - parts.n_largest(),
+            closed_in,
+        })
+    }
+
+    /// The share of the free cells that random starts cannot reach, in words; `None` if there are no such cells.
+    pub fn cut_off(&self) -> Option<String> {
+        let Self {
+            n_free, n_cut_off, ..
+        } = *self;
+        let percent = 100.0 * n_cut_off as f64 / n_free as f64;
+        (n_cut_off > 0).then(|| {
+            format!(
+                "no-fly cells close off {n_cut_off} of {n_free} free cells ({percent:.2} %) from the largest connected \
+                 part, in which random starts are"
+            )
+        })
+    }
+}
+
+impl Display for ClosedIn {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let Self {
+            cell,
+            n_reached,
+            n_free,
+        } = self;
+        write!(
+            f,
+            "start: no-fly cells close in {cell}: robots that start there reach {n_reached} of {n_free} free cells; \
+             choose another start, or open the map `no_fly`"
+        )
+    }
+}
+
+/// The cells of random starts, by row-major index; `None` if that is all of the grid.
+pub(super) fn random_starts(airspace: &Airspace) -> Option<Vec<usize>> {
+    (!airspace.is_open()).then(|| Parts::of(airspace).starts())
+}
+
+/// Where a robot starts, unless that is random.
+pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Cell> {
+    match start {
+        Start::Corner => Some(corner_or_side(shape, robot)),
+        Start::Centre => Some(shape.centre()),
+        Start::Random => None,
+        Start::At(cell) => Some(cell),
+    }
+}
+
+/// A place at the edge, another one for each of eight robots.
+fn corner_or_side(shape: Shape, robot: usize) -> Cell {
+    let (bottom, right) = (shape.height() - 1, shape.width() - 1);
+    let places = [
+        (0, 0),
+        (bottom, right),
+        (0, right),
+        (bottom, 0),
+        (0, right / 2),
+        (bottom, right / 2),
+        (bottom / 2, 0),
+        (bottom / 2, right),
+    ];
+    let (row, col) = places[robot % places.len()];
+    Cell { row, col }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::Rules;
+    use emberwatch_model::randomness::{Purpose, stream};
+    use emberwatch_model::{CellMap, Pays};
+    use emberwatch_model::{Grid, Model};
+    use rand::RngExt;
+    use std::sync::Arc;
+
+    fn airspace(rows: &[&str]) -> Airspace {
+        let shape = Shape::new(rows.len(), rows[0].len()).expect("a shape");
+        let closed = |(row, col): (usize, usize)| rows[row].as_bytes()[col] == b'#';
+        let map = Grid::from_shape_fn(shape.dim(), closed);
+        Airspace::new(shape, Some(Arc::new(map)), 0, 1, Pays::Visited)
+    }
+
+    #[test]
+    fn fixed_starts_in_a_pocket_are_named_with_what_they_reach() {
+        let pocket = airspace(&["..#...", "###...", "......"]);
+        let reach = |start| Reach::of(start, &pocket, 2).expect("a start that can be left");
+        let corner = reach(Start::Corner);
+        assert_eq!((corner.n_free, corner.n_cut_off), (14, 2));
+        let words = corner.closed_in[0].to_string();
+        assert!(
+            words.contains("(0, 0)") && words.contains("reach 2 of 14 free cells"),
+            "{words}"
+        );
+        assert_eq!(corner.closed_in.len(), 1, "the other corner is outside");
+        let words = corner.cut_off().expect("a share");
+        assert!(words.contains("2 of 14 free cells (14.29 %)"), "{words}");
+        assert!(reach(Start::Centre).closed_in.is_empty());
+        assert!(reach(Start::Random).closed_in.is_empty());
+        let open = Reach::of(Start::Corner, &Airspace::open(pocket.shape()), 2);
+        assert_eq!(open.map(|it| it.cut_off()), Ok(None));
+    }
+
+    #[test]
+    fn a_connected_map_has_the_random_starts_of_all_free_cells() {
+        let rows = [".#....", ".####.", "......"];
+        let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
+        let mut file = Model::wildfire().file().clone();
+        file.no_fly = Some(CellMap::Rows(rows.map(of_row).to_vec()));
+        let model = Model::new(file).expect("a model");
+        let shape = Shape::new(3, 6).expect("a shape");
+        let rules = Rules::new(&model, shape, 0, 0, Start::Random).expect("rules");
+        let free: Vec<usize> = (0..18)
+            .filter(|&at| rows[at / 6].as_bytes()[at % 6] == b'.')
+            .collect();
+        for (seed, robot) in (0..200).zip([0, 1].into_iter().cycle()) {
+            let mut stream = stream(seed, Purpose::Start, robot as u64);
+            let expected = shape.cell(free[stream.random_range(0..free.len())]);
+            assert_eq!(rules.start_cell(seed, robot), expected);
+        }
+    }
+}

@@ -1,0 +1,244 @@
+//! The numbers of the binary messages: version, operations, flags, status codes.
+
+use crate::limits::memory::in_words;
+use thiserror::Error;
+
+/// Version of the protocol.
+pub const VERSION: u32 = 2;
+
+/// Set in [`crate::message::StepRequest::flags`]: observe every cell, not only the path (needs a server whose
+/// coverage is `client` or `full`).
+pub const FLAG_FULL_COVERAGE: u32 = 1;
+
+/// Set in [`crate::message::StepRequest::flags`]: instead of each robot's frame return one for each world, of all that
+/// its robots saw.
+pub const FLAG_TEAM_FRAMES: u32 = 2;
+
+/// What a step request asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Operation {
+    /// Fly a path with each robot; a world moves from k to k + 1 as soon as all its robots that are held have one.
+    /// Needs a lease.
+    Step = 1,
+    /// Return the last results and frames again, changing nothing; needs no lease.
+    Observe = 2,
+    /// Return the results and frames of an earlier step k of each world; needs no lease.
+    Recall = 3,
+}
+
+/// A number that is no [`Status`] or no [`Operation`].
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("{what}: {value} is not a known code")]
+pub struct UnknownCode {
+    /// `status` or `operation`.
+    pub what: &'static str,
+    /// The number received.
+    pub value: u32,
+}
+
+/// Answer to a request; every rejection has its own code and changes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u32)]
+pub enum Status {
+    /// Done.
+    Ok = 0,
+    /// The request's version is not the server's; detail: the server's version.
+    VersionMismatch = 1,
+    /// No such operation; detail: the operation received.
+    UnknownOperation = 2,
+    /// Not a well-formed control message.
+    Malformed = 3,
+    /// A world outside the server's; detail: number of worlds.
+    NoSuchWorld = 4,
+    /// The payload is not as long as the header says; detail: bytes expected.
+    WrongLength = 5,
+    /// Not the server's number of moves in a path; detail: moves expected.
+    WrongPathLength = 6,
+    /// A byte that is no move; detail: its position in the payload.
+    BadMove = 7,
+    /// The lease does not cover these robots, or was never given; detail: the first such robot.
+    NoLease = 8,
+    /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
+    /// robot since, 0 if no client does.
+    LeaseLost = 9,
+    /// Another client holds a robot; detail: its pid.
+    Busy = 10,
+    /// A world is being reset; detail: the world.
+    Resetting = 11,
+    /// A world was truncated and must be reset first; detail: the world.
+    EpisodeOver = 12,
+    /// Full frames were asked of a server that gives none, or acting of a replay; detail: 0.
+    NotPermitted = 13,
+    /// A flag that the server does not know; detail: the flags received.
+    UnknownFlags = 14,
+    /// A file that cannot be read or written, or is refused; detail: 0.
+    BadFile = 17,
+    /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
+    NotKept = 18,
+    /// The world has moved on from the step k of a path; detail: its present step. `Observe` tells whether the path
+    /// was flown.
+    Late = 19,
+    /// The step k of a path is ahead of its world; detail: the world's present step.
+    Early = 20,
+    /// A step leaves out a robot that its client holds in the world, or names several worlds in one of which another
+    /// client holds a robot; detail: the first such robot.
+    Incomplete = 21,
+    /// A robot outside the server's; detail: number of robots of all worlds.
+    NoSuchRobot = 22,
+    /// There is too little memory for the answer; detail: bytes of a step's answer, or 0 if it is shared memory.
+    NoMemory = 23,
+}
+
+impl Status {
+    /// Every status, in the order of its code.
+    pub const ALL: [Self; 22] = [
+        Self::Ok,
+        Self::VersionMismatch,
+        Self::UnknownOperation,
+        Self::Malformed,
+        Self::NoSuchWorld,
+        Self::WrongLength,
+        Self::WrongPathLength,
+        Self::BadMove,
+        Self::NoLease,
+        Self::LeaseLost,
+        Self::Busy,
+        Self::Resetting,
+        Self::EpisodeOver,
+        Self::NotPermitted,
+        Self::UnknownFlags,
+        Self::BadFile,
+        Self::NotKept,
+        Self::Late,
+        Self::Early,
+        Self::Incomplete,
+        Self::NoSuchRobot,
+        Self::NoMemory,
+    ];
+
+    /// What to tell a client of another version.
+    pub fn version_mismatch(client: u32, server: u64) -> String {
+        format!(
+            "protocol version mismatch: the client speaks {client}, the server {server}; \
+             use a client and a server of one release"
+        )
+    }
+
+    /// One sentence for people: what the status with this detail says and what to do.
+    pub fn explain(self, detail: u64) -> String {
+        match self {
+            Self::Ok => "ok".into(),
+            Self::VersionMismatch => Self::version_mismatch(VERSION, detail),
+            Self::UnknownOperation => {
+                format!("operation: expected 1 (step), 2 (observe) or 3 (recall), got {detail}")
+            }
+            Self::Malformed => "malformed control message".into(),
+            Self::NoSuchWorld => format!(
+                "no such world: the server has worlds 0 to {}; start it with --worlds N for more",
+                detail.saturating_sub(1)
+            ),
+            Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
+            Self::WrongPathLength => {
+                format!("wrong path length: the server flies {detail} moves a step")
+            }
+            Self::BadMove => format!("byte {detail} of the payload: expected a move in 0..=3"),
+            Self::NoLease => format!("no lease on robot {detail}: acquire it first"),
+            Self::LeaseLost if detail == 0 => {
+                "lease lost: it expired or was released; acquire the robots again".into()
+            }
+            Self::LeaseLost => format!(
+                "lease lost to pid {detail}, which took the robot over or acquired it since"
+            ),
+            Self::Busy => format!(
+                "busy: held by pid {detail}; wait for its release, or acquire with \"takeover\": true"
+            ),
+            Self::Resetting => {
+                format!("world {detail} is being reset; wait for the answer to the reset")
+            }
+            Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
+            Self::NotPermitted => {
+                "not permitted: full frames need a server with coverage \"client\" or \"full\", and a \
+                 replay takes no steps"
+                    .into()
+            }
+            Self::UnknownFlags => {
+                format!("flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}")
+            }
+            Self::BadFile => "the file cannot be used".into(),
+            Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
+            Self::Late => format!(
+                "late: the world is at step {detail} already; observe it, and send a path for that step"
+            ),
+            Self::Early => format!("early: the world is at step {detail} only"),
+            Self::Incomplete => format!(
+                "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
+                 a step of several worlds needs them all"
+            ),
+            Self::NoMemory if detail == 0 => {
+                "shared memory is full: free some, and ask again".into()
+            }
+            Self::NoMemory => format!(
+                "memory: expected {} for the answer, got less; ask for fewer robots at a time",
+                in_words(detail)
+            ),
+            Self::NoSuchRobot => format!(
+                "no such robot: the server has robots 0 to {}; start it with --worlds N for more worlds, or --robots N \
+                 for more in each",
+                detail.saturating_sub(1)
+            ),
+        }
+    }
+}
+
+impl TryFrom<u32> for Status {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        let known = Self::ALL.into_iter().find(|&it| it as u32 == value);
+        known.ok_or(UnknownCode {
+            what: "status",
+            value,
+        })
+    }
+}
+
+impl TryFrom<u32> for Operation {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        match value {
+            1 => Ok(Self::Step),
+            2 => Ok(Self::Observe),
+            3 => Ok(Self::Recall),
+            _ => Err(UnknownCode {
+                what: "operation",
+                value,
+            }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn status_codes_survive_the_wire() {
+        for status in Status::ALL {
+            assert_eq!(Status::try_from(status as u32), Ok(status));
+            for detail in [0, 1, u64::MAX] {
+                assert!(!status.explain(detail).is_empty());
+            }
+        }
+        for value in [15, 16, 24] {
+            let what = "status";
+            assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
+        }
+        for value in [0, 4, u32::MAX] {
+            let what = "operation";
+            assert_eq!(Operation::try_from(value), Err(UnknownCode { what, value }));
+        }
+    }
+}

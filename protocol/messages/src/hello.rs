@@ -1,0 +1,207 @@
+//! The answer to `hello`: what a server says of itself, of airspace and land.
+
+use emberwatch_model::grid::{Grid, Shape, ShapeError};
+use emberwatch_model::{Airspace, MAX_RADIUS, Pays, parse_color};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// The handshake: everything a client needs to know to act.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ServerInfo {
+    /// The server's protocol version.
+    pub protocol: u32,
+    /// The server's release.
+    pub build: String,
+    /// The server's process.
+    pub pid: u32,
+    /// The PID namespace of this number, as Linux numbers it; only there a client can watch the process.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pid_namespace: Option<u64>,
+    /// Grid height H.
+    pub height: usize,
+    /// Grid width W.
+    pub width: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// Number of worlds.
+    pub n_worlds: u32,
+    /// Robots of each world R.
+    pub n_robots: u32,
+    /// Number of observations O; frames hold values below it, or 255.
+    pub n_observations: usize,
+    /// Names of the observations.
+    pub observations: Vec<String>,
+    /// The model as TOML, if there is one and the server reveals it.
+    pub model: Option<String>,
+    /// The task that the worlds are, by its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+    /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that a reward depends on, besides the
+    /// seed and the policy. Absent from servers before release 0.3.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub worlds_fingerprint: Option<String>,
+    /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub airspace: Option<AirspaceInfo>,
+    /// Which land each cell is, where lands differ and learners are told.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zones: Option<ZonesInfo>,
+    /// What worlds show whose hidden states were recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recorded_world: Option<RecordedWorld>,
+    /// Steps simulated from the initial distribution before k = 0.
+    pub burn_in: u64,
+    /// Episode length; 0: never truncated.
+    pub max_steps: u64,
+    /// Most clients at a time.
+    pub max_clients: usize,
+    /// Which cells a step observes.
+    pub coverage: CoverageRule,
+    /// Whether the `truth` channel exists.
+    pub publish_truth: bool,
+    /// How long a lease lives without use, by default.
+    pub lease_millis: u64,
+    /// How long a world waits for the paths of its other held robots from the first path on; 0: no deadline.
+    pub deadline_millis: u64,
+}
+
+impl ServerInfo {
+    /// Height and width of the grid.
+    ///
+    /// # Errors
+    /// If a side is outside `1..=MAX_SIDE`.
+    pub fn shape(&self) -> Result<Shape, ShapeError> {
+        Shape::new(self.height, self.width)
+    }
+
+    /// Where robots may fly and what they see.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or out of range; the error says what was expected.
+    pub fn airspace(&self) -> Result<Airspace, String> {
+        let shape = self.shape().map_err(|error| error.to_string())?;
+        let airspace = self.airspace.as_ref();
+        let n_rings = airspace.map_or(1, |info| info.n_rings.max(1));
+        if !self.n_observations.is_multiple_of(n_rings) {
+            let expected = format!("observations for each of {n_rings} rings");
+            return Err(format!(
+                "airspace: expected {expected}, got {}",
+                self.n_observations
+            ));
+        }
+        airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
+    }
+
+    /// Steps of the shortest episode, if any is truncated.
+    pub fn shortest_episode(&self) -> Option<u64> {
+        let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);
+        let truncated = Some(self.max_steps).filter(|&steps| steps > 0);
+        recorded.into_iter().chain(truncated).min()
+    }
+}
+
+/// Sequences of recorded hidden states.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedWorld {
+    /// The description of its states as TOML, if the server reveals it.
+    pub description: Option<String>,
+    /// Number of sequences.
+    pub n_sequences: usize,
+    /// Steps of the shortest episode.
+    pub n_steps: u64,
+}
+
+/// Which cells a server's steps observe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CoverageRule {
+    /// The cells on the path.
+    Path,
+    /// Every cell.
+    Full,
+    /// The cells on the path, or every cell if the request asks for it.
+    Client,
+}
+
+/// Where robots may fly and what they see.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AirspaceInfo {
+    /// Rows and columns that robots see beyond each cell of their path, 0 to 8.
+    pub radius: usize,
+    /// Observation matrices: of the path, then of each ring around it; the last holds for the rings beyond. An
+    /// observation of matrix m has the number `m * n_observations / n_rings` plus that which it would have on the path.
+    pub n_rings: usize,
+    /// Which distinct cells pay.
+    pub pays: Pays,
+    /// 1 for each cell where no robot may be, row by row.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub no_fly: Option<Vec<Vec<u8>>>,
+}
+
+/// Zones of land, which differ in how states change.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ZonesInfo {
+    /// The name of each zone.
+    pub names: Vec<String>,
+    /// Its colour in pictures, `#rrggbb`.
+    pub colors: Vec<String>,
+    /// The zone of each cell, row by row.
+    pub map: Vec<Vec<u8>>,
+}
+
+impl AirspaceInfo {
+    /// Where robots of a grid may fly and what they see.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or out of range; the error says what was expected.
+    pub fn airspace(&self, shape: Shape) -> Result<Airspace, String> {
+        let (radius, n_rings) = (self.radius, self.n_rings);
+        if radius > MAX_RADIUS || !(1..=radius + 1).contains(&n_rings) {
+            let expected = format!("a radius up to {MAX_RADIUS} and 1 to radius + 1 rings");
+            return Err(format!(
+                "airspace: expected {expected}, got {radius} and {n_rings}"
+            ));
+        }
+        let no_fly = self.no_fly.as_ref();
+        let no_fly = no_fly
+            .map(|rows| of_grid("no_fly", shape, rows))
+            .transpose()?;
+        let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));
+        Ok(Airspace::new(shape, no_fly, radius, n_rings, self.pays))
+    }
+}
+
+impl ZonesInfo {
+    /// The zone of each cell of a grid, shape `[H, W]`.
+    ///
+    /// # Errors
+    /// If that is not of the grid, or a zone has no name; the error says what was expected.
+    pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
+        let map = of_grid("zones", shape, &self.map)?;
+        let n_zones = self.names.len();
+        let is_color = |color: &String| parse_color(color).is_some();
+        if self.colors.len() != n_zones || !self.colors.iter().all(is_color) {
+            let got = &self.colors;
+            return Err(format!(
+                "zones: expected {n_zones} colours #rrggbb, got {got:?}"
+            ));
+        }
+        match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
+            None => Ok(map),
+            Some(got) => Err(format!("zones: expected values below {n_zones}, got {got}")),
+        }
+    }
+}
+
+/// The numbers of a map, if it is of a grid.
+fn of_grid(what: &str, shape: Shape, rows: &[Vec<u8>]) -> Result<Grid<u8>, String> {
+    let fits = rows.len() == shape.height() && rows.iter().all(|row| row.len() == shape.width());
+    if !fits {
+        let got = format!("{} x {:?}", rows.len(), rows.first().map(Vec::len));
+        return Err(format!(
+            "{what}: expected a map of the {shape} grid, got {got}"
+        ));
+    }
+    let map = Grid::from_shape_vec(shape.dim(), rows.concat());
+    Ok(map.expect("invariant: as many numbers as cells"))
+}

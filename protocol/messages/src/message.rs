@@ -1,0 +1,282 @@
+//! The binary messages: `#[repr(C)]` headers of every channel. PROTOCOL.md holds their byte tables.
+//!
+//! Headers hold integers and floats only, in the byte order of the host; everything with fewer
+//! valid values than bit patterns is converted with `TryFrom` and checked. Variable parts travel
+//! as the `[u8]` payload behind the header.
+
+use bytemuck::{Pod, Zeroable};
+use emberwatch_model::grid::Cell;
+use std::ops::Range;
+
+pub use super::codes::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, UnknownCode, VERSION,
+};
+
+/// A header of plain bytes, which can lie in shared memory.
+pub trait Header: std::fmt::Debug + Default + Pod + Send + Sync {
+    /// The name by which channels tell types apart.
+    const TYPE_NAME: &'static str;
+}
+
+/// Names the headers as PROTOCOL.md does.
+macro_rules! headers {
+    ($($header:ident),* $(,)?) => {$(
+        impl Header for $header {
+            const TYPE_NAME: &'static str = concat!("emberwatch.v2.", stringify!($header));
+        }
+    )*};
+}
+
+headers!(
+    StepRequest,
+    StepReply,
+    WorldResult,
+    RobotResult,
+    ControlRequest,
+    ControlReply,
+    FrameHeader,
+    TruthHeader,
+    AgentHeader,
+);
+
+/// Header of a `step` request. The payload of `Step` is the present step k of each world (`u64`), then a path of
+/// `n_moves` bytes for each robot; that of `Recall` is the step of each world; that of `Observe` is empty.
+///
+/// The robots of a server are numbered through: robot r of world w is number `w * R + r`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct StepRequest {
+    /// [`VERSION`].
+    pub version: u32,
+    /// An [`Operation`].
+    pub operation: u32,
+    /// The lease from `acquire`; ignored by `Observe` and `Recall`.
+    pub lease: u64,
+    /// Chosen by the client, returned in the answer.
+    pub sequence: u64,
+    /// Number of the first robot.
+    pub first_robot: u32,
+    /// Number of consecutive robots, at least 1.
+    pub n_robots: u32,
+    /// Moves in each path; 0 for `Observe` and `Recall`.
+    pub n_moves: u32,
+    /// [`FLAG_FULL_COVERAGE`], [`FLAG_TEAM_FRAMES`], both or 0.
+    pub flags: u32,
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
+    pub listener_low: u64,
+    /// High half of that id.
+    pub listener_high: u64,
+}
+
+/// Header of a `step` answer. The payload is `n_worlds` [`WorldResult`]s, `n_robots` [`RobotResult`]s, then frames of
+/// `height * width` bytes: one for each robot, or with [`FLAG_TEAM_FRAMES`] one for each world. It is empty unless the
+/// status is `Ok`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct StepReply {
+    /// [`VERSION`].
+    pub version: u32,
+    /// A [`Status`].
+    pub status: u32,
+    /// The request's sequence number.
+    pub sequence: u64,
+    /// Number of the first robot, as asked.
+    pub first_robot: u32,
+    /// Number of robots in the payload; 0 unless the status is `Ok`.
+    pub n_robots: u32,
+    /// Number of worlds that these robots are in; 0 unless the status is `Ok`.
+    pub n_worlds: u32,
+    /// The request's flags.
+    pub flags: u32,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// Time that the server worked on the request, nanoseconds: checks, simulation, copying. The wait for other
+    /// clients' paths does not count.
+    pub simulation_nanos: u64,
+    /// See [`Status`].
+    pub detail: u64,
+}
+
+/// A world after a step or a reset, and what the step gave its robots together.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub struct WorldResult {
+    /// Step index k after the step; 0 after a reset.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Sum of rewards, in `X_{k+1}`, over the distinct cells that any robot visited.
+    pub reward: f64,
+    /// Bit r is set if nobody held robot r of the world: it stayed and saw nothing.
+    pub hovered: u64,
+    /// Bit r is set if robot r was held, but its path had not come by the deadline: it stayed and saw nothing.
+    pub late: u64,
+    /// Cells of the whole grid in the state that pays most (burning cells).
+    pub n_target_cells: u32,
+    /// Distinct cells that any robot visited.
+    pub n_visited: u32,
+    /// Distinct visited cells in the state that pays most.
+    pub n_hits: u32,
+    /// 1 if the episode ended by itself (never, in this model), else 0.
+    pub terminated: u16,
+    /// 1 if the episode reached the server's `max_steps`, else 0.
+    pub truncated: u16,
+}
+
+/// What a step gave one robot; also its place after a reset.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub struct RobotResult {
+    /// Its share of the team's reward: a cell that v robots visited pays each of them 1/v.
+    pub reward: f64,
+    /// What the team's reward would lack without this robot.
+    pub marginal: f64,
+    /// Distinct cells that it visited.
+    pub n_visited: u32,
+    /// Of these, cells in the state that pays most.
+    pub n_hits: u32,
+    /// Row where its path began, or where it stays.
+    pub start_row: u32,
+    /// Column where its path began, or where it stays.
+    pub start_col: u32,
+    /// Its row.
+    pub row: u32,
+    /// Its column.
+    pub col: u32,
+    /// A [`emberwatch_model::frame::Coverage`].
+    pub coverage: u32,
+    /// Moves that it flew; 0 after a reset, and in a step in which it hovered or was late.
+    pub n_moves: u32,
+}
+
+impl RobotResult {
+    /// Where it is.
+    pub fn cell(&self) -> Cell {
+        Cell {
+            row: self.row as usize,
+            col: self.col as usize,
+        }
+    }
+
+    /// Where its path began, or where it stays.
+    pub fn start(&self) -> Cell {
+        Cell {
+            row: self.start_row as usize,
+            col: self.start_col as usize,
+        }
+    }
+}
+
+/// Header of a `control` request; the payload is JSON, a [`crate::control::Request`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct ControlRequest {
+    /// [`VERSION`].
+    pub version: u32,
+    /// 0.
+    pub reserved: u32,
+    /// Chosen by the client, returned in the answer.
+    pub sequence: u64,
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
+    pub listener_low: u64,
+    /// High half of that id.
+    pub listener_high: u64,
+}
+
+/// Header of a `control` answer; the payload is JSON, a [`crate::control::Reply`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct ControlReply {
+    /// [`VERSION`].
+    pub version: u32,
+    /// A [`Status`].
+    pub status: u32,
+    /// The request's sequence number.
+    pub sequence: u64,
+}
+
+/// Header of a sample on `frames`: one step of one world. The payload is `n_robots` [`RobotResult`]s, as many frames
+/// of `height * width` bytes, then each robot's path of [`RobotResult::n_moves`] bytes.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub struct FrameHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples published on this channel before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Number of the world's first robot.
+    pub first_robot: u32,
+    /// Robots of the world R.
+    pub n_robots: u32,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// The world's result.
+    pub result: WorldResult,
+}
+
+/// Header of a sample on `truth`; the payload is the hidden state (`height * width` bytes).
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct TruthHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples published on this channel before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Step index k of the state shown.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+}
+
+/// Header of a sample on `agent`; the payload is a belief (`n_states * height * width` floats), then
+/// JSON, an [`super::agent_belief::Intent`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct AgentHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples that this agent published before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Step index k of the state that the belief is about.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// Number of states S of the belief.
+    pub n_states: u32,
+    /// The agent's process.
+    pub pid: u32,
+    /// Number of the first robot that the agent flies.
+    pub first_robot: u32,
+    /// Number of consecutive robots that it flies, at least 1.
+    pub n_robots: u32,
+}
+
+/// The worlds of consecutive robots, with `team` robots in each world.
+pub fn worlds_of(first_robot: u32, n_robots: u32, team: u32) -> Range<u32> {
+    let (team, end) = (team.max(1), first_robot.saturating_add(n_robots));
+    first_robot / team..end.div_ceil(team)
+}

@@ -1,0 +1,275 @@
+//! The variable parts of steps and frames: from bytes to results, frames and paths, and back.
+
+use super::capacity::MAX_ROBOTS;
+use super::control::ServerInfo;
+use super::message::{FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult};
+use bytemuck::AnyBitPattern;
+use emberwatch_model::frame::UNOBSERVED;
+use emberwatch_model::grid::Shape;
+use emberwatch_model::path::MAX_MOVES;
+
+/// Bytes of one [`WorldResult`] in a payload.
+pub const WORLD_BYTES: usize = size_of::<WorldResult>();
+
+/// Bytes of one [`RobotResult`] in a payload.
+pub const ROBOT_BYTES: usize = size_of::<RobotResult>();
+
+/// The payload of a successful step answer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepParts<'a> {
+    /// One result per world.
+    pub worlds: Vec<WorldResult>,
+    /// One result per robot.
+    pub robots: Vec<RobotResult>,
+    /// Frames of `height * width` bytes: one per robot, or with [`FLAG_TEAM_FRAMES`] one per world.
+    pub frames: &'a [u8],
+}
+
+/// The payload of a sample on `frames`: the robots of a world, in order.
+pub type FrameParts<'a> = Vec<RobotSample<'a>>;
+
+/// What a sample on `frames` says of one robot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RobotSample<'a> {
+    /// What the step gave it.
+    pub result: RobotResult,
+    /// What it saw, `height * width` bytes.
+    pub frame: &'a [u8],
+    /// The path that it flew, one byte a move; empty if it did not fly.
+    pub path: &'a [u8],
+}
+
+impl StepParts<'_> {
+    /// Checks the values: no robot stayed that a world does not have, paths are whole, and frames hold observations.
+    ///
+    /// # Errors
+    /// Says what is wrong.
+    pub fn check(&self, info: &ServerInfo) -> Result<(), String> {
+        let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
+        let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
+        let stayed = stayed.max().unwrap_or_default();
+        if stayed > u64::MAX >> (MAX_ROBOTS - n_robots) {
+            return Err(format!(
+                "robots that stayed: expected bits below {n_robots}, got {stayed:#x}"
+            ));
+        }
+        let mut paths = self.robots.iter().map(|robot| robot.n_moves as usize);
+        if let Some(got) = paths.find(|&n_moves| n_moves != 0 && n_moves != info.n_moves) {
+            let expected = info.n_moves;
+            return Err(format!("n_moves: expected 0 or {expected}, got {got}"));
+        }
+        // 255 becomes 0, observation o becomes o + 1: one maximum, of many values at once, checks all.
+        let values = self.frames.iter().map(|value| value.wrapping_add(1));
+        let highest = values.fold(0, u8::max);
+        if usize::from(highest) > info.n_observations {
+            let (n, got) = (info.n_observations, highest - 1);
+            return Err(format!(
+                "frame: expected observations below {n} or {UNOBSERVED}, got {got}"
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// Splits the payload of a step answer.
+///
+/// # Errors
+/// The number of bytes expected, if the payload is not as long as its header says.
+pub fn split_step_payload<'a>(
+    reply: &StepReply,
+    payload: &'a [u8],
+) -> Result<StepParts<'a>, usize> {
+    let (n_worlds, n_robots) = (reply.n_worlds as usize, reply.n_robots as usize);
+    let n_frames = match reply.flags & FLAG_TEAM_FRAMES {
+        0 => n_robots,
+        _ => n_worlds,
+    };
+    let n_cells = (reply.height as usize).saturating_mul(reply.width as usize);
+    let expected = (n_worlds * WORLD_BYTES + n_robots * ROBOT_BYTES)
+        .saturating_add(n_cells.saturating_mul(n_frames));
+    if payload.len() != expected {
+        return Err(expected);
+    }
+    let (worlds, rest) = payload.split_at(n_worlds * WORLD_BYTES);
+    let (robots, frames) = rest.split_at(n_robots * ROBOT_BYTES);
+    Ok(StepParts {
+        worlds: read_all(worlds),
+        robots: read_all(robots),
+        frames,
+    })
+}
+
+/// Splits the payload of a sample on `frames`.
+///
+/// # Errors
+/// If header and payload do not fit each other; the error says what was expected.
+pub fn split_frame_payload<'a>(
+    header: &FrameHeader,
+    payload: &'a [u8],
+) -> Result<FrameParts<'a>, String> {
+    let shape = Shape::new(header.height as usize, header.width as usize);
+    let n_cells = shape.map_err(|error| error.to_string())?.n_cells();
+    let n_robots = header.n_robots as usize;
+    if !(1..=MAX_ROBOTS).contains(&n_robots) {
+        return Err(format!(
+            "robots: expected 1 to {MAX_ROBOTS}, got {n_robots}"
+        ));
+    }
+    let stayed = header.result.hovered | header.result.late;
+    if stayed > u64::MAX >> (MAX_ROBOTS - n_robots) {
+        return Err(format!(
+            "robots that stayed: expected bits below {n_robots}, got {stayed:#x}"
+        ));
+    }
+    let wrong_length = |expected: usize| {
+        let got = payload.len();
+        format!("payload bytes: expected {expected}, got {got}")
+    };
+    let fixed = n_robots * (ROBOT_BYTES + n_cells);
+    let (results, rest) = payload
+        .split_at_checked(n_robots * ROBOT_BYTES)
+        .filter(|_| payload.len() >= fixed)
+        .ok_or_else(|| wrong_length(fixed))?;
+    let (frames, mut paths) = rest.split_at(n_robots * n_cells);
+    let results: Vec<RobotResult> = read_all(results);
+    let n_moves: usize = results.iter().map(|result| result.n_moves as usize).sum();
+    if paths.len() != n_moves {
+        return Err(wrong_length(fixed.saturating_add(n_moves)));
+    }
+    let robots = results.into_iter().zip(frames.chunks_exact(n_cells));
+    robots
+        .map(|(result, frame)| {
+            let (path, others) = paths.split_at(result.n_moves as usize);
+            paths = others;
+            if path.len() > MAX_MOVES {
+                let got = path.len();
+                return Err(format!(
+                    "path: expected at most {MAX_MOVES} moves, got {got}"
+                ));
+            }
+            Ok(RobotSample {
+                result,
+                frame,
+                path,
+            })
+        })
+        .collect()
+}
+
+/// Appends the payload of a `Step` request, steps and paths, or with no paths that of a `Recall`.
+pub fn write_step_body(steps: &[u64], paths: &[u8], body: &mut Vec<u8>) {
+    body.extend_from_slice(bytemuck::cast_slice(steps));
+    body.extend_from_slice(paths);
+}
+
+fn read_all<T: AnyBitPattern>(bytes: &[u8]) -> Vec<T> {
+    let each = bytes.chunks_exact(size_of::<T>());
+    each.map(bytemuck::pod_read_unaligned).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_step_payload_of_the_wrong_length_is_refused() {
+        let reply = StepReply {
+            n_worlds: 1,
+            n_robots: 2,
+            height: 3,
+            width: 5,
+            ..StepReply::default()
+        };
+        let team = StepReply {
+            flags: FLAG_TEAM_FRAMES,
+            ..reply
+        };
+        for (reply, expected) in [(reply, 64 + 2 * (48 + 15)), (team, 64 + 2 * 48 + 15)] {
+            // In shared memory a payload begins at any address.
+            assert!(split_step_payload(&reply, &vec![0; expected + 1][1..]).is_ok());
+            for wrong in [3, expected - 1, expected + 1] {
+                assert_eq!(split_step_payload(&reply, &vec![0; wrong]), Err(expected));
+            }
+        }
+        let huge = StepReply {
+            n_worlds: u32::MAX,
+            n_robots: u32::MAX,
+            height: u32::MAX,
+            width: u32::MAX,
+            ..reply
+        };
+        assert!(split_step_payload(&huge, &[]).is_err());
+    }
+
+    #[test]
+    fn values_that_cannot_be_are_refused() {
+        let info = serde_json::from_str(
+            r#"{"protocol": 2, "build": "", "pid": 1, "height": 1, "width": 3, "n_moves": 4, "n_worlds": 1, "n_robots": 2,
+            "n_observations": 3, "observations": [], "model": null, "burn_in": 0, "max_steps": 0, "max_clients": 16,
+            "coverage": "path", "publish_truth": false, "lease_millis": 1, "deadline_millis": 0, "recorded_world": null,
+            "task": null}"#,
+        )
+        .expect("what a server says of itself");
+        let problem = |stayed: u64, n_moves: u32, value: u8| {
+            let world = WorldResult {
+                hovered: stayed,
+                ..WorldResult::default()
+            };
+            let robot = RobotResult {
+                n_moves,
+                ..RobotResult::default()
+            };
+            let parts = StepParts {
+                worlds: vec![world],
+                robots: vec![RobotResult::default(), robot],
+                frames: &[255, 0, value],
+            };
+            parts.check(&info).err().unwrap_or_default()
+        };
+        for good in [problem(0, 4, 2), problem(3, 0, 255)] {
+            assert_eq!(good, "");
+        }
+        assert!(problem(4, 0, 0).contains("expected bits below 2, got 0x4"));
+        assert!(problem(0, 3, 0).contains("n_moves: expected 0 or 4, got 3"));
+        for value in [3, 254] {
+            let words = format!("expected observations below 3 or 255, got {value}");
+            assert!(problem(0, 0, value).contains(&words), "{words}");
+        }
+    }
+
+    #[test]
+    fn a_sample_gives_each_robot_its_frame_and_path() {
+        let header = FrameHeader {
+            n_robots: 2,
+            height: 1,
+            width: 3,
+            ..FrameHeader::default()
+        };
+        let flew = RobotResult {
+            n_moves: 2,
+            ..RobotResult::default()
+        };
+        let mut payload = bytemuck::bytes_of(&RobotResult::default()).to_vec();
+        payload.extend_from_slice(bytemuck::bytes_of(&flew));
+        payload.extend_from_slice(&[255, 255, 255, 0, 255, 2, 3, 3]);
+        // In shared memory a payload begins at any address.
+        let memory = [&[0], &payload[..]].concat();
+        let robots = split_frame_payload(&header, &memory[1..]).expect("well-formed");
+        assert_eq!((robots[0].frame, robots[0].path), (&[255; 3][..], &[][..]));
+        assert_eq!(
+            (robots[1].frame, robots[1].path),
+            (&[0, 255, 2][..], &[3, 3][..])
+        );
+        for wrong in [
+            &payload[..payload.len() - 1],
+            &[payload.clone(), vec![0]].concat(),
+        ] {
+            let error = split_frame_payload(&header, wrong).expect_err("refused");
+            assert!(error.contains("expected 104"), "{error}");
+        }
+        let mut of_third = header;
+        of_third.result.late = 4;
+        let error = split_frame_payload(&of_third, &payload).expect_err("refused");
+        assert!(error.contains("expected bits below 2"), "{error}");
+    }
+}

@@ -1,0 +1,211 @@
+//! Reads a recording, record by record; every byte is checked before it is used.
+
+use super::format::{
+    Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, MAX_STORED_BYTES, Record, RecordHeader,
+    RecordingError, Totals, VERSION, checksum,
+};
+use super::progress::Progress;
+use crate::sample::Sample;
+use bytemuck::{Pod, Zeroable};
+use flate2::bufread::DeflateDecoder;
+use serde::de::DeserializeOwned;
+use std::io::Read;
+
+/// Reads a recording: an iterator of records that ends after the first error.
+///
+/// A file without an end gives [`RecordingError::Cut`] after its last whole record, a damaged one
+/// [`RecordingError::Damaged`] before the first that is not.
+#[derive(Debug)]
+pub struct Reader<R> {
+    input: R,
+    offset: u64,
+    progress: Progress,
+    stored: Vec<u8>,
+    is_over: bool,
+}
+
+impl<R: Read> Reader<R> {
+    /// Begins to read; give it a buffered reader at the beginning of the file.
+    ///
+    /// # Errors
+    /// If it is another kind of file, of another version, or shorter than a header.
+    pub fn new(mut input: R) -> Result<Self, RecordingError> {
+        let mut header = FileHeader::zeroed();
+        let n_read = fill(&mut input, &mut header)?;
+        let n_magic = n_read.min(MAGIC.len());
+        if header.magic[..n_magic] != MAGIC[..n_magic] {
+            return Err(RecordingError::Foreign(format!(
+                "not a recording: expected it to begin with {:?}, got {:?}",
+                MAGIC.escape_ascii().to_string(),
+                header.magic[..n_magic].escape_ascii().to_string()
+            )));
+        }
+        if n_read < size_of::<FileHeader>() {
+            return Err(RecordingError::Cut {
+                offset: 0,
+                got: n_read as u64,
+                n_steps: 0,
+            });
+        }
+        if header.version != VERSION {
+            let got = header.version;
+            let problem = format!("recording version: expected {VERSION}, got {got}");
+            return Err(RecordingError::Foreign(problem));
+        }
+        if header.reserved != 0 {
+            let got = header.reserved;
+            let problem = format!("recording: expected 0 in byte 12 to 15, got {got}");
+            return Err(RecordingError::Foreign(problem));
+        }
+        Ok(Self {
+            input,
+            offset: n_read as u64,
+            progress: Progress::default(),
+            stored: Vec::new(),
+            is_over: false,
+        })
+    }
+
+    /// What has been read so far.
+    pub fn totals(&self) -> Totals {
+        self.progress.totals
+    }
+
+    /// The next record; `None` at the end.
+    fn read(&mut self) -> Result<Option<Record>, RecordingError> {
+        let (offset, n_steps) = (self.offset, self.progress.n_steps);
+        let mut header = RecordHeader::zeroed();
+        let n_read = fill(&mut self.input, &mut header)?;
+        let cut = |got: usize| RecordingError::Cut {
+            offset,
+            got: got as u64,
+            n_steps,
+        };
+        if n_read < size_of::<RecordHeader>() {
+            return Err(cut(n_read));
+        }
+        let damaged = |problem: String| RecordingError::Damaged {
+            offset,
+            problem,
+            n_steps,
+        };
+        let length = header.length as usize;
+        if length > MAX_STORED_BYTES {
+            let problem = format!("body: expected at most {MAX_STORED_BYTES} bytes, got {length}");
+            return Err(damaged(problem));
+        }
+        // Grows as bytes arrive, so a false length costs nothing.
+        self.stored.clear();
+        let mut body = (&mut self.input).take(length as u64);
+        body.read_to_end(&mut self.stored)?;
+        if self.stored.len() < length {
+            return Err(cut(n_read + self.stored.len()));
+        }
+        let expected = checksum(&header, &self.stored);
+        if header.checksum != expected {
+            let got = header.checksum;
+            return Err(damaged(format!(
+                "checksum: expected {expected:#010x}, got {got:#010x}"
+            )));
+        }
+        let body = inflated(&self.stored).map_err(damaged)?;
+        self.offset += (n_read + length) as u64;
+        if header.kind == Kind::End as u32 {
+            return self.check_end(&body).map_err(damaged).map(|()| None);
+        }
+        let record = Record {
+            nanos: header.nanos,
+            n_lost: header.n_lost,
+            event: event(header.kind, &body).map_err(damaged)?,
+        };
+        self.progress.accept(&record).map_err(damaged)?;
+        Ok(Some(record))
+    }
+
+    fn check_end(&mut self, body: &[u8]) -> Result<(), String> {
+        let (expected, got) = (self.totals(), json::<Totals>(body)?);
+        if got != expected {
+            return Err(format!("totals: expected {expected:?}, got {got:?}"));
+        }
+        match fill(&mut self.input, &mut [0u8; 1]) {
+            Ok(0) => Ok(()),
+            Ok(_) => Err("expected nothing behind the end, got more bytes".into()),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+}
+
+impl<R: Read> Iterator for Reader<R> {
+    type Item = Result<Record, RecordingError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.is_over {
+            return None;
+        }
+        let read = self.read();
+        self.is_over = !matches!(read, Ok(Some(_)));
+        read.transpose()
+    }
+}
+
+/// Reads a value's bytes; returns how many there were.
+fn fill<T: Pod>(input: &mut impl Read, value: &mut T) -> Result<usize, std::io::Error> {
+    let bytes = bytemuck::bytes_of_mut(value);
+    let mut n_read = 0;
+    while n_read < bytes.len() {
+        match input.read(&mut bytes[n_read..]) {
+            Ok(0) => break,
+            Ok(n) => n_read += n,
+            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(n_read)
+}
+
+fn inflated(stored: &[u8]) -> Result<Vec<u8>, String> {
+    let mut decoder = DeflateDecoder::new(stored);
+    let mut body = Vec::new();
+    let mut limited = (&mut decoder).take(MAX_BODY_BYTES as u64 + 1);
+    limited
+        .read_to_end(&mut body)
+        .map_err(|error| format!("body: expected deflate, got {error}"))?;
+    if body.len() > MAX_BODY_BYTES {
+        return Err(format!(
+            "body: expected at most {MAX_BODY_BYTES} bytes, got more"
+        ));
+    }
+    match decoder.into_inner().len() {
+        0 => Ok(body),
+        got => Err(format!(
+            "body: expected one deflate stream, got {got} bytes behind it"
+        )),
+    }
+}
+
+fn event(kind: u32, body: &[u8]) -> Result<Event, String> {
+    match kind {
+        kind if kind == Kind::Server as u32 => Ok(Event::Server(Box::new(json(body)?))),
+        kind if kind == Kind::Frame as u32 => Ok(Event::Frame(sample(body)?)),
+        kind if kind == Kind::Truth as u32 => Ok(Event::Truth(sample(body)?)),
+        got => Err(format!("kind: expected 1 to 4, got {got}")),
+    }
+}
+
+fn sample<H: Pod>(body: &[u8]) -> Result<Sample<H>, String> {
+    let (header, payload) = body.split_at_checked(size_of::<H>()).ok_or_else(|| {
+        format!(
+            "sample: expected {} bytes, got {}",
+            size_of::<H>(),
+            body.len()
+        )
+    })?;
+    Ok(Sample {
+        header: bytemuck::pod_read_unaligned(header),
+        payload: payload.to_vec(),
+    })
+}
+
+fn json<T: DeserializeOwned>(body: &[u8]) -> Result<T, String> {
+    serde_json::from_slice(body).map_err(|error| format!("JSON: {error}"))
+}

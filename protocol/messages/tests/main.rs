@@ -1,0 +1,4 @@
+//! One program: each would link the crate.
+
+mod hostile;
+mod recording;

@@ -1,0 +1,119 @@
+//! Maps in a model file: a number for each cell, written out or in a file beside it.
+
+use super::grid::{Grid, Shape};
+use crate::text::MAX_TEXT_BYTES;
+use ndarray::Array2;
+use ndarray_npy::ReadNpyExt;
+use ndarray_npy::npy::header::Header;
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::{Cursor, Read};
+use std::path::{Path, PathBuf};
+
+/// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
+const MAX_HEADER_BYTES: u16 = 512;
+
+/// A number for each cell of a grid.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected rows of numbers from 0 to 255, or the name of a .npy file"
+)]
+pub enum CellMap {
+    /// Row by row.
+    Rows(Vec<Vec<u8>>),
+    /// The name of a `.npy` file beside the model file: `[H, W]`, `uint8` or `bool`.
+    File(String),
+}
+
+impl CellMap {
+    /// The numbers row by row, unless they are in a file that was not read.
+    pub fn rows(&self) -> Option<Vec<Vec<u8>>> {
+        match self {
+            Self::Rows(rows) => Some(rows.clone()),
+            Self::File(_) => None,
+        }
+    }
+
+    /// The numbers, shape `[H, W]`.
+    ///
+    /// # Errors
+    /// If rows differ in length, no grid has so many, or they are in a file that was not read; the error says what was
+    /// expected and what was got.
+    pub fn grid(&self) -> Result<Grid<u8>, (String, String)> {
+        let rows = match self {
+            Self::Rows(rows) => rows,
+            Self::File(name) => {
+                let expected = "rows of numbers (files are read beside a model file alone)";
+                return Err((expected.into(), format!("{name:?}")));
+            }
+        };
+        let width = rows.first().map_or(0, Vec::len);
+        let shape = Shape::new(rows.len(), width);
+        let shape = shape.map_err(|error| ("a map of a grid".into(), error.to_string()))?;
+        if let Some(got) = rows.iter().map(Vec::len).find(|&length| length != width) {
+            return Err((format!("rows of {width} numbers"), got.to_string()));
+        }
+        let grid = Grid::from_shape_vec(shape.dim(), rows.concat());
+        Ok(grid.expect("invariant: as many numbers as cells"))
+    }
+
+    /// Reads the file beside a model file, if it names one, and puts its rows here.
+    ///
+    /// # Errors
+    /// The file, and why it was not read.
+    pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
+        let Self::File(name) = &*self else {
+            return Ok(());
+        };
+        let path = model.with_file_name(name);
+        let numbers = read_array(&path).map_err(|problem| (path, problem))?;
+        *self = Self::Rows(numbers.outer_iter().map(|row| row.to_vec()).collect());
+        Ok(())
+    }
+}
+
+fn read_array(path: &Path) -> Result<Array2<u8>, String> {
+    let words = |error: &dyn std::fmt::Display| error.to_string();
+    let metadata = path.metadata().map_err(|error| words(&error))?;
+    if !metadata.is_file() || metadata.len() > MAX_TEXT_BYTES {
+        return Err(format!(
+            "expected a .npy file of at most {MAX_TEXT_BYTES} bytes"
+        ));
+    }
+    let mut bytes = Vec::new();
+    let file = File::open(path).map_err(|error| words(&error))?;
+    let read = file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes);
+    read.map_err(|error| words(&error))?;
+    let header = match bytes.strip_prefix(b"\x93NUMPY") {
+        Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]),
+        _ => return Err("expected a NumPy array".into()),
+    };
+    if header > MAX_HEADER_BYTES {
+        let expected = format!("expected a header of at most {MAX_HEADER_BYTES} bytes");
+        return Err(format!("{expected}, got {header}"));
+    }
+    // An array is made as large as its header says before it is read.
+    let mut rest = Cursor::new(&bytes);
+    let header = Header::from_reader(&mut rest).map_err(|error| words(&error))?;
+    let n_values = bytes.len() as u64 - rest.position();
+    let fits = match header.shape[..] {
+        [height, width] => {
+            Shape::new(height, width).is_ok_and(|it| it.n_cells() as u64 == n_values)
+        }
+        _ => false,
+    };
+    if !fits {
+        let expected = "expected an array [H, W] of uint8 or bool";
+        return Err(format!(
+            "{expected}, got shape {:?} in {n_values} bytes",
+            header.shape
+        ));
+    }
+    let numbers = Array2::<u8>::read_npy(Cursor::new(&bytes));
+    let numbers = numbers.or_else(|error| {
+        let flags = Array2::<bool>::read_npy(Cursor::new(&bytes));
+        flags.map(|flags| flags.mapv(u8::from)).map_err(|_| error)
+    });
+    numbers.map_err(|error| format!("expected an array [H, W] of uint8 or bool: {error}"))
+}

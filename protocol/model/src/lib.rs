@@ -1,0 +1,37 @@
+//! The hidden Markov model of the paper: its parameters, its mathematics, and what a robot does and sees.
+//!
+//! Nothing here knows messages. [`grid`] is what every other file indexes; [`dynamics`] draws hidden states,
+//! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
+//! A [`task`] is a world with a name. [`text`] reads settings and model files.
+
+mod airspace;
+mod cell_map;
+mod check;
+mod description;
+pub mod dynamics;
+pub mod file;
+pub mod frame;
+pub mod grid;
+mod parameters;
+mod parts;
+pub mod path;
+pub mod randomness;
+pub mod task;
+pub mod text;
+pub mod transition;
+pub mod vectors;
+
+pub use airspace::{Airspace, SeenCell};
+pub use cell_map::CellMap;
+pub use description::{DescribedState, Description};
+pub use dynamics::Dynamics;
+pub use file::{
+    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
+    ObservationEntry, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
+};
+pub use frame::{Coverage, Frame, UNOBSERVED};
+pub use grid::{Cell, Grid, Probabilities, Shape};
+pub use parameters::Model;
+pub use parts::Parts;
+pub use path::Move;
+pub use transition::Transition;

@@ -1,0 +1,291 @@
+//! Tasks: worlds with a name, fixed completely, on which results can be compared.
+
+use crate::grid::Cell;
+use crate::parameters::Model;
+use crate::text::read_text;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+use std::path::Path;
+use thiserror::Error;
+
+/// Most seeds of worlds that are compared on.
+pub const MAX_SEEDS: u64 = 100_000;
+
+/// Names of the recorded states that are built in.
+pub const BUILT_IN_STATES: [&str; 1] = ["jacksboro"];
+
+/// The built-in tasks by name.
+const BUILT_IN: [(&str, &str); 9] = [
+    ("wildfire", include_str!("../tasks/wildfire.toml")),
+    ("small", include_str!("../tasks/small.toml")),
+    ("sparse", include_str!("../tasks/sparse.toml")),
+    ("latent", include_str!("../tasks/latent.toml")),
+    ("burnout", include_str!("../tasks/burnout.toml")),
+    ("terrain", include_str!("../tasks/terrain.toml")),
+    ("road-ice", include_str!("../tasks/road-ice.toml")),
+    ("team", include_str!("../tasks/team.toml")),
+    ("jacksboro", include_str!("../tasks/jacksboro.toml")),
+];
+
+/// The settings of a server that make a task's worlds, by their names there, and the seeds to test on.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Task {
+    /// What was asked for: a built-in name, or the path of a file.
+    #[serde(skip)]
+    pub source: String,
+    /// Its own name.
+    pub name: String,
+    /// A built-in model or a model file; empty where states were recorded.
+    #[serde(default)]
+    pub model: String,
+    /// Recorded states, built in or a file; empty where a model makes them.
+    #[serde(default)]
+    pub states: String,
+    /// Whether seeds choose among the symmetries of the grid, too.
+    #[serde(default)]
+    pub states_symmetries: bool,
+    /// Episodes begin at a recorded step of 0 to this.
+    #[serde(default)]
+    pub states_offset: u64,
+    /// Grid height in cells; 0 where states were recorded, which decide it.
+    #[serde(default)]
+    pub height: usize,
+    /// Grid width, likewise.
+    #[serde(default)]
+    pub width: usize,
+    /// Rows and columns that robots see beyond each cell of their path; -1: as the model says.
+    #[serde(default = "as_model_says")]
+    pub sensor_radius: i64,
+    /// Moves in a path.
+    pub moves: usize,
+    /// Robots of each world.
+    #[serde(default = "one")]
+    pub robots: u32,
+    /// Steps simulated before k = 0.
+    #[serde(default)]
+    pub burn_in: u64,
+    /// Where the robots begin.
+    #[serde(default)]
+    pub start: Start,
+    /// Steps of an episode.
+    pub max_steps: u64,
+    /// Seeds of the worlds to test on.
+    pub test_seeds: Range<u64>,
+}
+
+/// Where the robots of a world are after a reset.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Start {
+    /// The corners (0, 0), the opposite one, upper right, lower left; then the middles of the sides; and again.
+    #[default]
+    Corner,
+    /// All in the middle.
+    Centre,
+    /// Cells drawn from the seed.
+    Random,
+    /// All in this cell.
+    #[serde(untagged)]
+    At(Cell),
+}
+
+/// A task that is refused.
+#[derive(Debug, Error)]
+#[error("task {task}: {problem}")]
+pub struct TaskError {
+    task: String,
+    problem: String,
+}
+
+impl Task {
+    /// The radius of the sensor, if it is not as the model says.
+    pub fn radius(&self) -> Option<usize> {
+        self.sensor_radius.try_into().ok()
+    }
+
+    /// The built-in task of a name, or that of a file.
+    ///
+    /// # Errors
+    /// If there is no such file, or it is no task.
+    pub fn named(name: &str) -> Result<Self, TaskError> {
+        let read = match BUILT_IN.iter().find(|(known, _)| *known == name) {
+            Some((_, text)) => Self::from_toml(text),
+            None if name.is_empty() => Err("expected a name or a file, got \"\"".into()),
+            None => Self::read(Path::new(name)),
+        };
+        let named = |task| Self {
+            source: name.into(),
+            ..task
+        };
+        read.map(named).map_err(|problem| TaskError {
+            task: name.into(),
+            problem,
+        })
+    }
+
+    /// The names of the built-in tasks.
+    pub fn built_in_names() -> impl Iterator<Item = &'static str> {
+        BUILT_IN.iter().map(|(name, _)| *name)
+    }
+
+    /// Whether its hidden states were recorded.
+    pub fn is_recorded(&self) -> bool {
+        !self.states.is_empty()
+    }
+
+    fn read(path: &Path) -> Result<Self, String> {
+        check_kind(path)?;
+        let text = read_text(path).map_err(|error| {
+            if path.exists() {
+                return error.to_string();
+            }
+            let names: Vec<&str> = Self::built_in_names().collect();
+            format!("{error}: expected one, or {}", names.join(", "))
+        })?;
+        let mut task = Self::from_toml(&text)?;
+        let same_name = BUILT_IN.iter().find(|(name, _)| *name == task.name);
+        if same_name.is_some_and(|(_, text)| Self::from_toml(text).as_ref() != Ok(&task)) {
+            return Err(format!(
+                "name: expected one of its own, got {}, which is built in",
+                task.name
+            ));
+        }
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let is_model = Model::built_in(&task.model).is_some();
+        let is_states = BUILT_IN_STATES.contains(&&*task.states);
+        for (setting, file, is_built_in) in [
+            ("model", &mut task.model, is_model),
+            ("states", &mut task.states, is_states),
+        ] {
+            let beside = folder.join(&*file);
+            if file.is_empty() || !beside.exists() || (is_built_in && beside.is_dir()) {
+                continue;
+            }
+            if is_built_in {
+                return Err(format!(
+                    "{setting}: expected a file with a name of its own, got {file}, which is built in (./{file} is the file)"
+                ));
+            }
+            check_kind(&beside).map_err(|problem| format!("{setting}: {problem}"))?;
+            *file = beside.display().to_string();
+        }
+        Ok(task)
+    }
+
+    fn from_toml(text: &str) -> Result<Self, String> {
+        let task: Self = toml::from_str(text).map_err(|error| error.to_string())?;
+        task.check()?;
+        Ok(task)
+    }
+
+    /// Checks what the server cannot: it takes a setting that is not given for its default.
+    fn check(&self) -> Result<(), String> {
+        let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
+            Err(format!("{setting}: expected {expected}, got {got}"))
+        };
+        if !is_file_name(&self.name) {
+            return needs(
+                "name",
+                "1 to 64 letters, digits, - and _",
+                &format!("{:?}", self.name),
+            );
+        }
+        if self.model.is_empty() != self.is_recorded() {
+            let got = format!("{:?} and {:?}", self.model, self.states);
+            return needs("model and states", "one of them", &got);
+        }
+        let simulated = [
+            ("height", self.height as u64),
+            ("width", self.width as u64),
+            ("burn_in", self.burn_in),
+        ];
+        for (setting, got) in simulated.into_iter().filter(|_| self.is_recorded()) {
+            if got != 0 {
+                return needs(setting, "none beside states, which decide it", &got);
+            }
+        }
+        if self.max_steps == 0 {
+            return needs("max_steps", "at least 1", &0);
+        }
+        let n_seeds = self.test_seeds.end.saturating_sub(self.test_seeds.start);
+        if !(1..=MAX_SEEDS).contains(&n_seeds) {
+            return needs("test_seeds", &format!("1 to {MAX_SEEDS}"), &n_seeds);
+        }
+        Ok(())
+    }
+}
+
+/// Refuses pipes and devices, which may keep a reader waiting and cannot be read twice.
+fn check_kind(path: &Path) -> Result<(), String> {
+    match path.metadata() {
+        Ok(found) if !found.is_file() && !found.is_dir() => Err(format!(
+            "expected a regular file, got a pipe or device at {}",
+            path.display()
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Whether a name can be that of a file anywhere: 1 to 64 letters, digits, hyphens, underscores and dots within.
+pub fn is_file_name(name: &str) -> bool {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    (1..=64).contains(&name.len()) && name.bytes().all(is_plain) && !name.starts_with('.')
+}
+
+fn as_model_says() -> i64 {
+    -1
+}
+
+fn one() -> u32 {
+    1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn built_in_tasks_have_their_names_and_a_model_or_states() {
+        for name in Task::built_in_names() {
+            let task = Task::named(name).expect(name);
+            assert_eq!((&*task.name, &*task.source), (name, name));
+            let model = Model::built_in(&task.model);
+            assert_eq!(model.is_none(), task.is_recorded(), "{name}");
+        }
+    }
+
+    #[test]
+    fn wrong_tasks_are_refused_by_their_setting() {
+        let task = |name| BUILT_IN.iter().find(|(known, _)| *known == name);
+        let text = |name| task(name).map(|(_, text)| *text).expect(name);
+        let check = |name, from: &str, to: &str, words: &str| {
+            let (before, text) = (text(name), text(name).replacen(from, to, 1));
+            assert_ne!(before, text);
+            let error = Task::from_toml(&text).expect_err(to);
+            assert!(error.contains(words), "{error}");
+        };
+        check("small", "height", "heigth", "unknown field `heigth`");
+        check("small", "moves = 16", "", "missing field `moves`");
+        let both = "states = \"a.npz\"\nmodel";
+        check("small", "model", both, "model and states: expected one");
+        let height = "moves = 64\nheight = 3";
+        check("jacksboro", "moves = 64", height, "height: expected none");
+        check("small", "max_steps = 300", "max_steps = 0", "at least 1");
+        for name in ["", "../small", "a b", ".a", "/a"] {
+            let name = format!("name = {name:?}");
+            check("small", "name = \"small\"", &name, "name: expected 1 to 64");
+        }
+        check("small", "end = 32", "end = 0", "test_seeds: expected 1 to");
+    }
+
+    #[test]
+    fn what_is_neither_a_name_nor_a_file_is_told_the_names() {
+        let error = Task::named("no/such").expect_err("no task").to_string();
+        assert!(error.contains("task no/such: No such file"), "{error}");
+        assert!(
+            error.contains("expected one, or wildfire, small"),
+            "{error}"
+        );
+    }
+}

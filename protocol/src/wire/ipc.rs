@@ -1,0 +1,21 @@
+//! iceoryx2's flavour, and headers in its shared memory.
+
+use emberwatch_messages::message::Header;
+use iceoryx2::prelude::ZeroCopySend;
+use iceoryx2::service::ipc_threadsafe;
+
+/// iceoryx2's inter-process flavour whose ports may move between threads.
+pub type Ipc = ipc_threadsafe::Service;
+
+/// A header in shared memory, for iceoryx2.
+#[repr(transparent)]
+#[derive(Debug, Clone, Copy, Default)]
+pub struct WireHeader<H>(pub H);
+
+#[expect(unsafe_code, reason = "iceoryx2 asks for a promise")]
+// SAFETY: a header is plain bytes (`Pod`), so it has no pointers and no destructor.
+unsafe impl<H: Header> ZeroCopySend for WireHeader<H> {
+    unsafe fn type_name() -> &'static str {
+        H::TYPE_NAME
+    }
+}
