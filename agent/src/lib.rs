@@ -8,6 +8,7 @@
 //! - [`training`] -- the loop that learns while acting, its metrics and events
 //! - [`client`] -- the ends of the wire
 //! - [`flags`] -- settings as flags
+//! - [`process`] -- the allocator and candle's threads
 //!
 //! Policies, estimators, learners and checkpoints are in the crate `emberwatch-learning`.
 
@@ -17,4 +18,5 @@ pub mod acting;
 pub mod benchmark;
 pub mod client;
 pub mod flags;
+pub mod process;
 pub mod training;

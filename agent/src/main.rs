@@ -3,7 +3,7 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
-use emberwatch_network::{Allocator, set_up_process};
+use emberwatch_agent::process::{Allocator, set_up_process};
 use emberwatch_protocol::limits::threads::NoThreads;
 use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;

@@ -4,10 +4,10 @@
 //! requests in [`control`] and [`message`]. An [`observer`] reads what a server publishes, a [`recording`] what a file
 //! holds of that. A [`responder`], [`channels`] and [`failed_connections`] are for those who serve worlds.
 //!
-//! The messages are in the crate `emberwatch-messages`, the mathematics of the worlds in `emberwatch-model`; a client finds
-//! what it needs of both here. PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of
-//! one grid; a *step* `k` flies one path with each robot and moves the world once; a *frame* holds the observations of a
-//! step; a *lease* is the right to fly robots.
+//! The messages are in the crate `emberwatch-messages`, the mathematics of the worlds in `emberwatch-model`; a client
+//! finds what it needs of both here. PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden
+//! state of one grid; a *step* `k` flies one path with each robot and moves the world once; a *frame* holds the
+//! observations of a step; a *lease* is the right to fly robots.
 
 pub mod program;
 pub mod throttle;

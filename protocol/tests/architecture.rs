@@ -201,6 +201,19 @@ fn rooms_use_only_those_below_them() {
 }
 
 #[test]
+fn pure_crates_need_no_channels_and_no_flags() {
+    let pure = ["protocol/model", "protocol/messages", "env-server/sim"];
+    for name in pure.into_iter().chain(["agent/belief", "agent/learning"]) {
+        let manifest = std::fs::read_to_string(root().join(name).join("Cargo.toml"));
+        let manifest = manifest.expect("a manifest");
+        for other in ["iceoryx2", "clap", "tokio", "emberwatch-protocol"] {
+            let is_named = manifest.lines().any(|line| line.starts_with(other));
+            assert!(!is_named, "{name} uses {other}");
+        }
+    }
+}
+
+#[test]
 fn no_crate_has_a_circle_of_files() {
     for name in CRATES {
         let graph = graph_of(name);

@@ -1,4 +1,4 @@
-//! What learns while it acts, as [`crate::train`] drives it. Pure: frames in, paths out.
+//! What learns while it acts, as a training loop drives it. Pure: frames in, paths out.
 
 mod base;
 pub mod decisions;

@@ -1,6 +1,6 @@
 //! What agents learn and what they act on: estimators with networks, learners, decisions, their checkpoints, and the
-//! policies that put belief, planner and objective together. Pure but for checkpoints and kept beliefs in files: frames in,
-//! paths out.
+//! policies that put belief, planner and objective together. Pure but for checkpoints and kept beliefs in files: frames
+//! in, paths out.
 //!
 //! Modules, each using only those below it:
 //!

@@ -21,12 +21,12 @@ pub struct ModelUpdate {
     pub loss: Option<f64>,
     /// The model's step size, if it was updated.
     pub rate: Option<f64>,
-    /// What [`emberwatch_learning::learners::Learner::columns`] names.
+    /// What [`crate::learners::Learner::columns`] names.
     pub more: Vec<Option<f64>>,
 }
 
 impl ModelUpdate {
-    /// No update, after so many; `n_more`: length of [`emberwatch_learning::learners::Learner::columns`].
+    /// No update, after so many; `n_more`: length of [`crate::learners::Learner::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

@@ -8,9 +8,14 @@ use emberwatch_model::grid::Shape;
 use emberwatch_model::path::{Move, fly};
 use emberwatch_model::randomness::split_mix;
 use emberwatch_network::{
-    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, Lesson,
-    NetworkShape, NeuralBelief, Sightings, Transition, Window, set_up_process,
+    Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, Lesson, NetworkShape,
+    NeuralBelief, Sightings, Transition, Window,
 };
+
+#[path = "../../src/process.rs"]
+mod process;
+
+use process::{Allocator, set_up_process};
 
 #[global_allocator]
 static ALLOCATOR: Allocator = Allocator;

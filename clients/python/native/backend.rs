@@ -2,11 +2,11 @@
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
+use crate::wire::Connection;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_messages::message::{StepReply, StepRequest};
-use emberwatch_protocol::connection::Connection;
 use emberwatch_sim::config::{Checked, ServerConfig};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;

@@ -20,8 +20,11 @@ thread_local! {
 /// Runs Python's signal handlers; returns whether one raised.
 pub fn interrupted() -> bool {
     // Python runs them on its main thread only, and others may be kept waiting for the interpreter.
-    let is_main = rustix::thread::gettid() == rustix::process::getpid();
-    is_main
+    #[cfg(target_os = "linux")]
+    let may_be_main = rustix::thread::gettid() == rustix::process::getpid();
+    #[cfg(not(target_os = "linux"))]
+    let may_be_main = true;
+    may_be_main
         && Python::attach(|py| match py.check_signals() {
             Ok(()) => false,
             Err(error) => {

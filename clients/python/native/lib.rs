@@ -8,6 +8,8 @@ mod connection;
 mod detached;
 mod errors;
 mod flights;
+#[cfg(target_os = "linux")]
+mod fork;
 mod lease;
 mod merit;
 mod model;
@@ -19,34 +21,16 @@ mod reader;
 mod recording;
 mod refusal;
 mod samples;
+mod wire;
 
 use emberwatch_messages::interrupt::interrupt_when;
-use emberwatch_protocol::turn;
 use pyo3::prelude::*;
-use pyo3::types::IntoPyDict;
-
-#[pyfunction]
-fn before_fork(py: Python<'_>) {
-    py.detach(turn::before_fork);
-}
-
-#[pyfunction]
-fn after_fork() {
-    turn::after_fork();
-}
 
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    let py = module.py();
     interrupt_when(errors::interrupted);
-    let after = wrap_pyfunction!(after_fork, module)?;
-    let hooks = [
-        ("before", wrap_pyfunction!(before_fork, module)?),
-        ("after_in_parent", after.clone()),
-        ("after_in_child", after),
-    ];
-    let os = py.import("os")?;
-    os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
+    #[cfg(target_os = "linux")]
+    fork::register(module)?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
     module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
     module.add_class::<answer::Answer>()?;

@@ -12,7 +12,7 @@ const INTERVAL: Duration = Duration::from_millis(5);
 
 /// Something of iceoryx2's, which does not survive a fork: a child neither uses nor drops it.
 pub struct Owned<T: Send> {
-    pid: i32,
+    pid: u32,
     instance: String,
     slot: ManuallyDrop<Mutex<Slot<T>>>,
     freed: Condvar,
@@ -202,6 +202,6 @@ impl<T: Send> Drop for Owned<T> {
     }
 }
 
-fn pid() -> i32 {
-    rustix::process::getpid().as_raw_nonzero().get()
+fn pid() -> u32 {
+    std::process::id()
 }

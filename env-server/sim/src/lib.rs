@@ -1,8 +1,8 @@
 //! Simulated worlds: requests in, answers out, without channels.
 //!
 //! One step, in reading order: [`world`] (hidden states, robot, noise), [`simulator`] (leases; request in, answer out).
-//! [`snapshot`] saves worlds. [`config`] has the settings, [`given`] those given by name. [`embedded`] has worlds inside
-//! the process that uses them.
+//! [`snapshot`] saves worlds. [`config`] has the settings, [`given`] those given by name. [`embedded`] has worlds
+//! inside the process that uses them.
 
 #![allow(
     missing_docs,

@@ -41,6 +41,16 @@ pub enum ChannelError {
         /// Name of the instance.
         instance: String,
     },
+    /// This system has no channels.
+    #[error(
+        "instance {instance:?}: servers are attached to on Linux only, got {}; without an instance, worlds run in this \
+         process on every system",
+        std::env::consts::OS
+    )]
+    OtherSystem {
+        /// Name of the instance.
+        instance: String,
+    },
     /// A server runs on the instance, but it speaks another version of the protocol.
     #[error(
         "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of one \

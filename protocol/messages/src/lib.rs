@@ -1,8 +1,8 @@
 //! The bytes and the JSON of PROTOCOL.md: what a server and its clients say to each other, and why a request fails.
 //!
 //! [`message`] and [`payload`] are the bytes of steps and samples, [`control`] is the JSON of everything rare,
-//! [`recording`] keeps samples in a file. Nothing here opens a channel. [`limits`] refuses more memory and threads than the
-//! system has; [`interrupt`] ends waits.
+//! [`recording`] keeps samples in a file. Nothing here opens a channel. [`limits`] refuses more memory and threads than
+//! the system has; [`interrupt`] ends waits.
 
 pub mod agent_belief;
 pub mod capacity;

@@ -1,0 +1,104 @@
+//! Systems other than Linux: servers cannot be attached to, and nothing is shown to observers.
+
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_messages::control::ServerInfo;
+use emberwatch_messages::errors::{ChannelError, ConnectionError};
+use emberwatch_messages::instance::Instance;
+use emberwatch_messages::message::{
+    AgentHeader, FrameHeader, StepReply, StepRequest, TruthHeader, WorldResult,
+};
+use emberwatch_messages::sample::Sample;
+use emberwatch_model::Probabilities;
+use std::convert::Infallible;
+use std::marker::PhantomData;
+use std::ops::Range;
+use std::time::Duration;
+
+/// There is none.
+pub struct Connection(Infallible);
+
+impl Connection {
+    /// Refuses to connect.
+    pub fn open(instance: &Instance, _: &str, _: Duration) -> Result<Self, ConnectionError> {
+        Err(refusal(instance).into())
+    }
+
+    pub fn info(&self) -> &ServerInfo {
+        match self.0 {}
+    }
+
+    pub fn control_text(&mut self, _: &[u8], _: Duration) -> Result<Vec<u8>, ConnectionError> {
+        match self.0 {}
+    }
+
+    pub fn step_payload(
+        &mut self,
+        _: StepRequest,
+        _: &[u8],
+        _: Duration,
+    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
+        match self.0 {}
+    }
+}
+
+/// There is none.
+pub struct Observer<H>(Infallible, PhantomData<H>);
+
+impl Observer<FrameHeader> {
+    /// Refuses to observe.
+    pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
+        Err(refusal(instance))
+    }
+}
+
+impl Observer<TruthHeader> {
+    /// Refuses to observe.
+    pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
+        Err(refusal(instance))
+    }
+}
+
+impl Observer<AgentHeader> {
+    /// Refuses to observe.
+    pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
+        Err(refusal(instance))
+    }
+}
+
+impl<H> Observer<H> {
+    pub fn receive(&self, _: Duration) -> Result<Option<Sample<H>>, ChannelError> {
+        match self.0 {}
+    }
+}
+
+/// A channel without observers.
+pub struct Feed;
+
+/// A belief for observers.
+#[expect(dead_code, reason = "nobody reads it here")]
+pub struct View<'a> {
+    pub world: u32,
+    pub robots: Range<u32>,
+    pub result: &'a WorldResult,
+    pub belief: &'a Probabilities,
+    pub intent: Intent,
+}
+
+impl Feed {
+    pub fn open(_: &Instance, _: &Probabilities) -> Self {
+        Self
+    }
+
+    /// No world is to be shown.
+    pub fn turn(&self, _: usize) -> Vec<usize> {
+        Vec::new()
+    }
+
+    pub fn show(&mut self, _: &View<'_>) {}
+}
+
+fn refusal(instance: &Instance) -> ChannelError {
+    ChannelError::OtherSystem {
+        instance: instance.name().into(),
+    }
+}
