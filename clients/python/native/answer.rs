@@ -7,6 +7,7 @@ use emberwatch_messages::message::{
 };
 use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
 use emberwatch_model::Shape;
+use numpy::ndarray::arr2;
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
 };
@@ -17,9 +18,9 @@ use std::ops::Range;
 /// Bytes of a world's result and of its robot's result.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
-/// Numbers of one robot's step: reward, whether the episode terminated and was truncated, step, distinct cells visited,
-/// row and column.
-type Numbers = (f64, bool, bool, u64, u32, (u32, u32));
+/// Numbers of one robot's step: reward, whether the episode terminated and was truncated, step, distinct cells visited;
+/// row and column, `[1, 2]`.
+type Numbers<'py> = (f64, bool, bool, u64, u32, Bound<'py, PyArray2<i64>>);
 
 /// Columns of many robots' steps, see `_native.pyi`.
 type Columns<'py> = (
@@ -46,6 +47,8 @@ pub struct Answer {
     /// Number of frames, height, width.
     dim: [usize; 3],
     payload: Py<PyArray1<u8>>,
+    /// The results of the first robot and its world.
+    first: (WorldResult, RobotResult),
 }
 
 #[pymethods]
@@ -63,12 +66,24 @@ impl Answer {
         simulation_nanos: u64,
         payload: Bound<'_, PyArray1<u8>>,
     ) -> PyResult<Self> {
-        let place = (team, first_robot, n_robots, flags);
-        let answer = Self::made(place, [height, width], simulation_nanos, payload.clone());
+        let mut answer = Self {
+            team: team.max(1),
+            first_robot,
+            n_robots,
+            simulation_nanos,
+            dim: [
+                n_frames((team, first_robot, n_robots, flags)),
+                height,
+                width,
+            ],
+            payload: payload.clone().unbind(),
+            first: Default::default(),
+        };
         let (expected, got) = (answer.n_bytes(), payload.len());
         if expected != got || n_robots == 0 {
             return Err(invalid(py, "payload", format!("{expected} bytes"), got));
         }
+        answer.first = answer.results_of(py, 0)?;
         Ok(answer)
     }
 
@@ -118,41 +133,20 @@ impl Answer {
     }
 
     /// The numbers of the first robot's step; `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
-    fn numbers(&self, py: Python<'_>, pays: u8) -> PyResult<Numbers> {
-        let (world, robot) = self.results_of(py, 0)?;
-        Ok((
+    fn numbers<'py>(&self, py: Python<'py>, pays: u8) -> Numbers<'py> {
+        let (world, robot) = self.first;
+        (
             paid(pays, &world, &robot),
             world.terminated != 0,
             world.truncated != 0,
             world.step,
             robot.n_visited,
-            (robot.row, robot.col),
-        ))
+            PyArray2::from_owned_array(py, arr2(&[[i64::from(robot.row), i64::from(robot.col)]])),
+        )
     }
 }
 
 impl Answer {
-    /// `place`: robots of each world, the first robot, number of robots, flags.
-    fn made(
-        (team, first_robot, n_robots, flags): (u32, u32, u32, u32),
-        [height, width]: [usize; 2],
-        simulation_nanos: u64,
-        payload: Bound<'_, PyArray1<u8>>,
-    ) -> Self {
-        let n_frames = match flags & FLAG_TEAM_FRAMES {
-            0 => n_robots as usize,
-            _ => worlds_of(first_robot, n_robots, team).len(),
-        };
-        Self {
-            team: team.max(1),
-            first_robot,
-            n_robots,
-            simulation_nanos,
-            dim: [n_frames, height, width],
-            payload: payload.unbind(),
-        }
-    }
-
     /// An answer that came with this header.
     pub fn of(
         py: Python<'_>,
@@ -161,14 +155,28 @@ impl Answer {
         reply: &StepReply,
         payload: Vec<u8>,
     ) -> Self {
+        let n_worlds = worlds_of(reply.first_robot, reply.n_robots, team).len();
+        let robot = &payload[n_worlds * WORLD_BYTES..][..ROBOT_BYTES];
+        let first = (
+            bytemuck::pod_read_unaligned(&payload[..WORLD_BYTES]),
+            bytemuck::pod_read_unaligned(robot),
+        );
         let place = (team, reply.first_robot, reply.n_robots, reply.flags);
-        let payload = PyArray1::from_vec(py, payload);
-        Self::made(place, shape.dim().into(), reply.simulation_nanos, payload)
+        let (height, width) = shape.dim();
+        Self {
+            team: team.max(1),
+            first_robot: reply.first_robot,
+            n_robots: reply.n_robots,
+            simulation_nanos: reply.simulation_nanos,
+            dim: [n_frames(place), height, width],
+            payload: PyArray1::from_vec(py, payload).unbind(),
+            first,
+        }
     }
 
     /// The step of its first world.
-    pub fn step(&self, py: Python<'_>) -> PyResult<u64> {
-        Ok(self.results_of(py, 0)?.0.step)
+    pub fn step(&self) -> u64 {
+        self.first.0.step
     }
 
     fn n_worlds(&self) -> usize {
@@ -256,6 +264,14 @@ pub fn columns<'py>(
         PyArray1::from_vec(py, cells).reshape([n, 2])?,
         is_over,
     ))
+}
+
+/// Number of frames of robots: robots of each world, the first robot, number of robots, flags.
+fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize {
+    match flags & FLAG_TEAM_FRAMES {
+        0 => n_robots as usize,
+        _ => worlds_of(first_robot, n_robots, team).len(),
+    }
 }
 
 /// What a step pays a robot.

@@ -87,22 +87,35 @@ pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
     Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
-/// Reads files on a thread of its own: one may be a pipe.
+/// Reads settings and their files. What is no plain file, such as a pipe, is read on a thread of its own, so that the wait
+/// for it can end.
 fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
     let given: Map<String, Value> =
         serde_json::from_str(settings).map_err(|error| refused(py, &error.to_string()))?;
-    let (sender, receiver) = channel();
+    let may_block = may_block(&given);
     let read = move || {
         let settings = ServerConfig::default().with(&given);
         settings.and_then(ServerConfig::check)
     };
-    let reader = spawn("settings", move || drop(sender.send(read())));
-    reader.map_err(|short| no_threads(py, &short))?;
-    let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
-    let checked = py.detach(wait);
-    let checked =
-        checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?;
+    let checked = if may_block {
+        let (sender, receiver) = channel();
+        let reader = spawn("settings", move || drop(sender.send(read())));
+        reader.map_err(|short| no_threads(py, &short))?;
+        let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
+        let checked = py.detach(wait);
+        checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?
+    } else {
+        py.detach(read)
+    };
     checked.map_err(|problem| refused(py, &problem.to_string()))
+}
+
+/// Whether a setting names a pipe, a device or the like, whose reader may wait.
+fn may_block(given: &Map<String, Value>) -> bool {
+    let paths = given.values().filter_map(Value::as_str);
+    let kinds = paths.filter_map(|path| std::fs::metadata(path).ok());
+    let mut others = kinds.filter(|kind| !kind.is_file() && !kind.is_dir());
+    others.next().is_some()
 }
 
 /// Warns of robots that begin where no-fly cells close them in.

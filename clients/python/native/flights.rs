@@ -229,6 +229,17 @@ impl Flights {
 }
 
 impl Flights {
+    /// Where the robots are.
+    pub fn cells(&self) -> &[Cell] {
+        &self.cells
+    }
+
+    /// The share of a path's moves that are left, times 255.
+    pub fn share_left(&self, row: usize) -> u8 {
+        let made = self.n_made[row] as f64 / self.n_moves as f64;
+        (255.0 * (1.0 - made)).round_ties_even() as u8
+    }
+
     /// Forgets what was visited, and keeps the hidden states, of the rows `begun`.
     fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
         let n_cells = self.shape.n_cells();

@@ -1,5 +1,8 @@
-//! Keeps forks out of the turns in which channels are made.
+//! What a fork of this process needs: it waits for turns in which channels are made, and the child forgets its parent's
+//! number.
 
+use crate::owned::forget_pid;
+#[cfg(target_os = "linux")]
 use emberwatch_protocol::turn;
 use pyo3::prelude::*;
 use pyo3::types::IntoPyDict;
@@ -7,11 +10,13 @@ use pyo3::types::IntoPyDict;
 /// Has Python call the hooks at each fork of this process.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
-    let after = wrap_pyfunction!(after_fork, module)?;
     let hooks = [
         ("before", wrap_pyfunction!(before_fork, module)?),
-        ("after_in_parent", after.clone()),
-        ("after_in_child", after),
+        ("after_in_parent", wrap_pyfunction!(after_fork, module)?),
+        (
+            "after_in_child",
+            wrap_pyfunction!(after_fork_in_child, module)?,
+        ),
     ];
     let os = py.import("os")?;
     os.call_method("register_at_fork", (), Some(&hooks.into_py_dict(py)?))?;
@@ -20,10 +25,20 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 
 #[pyfunction]
 fn before_fork(py: Python<'_>) {
+    #[cfg(target_os = "linux")]
     py.detach(turn::before_fork);
+    #[cfg(not(target_os = "linux"))]
+    let _ = py;
 }
 
 #[pyfunction]
 fn after_fork() {
+    #[cfg(target_os = "linux")]
     turn::after_fork();
+}
+
+#[pyfunction]
+fn after_fork_in_child() {
+    forget_pid();
+    after_fork();
 }

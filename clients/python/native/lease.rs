@@ -85,7 +85,7 @@ impl Lease {
             let request = it.request(Operation::Observe, first_robot, n_robots, 0);
             let seen = it.ask(py, request, &[], duration(seconds))?;
             let seen = server.answered(py, seen, seconds)?;
-            if seen.step(py)? > before {
+            if seen.step() > before {
                 return Ok(Some(seen));
             }
             warn_of_wait(py, first_world)?;
@@ -95,7 +95,7 @@ impl Lease {
         match until_moved(&mut lease, send, look, || false)? {
             Flown::Answered(answer) => Ok((answer, 0)),
             Flown::Observed(seen) => {
-                let n_moved = seen.step(py)? - before;
+                let n_moved = seen.step() - before;
                 Ok((seen, n_moved - 1))
             }
             Flown::GivenUp => unreachable!("invariant: it is never given up"),

@@ -8,7 +8,7 @@ mod connection;
 mod detached;
 mod errors;
 mod flights;
-#[cfg(target_os = "linux")]
+#[cfg(unix)]
 mod fork;
 mod lease;
 mod merit;
@@ -21,6 +21,7 @@ mod reader;
 mod recording;
 mod refusal;
 mod samples;
+mod windows;
 mod wire;
 
 use emberwatch_messages::interrupt::interrupt_when;
@@ -29,7 +30,7 @@ use pyo3::prelude::*;
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     interrupt_when(errors::interrupted);
-    #[cfg(target_os = "linux")]
+    #[cfg(unix)]
     fork::register(module)?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
     module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
@@ -37,6 +38,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<connection::Server>()?;
     module.add_class::<flights::Flights>()?;
+    module.add_class::<windows::Windows>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Frames>()?;
     module.add_class::<reader::Truths>()?;

@@ -4,6 +4,7 @@ use crate::errors::{error, interrupted, raise_of_channel};
 use emberwatch_messages::errors::ChannelError;
 use pyo3::prelude::*;
 use std::mem::ManuallyDrop;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -202,6 +203,22 @@ impl<T: Send> Drop for Owned<T> {
     }
 }
 
+/// This process's number; 0 until it is asked for.
+static PID: AtomicU32 = AtomicU32::new(0);
+
+/// This process's number, without a system call after the first one.
 fn pid() -> u32 {
-    std::process::id()
+    match PID.load(Ordering::Relaxed) {
+        0 => {
+            let pid = std::process::id();
+            PID.store(pid, Ordering::Relaxed);
+            pid
+        }
+        pid => pid,
+    }
+}
+
+/// Has a forked child ask for its number again.
+pub fn forget_pid() {
+    PID.store(0, Ordering::Relaxed);
 }

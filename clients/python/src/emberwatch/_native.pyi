@@ -56,7 +56,7 @@ def check_settings(settings: str) -> str:
 def worlds_fingerprint(settings: str) -> str:
     """The `worlds_fingerprint` of a server with these settings, as JSON; simulates nothing."""
 
-_Numbers = tuple[float, bool, bool, int, int, tuple[int, int]]
+_Numbers = tuple[float, bool, bool, int, int, NDArray[np.int64]]
 _Columns = tuple[
     _Doubles,
     NDArray[np.bool_],
@@ -120,7 +120,7 @@ class Answer:
     def numbers(self, pays: int) -> _Numbers:
         """Reward, terminated, truncated, step, distinct cells visited and cell of the first robot.
 
-        `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
+        The cell is a new array, `(1, 2)`. `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
         """
 
 def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
@@ -308,6 +308,34 @@ class Lease:
     @property
     def steps(self) -> list[int]:
         """The step of each world."""
+
+@final
+class Windows:
+    """A square of cells around each robot, in rows: the observation parts `local` and `recent`.
+
+    The channels about the world come first, then 255 where this path has been, 255 off the grid and
+    in no-fly cells, and 255 times the share of the path's moves that are left.
+    """
+
+    def __new__(
+        cls,
+        n_rows: int,
+        height: int,
+        width: int,
+        side: int,
+        n_of_world: int,
+        airspace: _Airspace,
+    ) -> Windows:
+        """`side`: cells along a side, odd; `n_of_world`: channels about the world."""
+
+    def begin(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
+        """Shows the world, `(n_begun, H, W, n_of_world)`, to robots that have visited nothing."""
+
+    def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
+        """Some robots have made a move: the cells that their visit has pay hold nothing any more."""
+
+    def around(self, flights: Flights) -> NDArray[np.uint8]:
+        """The windows of all robots, `(n_rows, side, side, channels)`; a new array."""
 
 class Frames:
     """Reads `Frame`s, of one world or of all."""

@@ -164,8 +164,8 @@ class WildfireEnv(WorldEnv):
         with self._session.turn:
             self._answer = answer = self._begin(seed, options)
             self._observations.reset(ONE_ROW, answer.frames)
-            _, _, _, step, n_visited, cell = answer.native.numbers(self._pays)
-            seen = self._seen(answer, step, n_visited, cell)
+            _, _, _, step, n_visited, cells = answer.native.numbers(self._pays)
+            seen = self._seen(answer, step, n_visited, cells)
             self._session.finish()
         return seen
 
@@ -187,15 +187,17 @@ class WildfireEnv(WorldEnv):
             session.begin_step()
             self._answer = answer = session.step(action)
             self._update(self._observations, answer)
-            reward, terminated, truncated, step, n_visited, cell = answer.native.numbers(self._pays)
+            reward, terminated, truncated, step, n_visited, cells = answer.native.numbers(
+                self._pays
+            )
             if self.render_mode is not None:
                 self._trace(answer, as_moves(action, 1, self._spec.n_moves).reshape(-1))
-            observation, info = self._seen(answer, step, n_visited, cell)
+            observation, info = self._seen(answer, step, n_visited, cells)
             session.finish()
         return observation, reward, terminated, truncated, info
 
     def _seen(
-        self, answer: StepAnswer, step: int, n_visited: int, cell: tuple[int, int]
+        self, answer: StepAnswer, step: int, n_visited: int, cells: NDArray[np.int64]
     ) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, step, n_visited)
         # The learner may write to its frame: pictures come from another.
@@ -203,7 +205,7 @@ class WildfireEnv(WorldEnv):
         if self.render_mode == "human":
             self._draw()
         teams = self._teams(self._observations, answer)
-        return self._observations.one(frames, np.array([cell], np.int64), teams), info
+        return self._observations.one(frames, cells, teams), info
 
 
 class WildfireVectorEnv(WorldVectorEnv):

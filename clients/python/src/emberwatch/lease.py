@@ -42,7 +42,7 @@ class Lease:
         #: Where these worlds stood when it was given.
         self.start: Final = start
         #: It knows k of each world.
-        self._native = client.lease(grant.lease, robots)
+        self.native = client.lease(grant.lease, robots)
         self._is_over = False
         self._note(start)
 
@@ -75,7 +75,7 @@ class Lease:
                 tells to where. With code `"episode_over"`: reset that world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
-        return StepAnswer(self._native.step(paths, *place, timeout))
+        return StepAnswer(self.native.step(paths, *place, timeout))
 
     def fly(
         self,
@@ -105,7 +105,7 @@ class Lease:
             EmberwatchError: As `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
-        answer, n_skipped = self._native.fly(paths, *place, accepts_late, timeout)
+        answer, n_skipped = self.native.fly(paths, *place, accepts_late, timeout)
         return StepAnswer(answer), n_skipped
 
     def observe(
@@ -117,7 +117,7 @@ class Lease:
     ) -> StepAnswer:
         """The last results and frames of its robots again, or of some; steps go on from there."""
         place = self._place(robots, team * wire.TEAM_FRAMES)
-        return StepAnswer(self._native.observe(*place, timeout))
+        return StepAnswer(self.native.observe(*place, timeout))
 
     def reset(
         self,
@@ -224,7 +224,7 @@ class Lease:
 
     def _note(self, worlds: tuple[WorldInfo, ...]) -> tuple[WorldInfo, ...]:
         for info in worlds:
-            self._native.note(info.world, info.step)
+            self.native.note(info.world, info.step)
         return worlds
 
     def __enter__(self) -> Self:

@@ -183,7 +183,7 @@ class WildfireMovesEnv(WorldEnv):
         _, _, _, self._step, self._n_visited, self._start = answer.native.numbers(self._pays)
         self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
-        self._flights.begin(ONE_ROW, np.array([self._start], np.int64), states)
+        self._flights.begin(ONE_ROW, self._start, states)
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, self._step, self._n_visited)
@@ -197,7 +197,8 @@ class WildfireMovesEnv(WorldEnv):
     def _draw(self) -> Any:
         made, path = self._flights.made(0), self._path
         if len(made):
-            self._path = fly(self._start, made, self._spec)
+            row, col = self._start[0].tolist()
+            self._path = fly((row, col), made, self._spec)
         picture = super()._draw()
         self._path = path
         return picture

@@ -8,13 +8,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch._native import Flights
+from emberwatch._native import Flights, Windows
 from emberwatch.belief import Filters
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.last_seen import LastSeen
 from emberwatch.prior import prior_of
 from emberwatch.settings import WorldSpec
-from emberwatch.window import N_OF_BELIEF, N_OF_PATH, Windows, of_belief
+from emberwatch.window import N_OF_BELIEF, N_OF_PATH, of_belief
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
 MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "action_mask"]
@@ -74,10 +74,14 @@ class Observations:
         self._filters: Filters | None = None
         channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
         self._windows = {
-            name: Windows(spec, n_rows, window, channels[name])
+            name: Windows(
+                n_rows, spec.height, spec.width, window, channels[name], spec.airspace
+            )
             for name in names
             if name in channels
         }
+        #: Whether frames alone tell what is observed.
+        self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
         self._beliefs = np.empty(0, np.uint8)
         # By observed value, the last for none.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
@@ -96,6 +100,8 @@ class Observations:
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
         """One step of the rows `moved`; `frames` are those of all."""
+        if self._has_no_memory:
+            return
         if self._last_seen is not None:
             self._last_seen.update(moved, frames)
         if self._filters is not None:
@@ -104,11 +110,9 @@ class Observations:
 
     def visit(self, moved: NDArray[np.bool_]) -> None:
         """Some robots have made a move."""
-        if self._flights is not None and self._windows:
-            indices = np.flatnonzero(moved)
-            rows, cols = self._flights.robots[indices].T
+        if self._flights is not None:
             for windows in self._windows.values():
-                windows.visit(indices, rows, cols)
+                windows.visit(self._flights, moved)
 
     def all(
         self,
@@ -135,7 +139,12 @@ class Observations:
         """The observation of the only row; arguments as of `all`."""
         if self._is_plain:
             return self._part(self._names[0], frames, robots, teams)[0]
-        return {name: self._part(name, frames, robots, teams)[0] for name in self._names}
+        return {
+            name: frames[0, ..., np.newaxis]
+            if name == "frame"
+            else self._part(name, frames, robots, teams)[0]
+            for name in self._names
+        }
 
     def _part(
         self,

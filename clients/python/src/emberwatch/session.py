@@ -45,6 +45,19 @@ _LEASE: Final = 3600.0
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
+#: Number of forks between the first process and this one.
+_n_forks = 0
+
+
+def _count_fork() -> None:
+    global _n_forks
+    _n_forks += 1
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_count_fork)
+
+
 class State(Enum):
     """What a session may do next."""
 
@@ -86,9 +99,11 @@ class Session:
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
         self._state = State.CLOSED
-        self._pid, self._turn = os.getpid(), threading.RLock()
+        self._made_after, self._turn = _n_forks, threading.RLock()
         #: Whether test worlds are meant, as in an evaluation.
         self.allows_test_worlds = False
+        # Nobody else moves worlds of which it flies all robots.
+        self._accepts_late = settings.robot is not None
         #: World steps that passed unseen before the last answer, since a path came too late.
         self.n_skipped = 0
         if settings.instance is None:
@@ -97,6 +112,7 @@ class Session:
             with self._connect(settings.instance) as client:
                 self.spec, self._robots = running_spec(settings, n_rows, client.info)
         self.n_rows: Final = len(self._robots)
+        self._first = self._robots.start
         n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
         self.n_worlds: Final = n_worlds
         self._worlds: Final = range(settings.world, settings.world + n_worlds)
@@ -113,9 +129,9 @@ class Session:
     @property
     def turn(self) -> threading.RLock:
         """Lets one thread at a time step or reset; use it in a `with`."""
-        if self._pid != os.getpid():
+        if self._made_after != _n_forks:
             # The thread that held it may not exist in a forked child.
-            self._pid, self._turn = os.getpid(), threading.RLock()
+            self._made_after, self._turn = _n_forks, threading.RLock()
         return self._turn
 
     @property
@@ -195,14 +211,12 @@ class Session:
         given up, and the answer is how the world stands.
         """
         lease = self._opened()
-        robots = None if rows is None else lease.robots[rows.start : rows.stop]
+        first, n_robots = self._first, self.n_rows
+        if rows is not None:
+            first, n_robots = first + rows.start, len(rows)
         try:
-            # Nobody else moves worlds of which it flies all robots.
-            answer, self.n_skipped = lease.fly(
-                paths,
-                robots=robots,
-                accepts_late=self.settings.robot is not None,
-                timeout=self.settings.timeout,
+            answer, self.n_skipped = lease.native.fly(
+                paths, first, n_robots, self._accepts_late, self.settings.timeout
             )
         except LOST as error:
             raise self._lost(error) from None
@@ -210,7 +224,7 @@ class Session:
             self._refused(error)
             raise
         self._state = State.MOVED
-        return answer
+        return StepAnswer(answer)
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
