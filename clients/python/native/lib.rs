@@ -52,6 +52,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
+    module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
+    module.add_function(wrap_pyfunction!(model::built_in, module)?)?;
     module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::grid_of_maps, module)?)?;
     module.add_function(wrap_pyfunction!(model::model_text, module)?)?;

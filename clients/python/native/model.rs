@@ -2,13 +2,27 @@
 
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
+use emberwatch_model::task::Task;
 use emberwatch_model::{CellMap, Description, Model, ModelFile, Pays, parse_color};
+use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
+
+/// The built-in files of a kind by name: `"models"`, `"tasks"`, or `"states"`, the descriptions of recorded states.
+#[pyfunction]
+pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &'static str>> {
+    match kind {
+        "models" => Ok(Model::built_in_files().collect()),
+        "tasks" => Ok(Task::built_in_files().collect()),
+        "states" => Ok(StatesFile::built_in_descriptions().collect()),
+        _ => Err(invalid(py, "kind", "'models', 'tasks' or 'states'", kind)),
+    }
+}
 
 /// The fields of a model file's model by name.
 #[pyfunction]

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from emberwatch.programs import find, unused_instance
 from failures import fails
 from processes import server, stopped
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, NotEnoughMemoryError
-from emberwatch.programs import find, unused_instance
 
 #: Says what an error says.
 HEAD = """

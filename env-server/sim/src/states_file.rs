@@ -74,6 +74,11 @@ impl StatesFile {
         }
     }
 
+    /// The built-in recorded states: name, and text of the description.
+    pub fn built_in_descriptions() -> impl Iterator<Item = (&'static str, &'static str)> {
+        BUILT_IN.iter().map(|(name, _, text)| (*name, *text))
+    }
+
     /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.
     pub fn read(path: &Path) -> Result<Self, StatesError> {
         read(path).map_err(|problem| StatesError {

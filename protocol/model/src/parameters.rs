@@ -67,7 +67,12 @@ impl Model {
 
     /// The names of the built-in models.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
-        BUILT_IN.iter().map(|(name, _)| *name)
+        Self::built_in_files().map(|(name, _)| name)
+    }
+
+    /// The built-in models: name, and text of the file.
+    pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
+        BUILT_IN.into_iter()
     }
 
     /// Reads and checks a model file's text.

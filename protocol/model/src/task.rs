@@ -126,7 +126,12 @@ impl Task {
 
     /// The names of the built-in tasks.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
-        BUILT_IN.iter().map(|(name, _)| *name)
+        Self::built_in_files().map(|(name, _)| name)
+    }
+
+    /// The built-in tasks: name, and text of the file.
+    pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
+        BUILT_IN.into_iter()
     }
 
     /// Whether its hidden states were recorded.

@@ -15,25 +15,33 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from emberwatch import recording
-from emberwatch.client import Client, connect, embed
-from emberwatch.env import WildfireEnv, WildfireVectorEnv
+from emberwatch._native import VERSION
+from emberwatch.client import recording
+from emberwatch.client.client import Client, connect, embed
+from emberwatch.client.lease import Lease
+from emberwatch.client.observer import (
+    Frame,
+    Observer,
+    Outlook,
+    OutlookReader,
+    Truth,
+    TruthReader,
+    observe,
+)
+from emberwatch.client.replies import ServerInfo, ServerStatus, WorldInfo
+from emberwatch.client.wire import RobotResult, StepAnswer, StepResult, WorldResult
+from emberwatch.envs.moves_env import WildfireMovesEnv, WildfireMovesVectorEnv
+from emberwatch.envs.objective_env import WildfireObjectiveEnv, WildfireObjectiveVectorEnv
+from emberwatch.envs.path_env import WildfireEnv, WildfireVectorEnv
 from emberwatch.errors import EmberwatchError, TrainingOnTestWorldsWarning
-from emberwatch.lease import Lease
-from emberwatch.moves_env import WildfireMovesEnv, WildfireMovesVectorEnv
-from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVectorEnv
-from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
-from emberwatch.release import VERSION
-from emberwatch.replies import ServerInfo, ServerStatus, WorldInfo
-from emberwatch.tasks import Task, built_in_tasks
-from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
+from emberwatch.model.tasks import Task, built_in_tasks
 
 if TYPE_CHECKING:
     from emberwatch import benchmark as benchmark
     from emberwatch import planning as planning
     from emberwatch import sb3 as sb3
     from emberwatch import wrappers as wrappers
-    from emberwatch.parallel import WildfireParallelEnv
+    from emberwatch.envs.parallel import WildfireParallelEnv
 
 __all__ = [
     "Client",
@@ -88,14 +96,14 @@ _PREFIXES = {
 def _register(prefix: str, steps: int, n_moves: int, **keywords: Any) -> None:
     """Registers the three environments with these keywords."""
     for module, kind, version, episode in (
-        ("env", "", 0, steps),
+        ("path_env", "", 0, steps),
         ("moves_env", "Moves", 0, n_moves * steps),
         ("objective_env", "Objective", 1, steps),
     ):
         gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
             f"emberwatch/{prefix}{kind}-v{version}",
-            entry_point=f"emberwatch.{module}:Wildfire{kind}Env",
-            vector_entry_point=f"emberwatch.{module}:Wildfire{kind}VectorEnv",
+            entry_point=f"emberwatch.envs.{module}:Wildfire{kind}Env",
+            vector_entry_point=f"emberwatch.envs.{module}:Wildfire{kind}VectorEnv",
             max_episode_steps=episode,
             kwargs=keywords,
         )
@@ -123,7 +131,7 @@ def parallel_env(**keywords: Any) -> WildfireParallelEnv:
     Raises `ModuleNotFoundError` without PettingZoo, which ``pip install emberwatch[teams]`` brings.
     """
     try:
-        from emberwatch.parallel import WildfireParallelEnv
+        from emberwatch.envs.parallel import WildfireParallelEnv
     except ModuleNotFoundError as error:
         needed = "expected PettingZoo: pip install emberwatch[teams]"
         raise ModuleNotFoundError(f"parallel_env: {needed}; got: {error}") from None

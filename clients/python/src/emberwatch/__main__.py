@@ -3,14 +3,14 @@
 import argparse
 from typing import Final
 
-from emberwatch.release import VERSION
+from emberwatch._native import VERSION
 
 _COMMANDS: Final = """
 commands, each with --help:
   emberwatch-server                  simulates worlds
   emberwatch-agent                   explores, learns, compares
   emberwatch-dashboard               shows an instance or a recording in a browser
-  python -m emberwatch.film          films of recordings
+  python -m emberwatch.render.film          films of recordings
   python -m emberwatch.landscape     recorded worlds from rasters of fires
 """
 

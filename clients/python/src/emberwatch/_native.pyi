@@ -50,6 +50,11 @@ class _Spec(Protocol):
     @property
     def description(self) -> _Text | None: ...
 
+VERSION: str
+
+def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
+    """Texts of the built-in files by name; `states`: descriptions of recorded states."""
+
 def check_settings(settings: str) -> str:
     """All settings that a server with these would have; JSON from JSON."""
 
@@ -120,7 +125,8 @@ class Answer:
     def numbers(self, pays: int) -> _Numbers:
         """Reward, terminated, truncated, step, distinct cells visited and cell of the first robot.
 
-        The cell is a new array, `(1, 2)`. `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
+        The cell is a new array, `(1, 2)`. `pays`: which reward, 0 the share, 1 the team's, 2 the
+        marginal one.
         """
 
 def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
@@ -332,7 +338,7 @@ class Windows:
         """Shows the world, `(n_begun, H, W, n_of_world)`, to robots that have visited nothing."""
 
     def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
-        """Some robots have made a move: the cells that their visit has pay hold nothing any more."""
+        """Marks the cells of some robots as visited, and what their visit pays as found."""
 
     def around(self, flights: Flights) -> NDArray[np.uint8]:
         """The windows of all robots, `(n_rows, side, side, channels)`; a new array."""

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import _native
-from emberwatch.airspace import Airspace
-from emberwatch.arguments import as_count
+from emberwatch.common.arguments import as_count
 from emberwatch.errors import invalid
+from emberwatch.model.airspace import Airspace
 
 
 def beam_search(

@@ -20,8 +20,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from emberwatch.envs.vector_base import WorldVectorEnv, info_of
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.vector_base import WorldVectorEnv, info_of
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:

@@ -16,11 +16,11 @@ from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.arguments import as_json
 from emberwatch.belief import Filter
+from emberwatch.belief.prior import PriorKind, prior_of
+from emberwatch.common.arguments import as_json
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
-from emberwatch.prior import PriorKind, prior_of
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):

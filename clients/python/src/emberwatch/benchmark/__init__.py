@@ -12,4 +12,4 @@ from emberwatch.benchmark.policies import Policy as Policy
 from emberwatch.benchmark.report import summary as summary
 from emberwatch.benchmark.rows import Row as Row
 from emberwatch.benchmark.rows import read as read
-from emberwatch.tasks import FIRST_TRAINING_SEED as FIRST_TRAINING_SEED
+from emberwatch.model.tasks import FIRST_TRAINING_SEED as FIRST_TRAINING_SEED

@@ -18,23 +18,24 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch import _native, wire
-from emberwatch.arguments import as_integer, as_seed, told
+from emberwatch import _native
+from emberwatch._native import VERSION
+from emberwatch.belief.merit import RECENT_STEPS
 from emberwatch.benchmark.digest import digest
 from emberwatch.benchmark.policies import Actor, Policy, statistics
 from emberwatch.benchmark.report import Progress
 from emberwatch.benchmark.row_file import Kind, Mark, RowFile
 from emberwatch.benchmark.rows import Row
 from emberwatch.benchmark.tally import Tally
-from emberwatch.client import Client
+from emberwatch.client import wire
+from emberwatch.client.client import Client
+from emberwatch.client.replies import ServerInfo
+from emberwatch.common.arguments import as_integer, as_seed, told
+from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.merit import RECENT_STEPS
 from emberwatch.model import Model
-from emberwatch.observations import OF_BELIEF, OF_TEAM, names_of
-from emberwatch.release import VERSION
-from emberwatch.replies import ServerInfo
-from emberwatch.settings import Settings, WorldArguments
-from emberwatch.tasks import Task, built_in_tasks
+from emberwatch.model.tasks import Task, built_in_tasks
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"

@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch.arguments import as_array, told
 from emberwatch.benchmark.fitting import fits, misfit, shapes
+from emberwatch.common.arguments import as_array, told
 from emberwatch.errors import InvalidArgumentError, invalid
 
 #: Returns the actions of some worlds for their stacked observations, or is a model of SB3.

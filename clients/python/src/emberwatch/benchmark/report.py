@@ -12,7 +12,7 @@ import numpy as np
 
 from emberwatch.benchmark.rows import Row
 from emberwatch.errors import invalid
-from emberwatch.tasks import FIRST_TRAINING_SEED
+from emberwatch.model.tasks import FIRST_TRAINING_SEED
 
 
 class Progress:

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
-from emberwatch.arguments import told
 from emberwatch.benchmark.rows import Row, read, write
+from emberwatch.common.arguments import told
+from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.paths import utf8
 
 #: How long to wait for another writer, and how often to look, seconds. Writers hold the lock for
 #: milliseconds, but `emberwatch-agent compare --csv` holds it until it ends.

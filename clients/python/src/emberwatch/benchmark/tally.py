@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.merit import MeritTally
-from emberwatch.moves import fly
-from emberwatch.observations import cells_of
-from emberwatch.settings import WorldSpec
+from emberwatch.belief.merit import MeritTally
+from emberwatch.envs.observations import cells_of
+from emberwatch.envs.settings import WorldSpec
+from emberwatch.model.moves import fly
 
 
 class Tally:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from emberwatch.arguments import told
+from emberwatch.common.arguments import told
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.sb3 import WildfireVecEnv
 

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape import land
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
@@ -22,7 +23,6 @@ from emberwatch.landscape.layers import Choice
 from emberwatch.landscape.lengths import side
 from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
-from emberwatch.paths import shown, utf8
 
 _NAME: Final = "python -m emberwatch.landscape"
 _EXAMPLES: Final = """

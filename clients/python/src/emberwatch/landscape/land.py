@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
 from emberwatch.landscape.elevation import slopes
@@ -22,7 +23,6 @@ from emberwatch.landscape.terrain import Zone, zones
 from emberwatch.landscape.world import Fill, check_new, write
 from emberwatch.landscape.zoned import Table, check_base, kernels, toml
 from emberwatch.model import Model
-from emberwatch.paths import shown, utf8
 
 _NAME: Final = "python -m emberwatch.landscape land"
 _EXAMPLES: Final = """

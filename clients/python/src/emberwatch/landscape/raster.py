@@ -9,12 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import LIKE, Place
 from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands, is_missing
 from emberwatch.landscape.libraries import library
 from emberwatch.landscape.schedule import Clock
-from emberwatch.paths import utf8
 
 #: First words of the lines before an ESRI ASCII grid's numbers.
 _ASCII_HEADER: Final = frozenset(

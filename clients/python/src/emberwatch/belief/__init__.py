@@ -1,0 +1,160 @@
+"""The Bayes filter for a known model (paper section III.A, masked as in section III.C).
+
+A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5); the transition turns that
+into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent given the
+frames, so this is an approximation even with the true model. `wrappers.BeliefObservation` runs it
+beside an environment.
+
+Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch import _native
+from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
+from emberwatch.errors import invalid
+from emberwatch.model import Model
+
+_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
+
+
+class Filter:
+    """Filter of one world: `correct` with each frame, and `predict` for each step of the world."""
+
+    def __init__(self, model: Model, *, prior: NDArray[np.floating]) -> None:
+        """Begins with the prior: predictor ``u_0``, shape (S, H, W), each cell a distribution."""
+        self._belief = _distribution(prior, n_states=model.n_states)
+        _, height, width = self._belief.shape
+        self._transition = Transition(model, height=height, width=width)
+        self._likelihood = np.ascontiguousarray(model.observation_matrix)
+
+    @property
+    def belief(self) -> NDArray[np.float64]:
+        """A copy, shape (S, H, W): the posterior after `correct`, the predictor after `predict`."""
+        return self._belief.copy()
+
+    def correct(self, frame: NDArray[np.uint8]) -> None:
+        """Bayes' rule on the observed cells (eq. 5); the others keep their belief.
+
+        ``p = B(y) u / (b(y)' u)`` with ``b(y)`` the column of the observation matrix for ``y``, and
+        ``B(y)`` the diagonal matrix of it. An impossible frame leaves the belief as it was.
+
+        Args:
+            frame: Observed values below O, 255 where nothing was observed; shape (H, W).
+        """
+        if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
+            expected = f"shape {self._belief.shape[1:]} and type uint8"
+            raise invalid("frame", expected, f"{frame.shape} and {frame.dtype}")
+        _native.correct(self._belief[:, np.newaxis], self._likelihood, frame[np.newaxis])
+
+    def predict(self) -> None:
+        """The predictor of the next step, ``u_{k+1} = Phi(p_k)`` (eq. 6)."""
+        self._belief = self._transition.apply(self._belief)
+
+    def entropy(self) -> NDArray[np.float64]:
+        """Shannon entropy of each cell in nats (eq. 14), shape (H, W), 0 to log S."""
+        return entropy(self._belief)
+
+
+class Filters:
+    """The filters of many worlds, stepped together. Beliefs have shape (S, n_worlds, H, W)."""
+
+    def __init__(self, model: Model, prior: NDArray[np.floating], n_worlds: int) -> None:
+        """`prior`, shape (S, H, W), is that of each world."""
+        self._prior = _distribution(prior, n_states=model.n_states)[:, np.newaxis]
+        _, _, height, width = self._prior.shape
+        self._transition = Transition(model, height=height, width=width, n_worlds=n_worlds)
+        self._likelihood = np.ascontiguousarray(model.observation_matrix)
+        #: The posterior ``p_k`` given the last frames.
+        self.posterior = np.repeat(self._prior, n_worlds, axis=1)
+        #: The predictor ``u_{k+1}`` of what the next paths will meet.
+        self.predictor = self.posterior
+
+    def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
+        """Begins with the prior in some worlds, and corrects it; `frames` are those of all."""
+        chosen = list(indices)
+        belief = np.repeat(self._prior, len(chosen), axis=1)
+        _native.correct(belief, self._likelihood, frames[chosen])
+        self.posterior[:, chosen] = belief
+        self.predictor = self._transition.apply(self.posterior)
+
+    def update(self, frames: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
+        """One step of the worlds `moved`; `frames`, `(n_worlds, H, W)`, are those of all."""
+        if moved.all():
+            belief = self.predictor
+            _native.correct(belief, self._likelihood, frames)
+            self.posterior = belief
+        else:
+            belief = np.ascontiguousarray(self.predictor[:, moved])
+            _native.correct(belief, self._likelihood, frames[moved])
+            self.posterior[:, moved] = belief
+        self.predictor = self._transition.apply(self.posterior)
+
+
+class Transition:
+    """The operator ``Phi`` on beliefs (eqs. 2-4) for one model on one grid.
+
+    ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
+    (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
+    over ``m`` (eq. 3).
+
+    Where the weights see the cell's own state ``o``, ``phi[m | o]`` has the weights of ``o``, its
+    centre tap sees ``o`` itself, and ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``: a mean
+    field, which takes neighbours for independent, as the filter does.
+
+    It keeps work space: share none between threads.
+    """
+
+    def __init__(
+        self, model: Model, *, height: int, width: int, n_worlds: int | None = None
+    ) -> None:
+        """Beliefs have shape (S, H, W), or with `n_worlds` (S, n_worlds, H, W)."""
+        worlds = () if n_worlds is None else (n_worlds,)
+        self._shape = (model.n_states, *worlds, height, width)
+        self._operator = _native.Transition(model.toml, height, width)
+
+    def apply(self, belief: NDArray[np.floating]) -> NDArray[np.float64]:
+        """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
+        if belief.shape != self._shape:
+            raise invalid("belief", f"shape {self._shape}", belief.shape)
+        belief = np.asarray(belief, np.float64)
+        n_states, *_, height, width = self._shape
+        beliefs = belief.reshape(n_states, -1, height, width)
+        return self._operator.apply(beliefs).reshape(self._shape)
+
+
+def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
+    return np.tile(model.initial[:, None, None], (1, height, width))
+
+
+def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
+    return np.full((model.n_states, height, width), 1.0 / model.n_states)
+
+
+def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
+    total = np.zeros(belief.shape[1:])
+    # State by state, as memory for all is got and given back in each call, which takes most time.
+    for probability in belief:
+        total += probability * np.log(np.where(probability > 0.0, probability, 1.0))
+    return np.maximum(0.0, 0.0 - total)
+
+
+def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:
+    """A copy of the prior, each cell's sum exactly one."""
+    belief = np.array(prior, dtype=np.float64, order="C")
+    if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
+        raise invalid("prior", f"shape ({n_states}, H, W)", belief.shape)
+    total = belief.sum(axis=0)
+    fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
+    if not fine.all():
+        row, col = (int(i) for i in np.argwhere(~fine)[0])
+        got = belief[:, row, col].tolist()
+        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
+    belief /= total
+    return belief

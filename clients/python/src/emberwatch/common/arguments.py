@@ -1,0 +1,166 @@
+"""What callers hand in: seeds, choices, moves, each checked before anything is sent."""
+
+import json
+import operator
+from collections.abc import Iterable, Mapping
+from enum import Enum
+from os import PathLike, fspath
+from typing import Any, SupportsIndex, TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emberwatch import _native
+from emberwatch.common import codes
+from emberwatch.common.paths import utf8
+from emberwatch.errors import invalid
+
+_Value = TypeVar("_Value")
+
+
+def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
+    """All settings that a server with these would have, by their names in `config/server.toml`."""
+    return json.loads(_native.check_settings(json.dumps(settings)))
+
+
+def as_setting(name: str, value: object) -> bool | int | str:
+    """The value of a setting, as JSON and programs take it."""
+    if isinstance(value, np.generic):
+        value = cast("object", value.item())
+    if isinstance(value, bool | int):
+        return value
+    if isinstance(value, str | PathLike):
+        return utf8(name, cast("str | PathLike[str]", value))
+    raise invalid(name, "an integer, True or False, text or a path", told(value))
+
+
+def as_seed(seed: object) -> int:
+    """Checks a world's seed: an integer of Python, NumPy or another library."""
+    number = as_integer(seed)
+    if number is not None and 0 <= number < 2**64:
+        return number
+    raise invalid("seed", "an integer within 0 to 2**64 - 1", told(seed))
+
+
+def as_integer(value: object) -> int | None:
+    """One integer of any library, as Python's own; None: it is none."""
+    if isinstance(value, int | np.integer):
+        return int(cast("int", value))
+    try:
+        return None if _is_masked(value) else operator.index(cast("SupportsIndex", value))
+    except Exception:  # of any kind: what a library says of an array that is elsewhere, or of many
+        return None
+
+
+def as_count(value: object, subject: str, least: int, most: int) -> int:
+    """Checks an integer that is not below `least` nor above `most`."""
+    number = as_integer(value)
+    if number is not None and least <= number <= most:
+        return number
+    raise invalid(subject, f"an integer within {least} to {most}", told(value))
+
+
+def as_seeds(
+    seeds: Iterable[int | None] | None, worlds: Iterable[int]
+) -> list[dict[str, int | None]]:
+    """Checks the seeds of a reset, one for each world, and names them as its request does."""
+    chosen = list(worlds)
+    given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
+    if len(given) != len(chosen):
+        raise invalid("seeds", len(chosen), len(given))
+    return [
+        {"world": world, "seed": None if seed is None else as_seed(seed)}
+        for world, seed in zip(chosen, given, strict=True)
+    ]
+
+
+def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
+    """What a caller gives for each world."""
+    try:
+        return list(values)
+    except Exception as error:  # of any kind, as of `as_array`
+        got = f"{type(values).__name__}: {error}"
+        raise invalid(subject, "one for each world", got) from None
+
+
+def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
+    """An array of any library as NumPy's own, without masked values, which mean nothing."""
+    if type(value) is np.ndarray:
+        return value
+    if isinstance(value, int | np.generic):
+        return np.asarray(value)
+    try:
+        given = np.asarray(value)
+    except Exception as error:  # of any kind: the library's own words, as of an array on a GPU
+        raise invalid(subject, expected, f"{type(value).__name__}: {error}") from None
+    is_sequence = isinstance(value, list | tuple)
+    if any(map(_is_masked, cast("list[object]", value))) if is_sequence else _is_masked(value):
+        raise invalid(subject, expected, "masked values")
+    return given
+
+
+def _is_masked(value: object) -> bool:
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(cast("Any", value)))
+
+
+def told(value: object) -> str:
+    """What a caller gave, or what it says instead of showing itself."""
+    try:
+        return repr(value)
+    except Exception as error:
+        return f"{type(value).__name__}: {error}"
+
+
+def as_json(value: object) -> Any:
+    """A keyword as JSON has it, which means the same: for `spec.to_json`, and so for Minari."""
+    if isinstance(value, PathLike):
+        return fspath(cast("PathLike[str]", value))
+    if isinstance(value, np.generic | np.ndarray):
+        return cast("NDArray[Any]", value).tolist()
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Mapping):
+        return {key: as_json(kept) for key, kept in cast("Mapping[Any, object]", value).items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in cast("list[object]", value)]
+    return value
+
+
+def as_choice(action: object, n_choices: int) -> int:
+    """Checks an action that is one integer below `n_choices`."""
+    expected = f"one integer, 0 to {n_choices - 1}"
+    given = as_array(action, "action", expected)
+    if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
+        return int(given.item())
+    raise invalid("action", expected, told(action))
+
+
+def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:
+    """Checks actions, one integer below `n_choices` for each world, and makes them bytes."""
+    chosen = _native.choices(actions, n_worlds, n_choices)
+    if chosen is not None:
+        return chosen
+    given = as_array(actions, "action", "an array")
+    if given.shape != (n_worlds,) or given.dtype.kind not in "iu":
+        got = f"{given.dtype} {given.shape}"
+        raise invalid("action", f"integers of shape ({n_worlds},)", got)
+    if (given < 0).any() or (given >= n_choices).any():
+        wrong = int(np.argmax((given < 0) | (given >= n_choices)))
+        raise invalid("action", f"0 to {n_choices - 1}", f"{given[wrong]} for world {wrong}")
+    return given.astype(np.uint8)
+
+
+def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
+    """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes."""
+    is_read = type(paths) is np.ndarray
+    given = paths if is_read else as_array(paths, "action", "an array of moves")
+    if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
+        one = f" or ({n_moves},)" if n_worlds == 1 else ""
+        raise invalid("action", f"shape ({n_worlds}, {n_moves}){one}", given.shape)
+    if given.dtype.kind not in "iu":
+        raise invalid("action", "integers", given.dtype)
+    # One shift leaves something of each value below 0 or above 3.
+    if (given >> 2).any():
+        where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= codes.N_MOVES))[0])
+        raise invalid("action", f"moves 0 to {codes.N_MOVES - 1}", f"{given[where]} at {where}")
+    return given.astype(np.uint8)

@@ -1,0 +1,187 @@
+"""`emberwatch/WildfireObjective-v1`: one step chooses what the next path is for.
+
+For one world, or for many.
+"""
+
+from os import PathLike
+from typing import Any, Unpack
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from emberwatch.client.wire import StepAnswer
+from emberwatch.common.arguments import as_choice, as_choices
+from emberwatch.envs.base import ONE_ROW, WorldEnv
+from emberwatch.envs.plans import Estimator, FirstBelief, Plans, PlansOwner
+from emberwatch.envs.session import Session
+from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
+from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+
+
+class WildfireObjectiveEnv(PlansOwner, WorldEnv):
+    """The paper's high-level decision: what the next path of the robot is for.
+
+    ## Description
+
+    The world is that of `WildfireEnv`. The environment keeps the belief about it, plans a path for
+    each of eight objectives, and describes what each path promises. A learner chooses which of them
+    is flown: it takes the place of the paper's deep Q-network (section III.E).
+
+    ## Action Space
+
+    `Discrete(8)`, by the names in `objectives`: exploit what pays most; the same with some entropy
+    beside it (two weights); the belief's entropy alone; cells that were not seen for long; what
+    pays most over three paths; the region that promises most; the region not seen for longest.
+
+    ## Observation Space
+
+    `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
+    `feature_names` names the 26 numbers, docs/environments/objective.md explains them. One network
+    can score each row by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of them.
+
+    ## Starting State
+
+    As `WildfireEnv`, with the first belief that `prior` names, or the learned one. With
+    ``reset(options={"resume": True})`` the belief is the one that was left for the world's present
+    step, or else is made anew from the frames of the episode that are still kept.
+
+    ## Rewards, Episode End, Information
+
+    As `WildfireEnv`.
+
+    ## Arguments
+
+    As `WildfireEnv` without `observation`, `reward` and `robot`, in worlds of one robot, and
+
+    * `estimator`: what keeps the belief. `"known_model"` is the paper's Bayes filter;
+      `"learned_filter"` one with learned parameters, which finds several times as many fires where
+      they are rare; `"learned_own_filter"` one that learned a kernel for each state of the cell
+      itself. Each of them has a spatial one, whose corrections reach neighbouring cells:
+      `"spatial_filter"`, `"learned_spatial_filter"`, `"learned_own_spatial_filter"`.
+      `"neural_belief"` is a network from what was seen in each cell. By default the checkpoint's,
+      without one the known model's filter.
+    * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
+    * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
+      second), `"initial"` or `"uniform"`.
+
+    With `instance`, beliefs and plans are kept here, too: other clients see the beliefs as those of
+    `emberwatch-agent`, and `close` leaves them to whoever flies next. A server that hides its model
+    needs `model`, or a `checkpoint`.
+
+    ## Vectorized environment
+
+    `gymnasium.make_vec("emberwatch/WildfireObjective-v1", num_envs=64)` is
+    `WildfireObjectiveVectorEnv`: all worlds are planned for at once, on several threads.
+
+    ## Version History
+
+    * v1: eight plans with features, on a belief of choice; v0 chose among states and entropy.
+    """
+
+    @shows_keywords
+    def __init__(
+        self,
+        *,
+        estimator: Estimator | None = None,
+        checkpoint: str | PathLike[str] | None = None,
+        prior: FirstBelief = "simulated",
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """See the class."""
+        session = Session(Settings.of(WildfireObjectiveEnv, world))
+        super().__init__(session)
+        self._plans = Plans(session, estimator, checkpoint, prior)
+        self.action_space = self._plans.action_space
+        self.observation_space = self._plans.space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begins an episode; see `WildfireEnv`."""
+        with self._session.turn:
+            answer = self._begin(seed, options)
+            self._plans.begin(ONE_ROW, answer.results, answer.frames)
+            seen = self._seen(answer)
+            self._session.finish()
+        return seen
+
+    def step(
+        self, action: np.integer[Any] | int
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Flies the path planned for an objective.
+
+        Raises:
+            EmberwatchError: As `WildfireEnv.step`.
+        """
+        choice = np.array([as_choice(action, int(self._plans.action_space.n))], np.uint8)
+        with self._session.turn:
+            self._session.begin_step()
+            path = self._plans.paths(choice)
+            answer = self._session.step(path)
+            self._plans.see(ONE_ROW, choice, answer.results, answer.frames)
+            if self.render_mode is not None:
+                self._trace(answer, path[0])
+            observation, info = self._seen(answer)
+            reward, terminated, truncated, *_ = answer.native.numbers(1)
+            self._session.finish()
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        self._plans.close(None if self._answer is None else self._answer.results)
+        super().close()
+
+    def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        self._answer = answer
+        _, _, _, step, n_visited, _ = answer.native.numbers(1)
+        info = self._describe(answer, step, n_visited)
+        if self.render_mode == "human":
+            self._draw()
+        return self._plans.features[0], info
+
+
+class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
+    """Many worlds of `WildfireObjectiveEnv`, stepped and planned for together.
+
+    As `WildfireVectorEnv`; arguments are those of `WildfireObjectiveEnv`, and `num_envs`,
+    `max_episode_steps`, `autoreset_mode`.
+    """
+
+    @shows_keywords
+    def __init__(
+        self,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        estimator: Estimator | None = None,
+        checkpoint: str | PathLike[str] | None = None,
+        prior: FirstBelief = "simulated",
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """See the class."""
+        session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
+        self._plans = Plans(session, estimator, checkpoint, prior)
+        super().__init__(
+            session,
+            self._plans,
+            self._plans.action_space,
+            pays=1,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._plans.close(self._results)
+        super().close_extras(**kwargs)
+
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        return as_choices(actions, self.num_envs, int(self._plans.action_space.n))
+
+    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+        self._exchange(self._plans.paths(actions), flown)
+        self._plans.see(flown, actions, self._results, self._frames)
+        return self._columns.rewards.copy()
+
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        self._plans.begin(begun, self._results, self._frames)

@@ -1,0 +1,262 @@
+"""What a learner sees: which parts, as which spaces."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, Literal, TypeAlias, cast
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch._native import Flights, Windows
+from emberwatch.belief import Filters
+from emberwatch.belief.prior import prior_of
+from emberwatch.client import wire
+from emberwatch.envs.last_seen import LastSeen
+from emberwatch.envs.settings import WorldSpec
+from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
+from emberwatch.errors import InvalidArgumentError, invalid
+
+Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
+MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "action_mask"]
+
+#: One part makes a plain observation, several make a flat dictionary.
+Parts: TypeAlias = Part | Sequence[Part]
+MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
+
+#: Cells along a side of the parts `local` and `recent`, unless told otherwise.
+WINDOW: Final = 15
+
+#: Parts that a filter is needed for, those from memory of frames, and those about other robots.
+OF_BELIEF: Final = frozenset(("belief", "local"))
+_OF_MEMORY: Final = frozenset(("age", "recent"))
+OF_TEAM: Final = frozenset(("team", "others"))
+
+
+class Observations:
+    """Observations of some robots, in rows: all of some worlds, or a single one."""
+
+    def __init__(
+        self,
+        parts: str | Sequence[str],
+        spec: WorldSpec,
+        n_rows: int = 1,
+        flights: Flights | None = None,
+        window: int = WINDOW,
+        *,
+        first: int = 0,
+    ) -> None:
+        """With `flights`, there are the parts of a path that is not complete.
+
+        `first`: which robot of its world is the first row.
+        """
+        known = _spaces(spec, None if flights is None else window)
+        names = names_of(parts)
+        if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
+            raise invalid("observation", f"one or several of {', '.join(known)}", repr(parts))
+        self._names, self._is_plain = names, isinstance(parts, str)
+        self._spec, self._n_rows, self._flights = spec, n_rows, flights
+        self._first = first
+        #: Whether there are parts about other robots.
+        self.shows_team = bool(OF_TEAM & set(names))
+        if OF_BELIEF & set(names) and spec.model is None:
+            needs = "a server that reveals its model"
+            if spec.is_recorded:
+                needs = "simulated worlds, as recorded ones have no model"
+            raise InvalidArgumentError(f"observation: expected {needs}, for the belief")
+        #: The space of one robot's observation.
+        self.space = (
+            known[names[0]]
+            if self._is_plain
+            else spaces.Dict({name: known[name] for name in names})
+        )
+        grid = (spec.height, spec.width, spec.n_observations)
+        self._last_seen = LastSeen(n_rows, *grid) if _OF_MEMORY & set(names) else None
+        self._filters: Filters | None = None
+        channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
+        self._windows = {
+            name: Windows(n_rows, spec.height, spec.width, window, channels[name], spec.airspace)
+            for name in names
+            if name in channels
+        }
+        #: Whether frames alone tell what is observed.
+        self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
+        self._beliefs = np.empty(0, np.uint8)
+        # By observed value, the last for none.
+        self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
+
+    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """Forgets all in rows whose episode has begun, or been resumed with a frame.
+
+        `frames` are those of all rows, `(n_rows, H, W)`.
+        """
+        if self._last_seen is not None:
+            self._last_seen.reset(begun, frames)
+        if OF_BELIEF & set(self._names):
+            self._filters = self._filters or self._first_beliefs()
+            self._filters.reset(np.flatnonzero(begun).tolist(), frames)
+        self._show(begun)
+
+    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """One step of the rows `moved`; `frames` are those of all."""
+        if self._has_no_memory:
+            return
+        if self._last_seen is not None:
+            self._last_seen.update(moved, frames)
+        if self._filters is not None:
+            self._filters.update(frames, moved)
+        self._show(moved)
+
+    def visit(self, moved: NDArray[np.bool_]) -> None:
+        """Some robots have made a move."""
+        if self._flights is not None:
+            for windows in self._windows.values():
+                windows.visit(self._flights, moved)
+
+    def all(
+        self,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None = None,
+    ) -> Any:
+        """The observations of all rows, stacked.
+
+        Args:
+            frames: Of all rows; taken as they are.
+            robots: Row and column of each; taken as they are.
+            teams: Team frames and all robots of the worlds, where the rows are not all of them.
+        """
+        parts = {name: self._part(name, frames, robots, teams) for name in self._names}
+        return parts[self._names[0]] if self._is_plain else parts
+
+    def one(
+        self,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None = None,
+    ) -> Any:
+        """The observation of the only row; arguments as of `all`."""
+        if self._is_plain:
+            return self._part(self._names[0], frames, robots, teams)[0]
+        return {
+            name: frames[0, ..., np.newaxis]
+            if name == "frame"
+            else self._part(name, frames, robots, teams)[0]
+            for name in self._names
+        }
+
+    def _part(
+        self,
+        name: str,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None,
+    ) -> NDArray[Any]:
+        if name == "frame":
+            return frames[..., np.newaxis]
+        if name == "image":
+            unseen = np.uint8(self._spec.n_observations)
+            return self._one_hot[np.where(frames == wire.UNOBSERVED, unseen, frames)]
+        if name == "robot":
+            return robots
+        if name == "team":
+            seen = team_frames(frames, self._spec.n_robots) if teams is None else teams.frames
+            return np.repeat(seen, self._n_rows // len(seen), axis=0)[..., np.newaxis]
+        if name == "others":
+            return self._others(robots if teams is None else cells_of(teams.robots))
+        if self._last_seen is not None and name == "age":
+            return self._last_seen.ages[..., np.newaxis].copy()
+        if self._filters is not None and name == "belief":
+            return self._beliefs.copy()
+        assert self._flights is not None
+        if name in self._windows:
+            return self._windows[name].around(self._flights)
+        if name == "visited":
+            return self._flights.visited[..., np.newaxis]
+        if name == "action_mask":
+            return self._flights.masks
+        return self._flights.n_made
+
+    def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Where the other robots of each row's world are; `robots` are all of the worlds."""
+        spec = self._spec
+        shown = np.zeros((self._n_rows, spec.height, spec.width, 1), np.uint8)
+        own = np.remainder(self._first + np.arange(self._n_rows), spec.n_robots)
+        n_same = self._n_rows * spec.n_robots // len(robots)  # rows of a world
+        rows, others = np.nonzero(own[:, np.newaxis] != np.arange(spec.n_robots))
+        cells = robots[rows // n_same * spec.n_robots + others]
+        shown[rows, cells[:, 0], cells[:, 1]] = 255
+        return shown
+
+    def _first_beliefs(self) -> Filters:
+        spec = self._spec
+        assert spec.model is not None
+        grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
+        return Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
+
+    def _show(self, rows: NDArray[np.bool_]) -> None:
+        """Shows what is known before a path to the rows that begin one."""
+        if self._filters is not None and "belief" in self._names:
+            beliefs = np.rint(255.0 * self._filters.predictor.transpose(1, 2, 3, 0))
+            self._beliefs = beliefs.astype(np.uint8)
+        for name, windows in self._windows.items():
+            if name == "recent" and self._last_seen is not None:
+                windows.begin(rows, self._last_seen.fading(rows))
+            elif self._filters is not None and self._spec.model is not None:
+                windows.begin(rows, of_belief(self._spec.model, self._filters, rows))
+
+
+def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
+    """What the robots of each world saw together, `(n_worlds, H, W)`."""
+    return frames.reshape(-1, n_robots, *frames.shape[1:]).min(axis=1)  # 255 is nothing
+
+
+def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:
+    """Row and column of each robot, a new array."""
+    return np.stack((robots["row"], robots["col"]), axis=1).astype(np.int64)
+
+
+def names_of(parts: object) -> tuple[str, ...]:
+    """The names of parts that a caller asks for, as given; unchecked."""
+    if isinstance(parts, str):
+        return (parts,)
+    return tuple(map(str, cast("Iterable[object]", parts))) if isinstance(parts, Iterable) else ()
+
+
+def of_row(observations: Any, index: int) -> Any:
+    """The observation of one row among stacked ones."""
+    if isinstance(observations, dict):
+        parts = cast("dict[str, NDArray[Any]]", observations)
+        return {name: part[index] for name, part in parts.items()}
+    return observations[index]
+
+
+def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]:
+    def image(n_channels: int) -> spaces.Box:
+        return spaces.Box(0, 255, (spec.height, spec.width, n_channels), np.uint8)
+
+    n_states = 1 if spec.model is None else spec.model.n_states
+    known: dict[str, spaces.Space[Any]] = {
+        "frame": image(1),
+        "image": image(spec.n_observations + 1),
+        "robot": spaces.MultiDiscrete([spec.height, spec.width]),
+        "age": image(1),
+        "belief": image(n_states),
+        "team": image(1),
+        "others": image(1),
+    }
+    if window is None:
+        return known
+    if not isinstance(window, int | np.integer) or window < 3 or not window & 1:  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise invalid("window", "an odd number from 3 on", repr(window))
+
+    def around(n_of_world: int) -> spaces.Box:
+        return spaces.Box(0, 255, (window, window, n_of_world + N_OF_PATH), np.uint8)
+
+    return {
+        **known,
+        "local": around(N_OF_BELIEF),
+        "recent": around(spec.n_observations),
+        "visited": image(1),
+        "move": spaces.Discrete(spec.n_moves),
+        "action_mask": spaces.Box(0, 1, (wire.N_MOVES,), np.int8),
+    }

@@ -1,0 +1,87 @@
+"""What environments of one world and of many tell of their session."""
+
+from copy import copy
+from typing import Any
+
+from gymnasium.envs.registration import EnvSpec
+
+from emberwatch.client.lease import Lease
+from emberwatch.common.arguments import as_json
+from emberwatch.envs.session import Session
+from emberwatch.envs.settings import WorldSpec
+from emberwatch.model import Model
+
+
+class SessionOwner:
+    """What environments of one world and of many tell of their session."""
+
+    _session: Session
+    _made_by: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gymnasium.make` made it of; its keywords are as JSON has them."""
+        return self._made_by
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._made_by = made_by = copy(spec)
+        if made_by is not None:
+            made_by.kwargs = as_json(made_by.kwargs)
+
+    @property
+    def model(self) -> Model | None:
+        """The model behind the worlds; None if a running server hides it, or they were recorded."""
+        return self._session.spec.model
+
+    @property
+    def world_spec(self) -> WorldSpec:
+        """What is known of the worlds before the first reset."""
+        return self._session.spec
+
+    @property
+    def n_moves(self) -> int:
+        """Moves of a path, T."""
+        return self._session.spec.n_moves
+
+    @property
+    def burn_in(self) -> int:
+        """Steps that the worlds are simulated before k = 0."""
+        return self._session.spec.burn_in
+
+    @property
+    def instance(self) -> str:
+        """The server's instance name, once the environment has been reset."""
+        return self._session.instance
+
+    @property
+    def lease(self) -> Lease:
+        """Under which it flies, once it has been reset: for snapshots and forks of its worlds.
+
+        After `lease.restore` or `lease.fork` go on with ``reset(options={"resume": True})``.
+        """
+        return self._session.lease
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._session.is_open
+
+    def allow_test_worlds(self) -> None:
+        """Resets on a task's test seeds are meant, and warn no more."""
+        self._session.allows_test_worlds = True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which only a closed environment has: no two may act on the same worlds."""
+        return state_of(self, self.is_open, "gymnasium.make(env.spec)")
+
+
+def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
+    """What a copy or a pickle of a closed environment holds; `maker` is how to make another."""
+    if is_open:
+        raise TypeError(
+            f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
+            f"that acts on worlds: close it first, or make another with {maker}; "
+            "Client.snapshot and Lease.fork copy worlds"
+        )
+    return vars(environment).copy()

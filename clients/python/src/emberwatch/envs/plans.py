@@ -1,0 +1,208 @@
+"""Beliefs about worlds of one robot each, and the plans there that a learner chooses among.
+
+`WildfireObjectiveEnv` makes an environment of it.
+"""
+
+from os import PathLike
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch import _native
+from emberwatch.client.wire import RobotResult, StepResult, WorldResult
+from emberwatch.common.arguments import told
+from emberwatch.common.paths import utf8
+from emberwatch.envs.session import Session
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+
+Estimator: TypeAlias = Literal[
+    "known_model",
+    "spatial_filter",
+    "learned_filter",
+    "learned_spatial_filter",
+    "learned_own_filter",
+    "learned_own_spatial_filter",
+    "neural_belief",
+]
+FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
+
+_NAMES: Final = _native.option_names()
+
+#: The names of the options.
+OBJECTIVES: Final = tuple(_NAMES[0])
+
+#: The names of the numbers that describe the plan of each.
+FEATURES: Final = tuple(_NAMES[1])
+
+
+class Plans:
+    """What options promise and fly in the worlds of a session, by the beliefs about them."""
+
+    def __init__(
+        self,
+        session: Session,
+        estimator: Estimator | None,
+        checkpoint: str | PathLike[str] | None,
+        prior: FirstBelief,
+    ) -> None:
+        """Arguments are those of `WildfireObjectiveEnv`, checked here."""
+        if session.settings.robot is not None or session.spec.n_robots > 1:
+            raise InvalidArgumentError(
+                "robots, robot: expected worlds of one robot, as options are planned for one"
+            )
+        given: dict[str, object] = {
+            "estimator": estimator,
+            "prior": prior,
+            "checkpoint": checkpoint,
+        }
+        for name, value in given.items():
+            kinds = (str, PathLike) if name == "checkpoint" else str
+            if not isinstance(value, kinds) and (name == "prior" or value is not None):
+                expected = "a path" if name == "checkpoint" else "the name of one"
+                raise invalid(name, expected, told(value))
+        self._session = session
+        path = None if checkpoint is None else utf8("checkpoint", checkpoint)
+        self._arguments = estimator, path, prior
+        #: Of one world.
+        self.action_space: Final = spaces.Discrete(len(OBJECTIVES))
+        shape = len(OBJECTIVES), len(FEATURES)
+        self.space: Final = spaces.Box(-np.inf, np.inf, shape, np.float32)
+        #: What keeps the beliefs.
+        self.estimator: Final = self._made().estimator
+        self._native: _native.Options | None = None
+        #: Where it shows beliefs, if it does.
+        self._watched: tuple[str, int] | None = None
+        #: What the plans of all worlds promise; a new array after each step.
+        self.features = np.zeros((session.n_worlds, *shape), np.float32)
+        self._paths = np.zeros((session.n_worlds, len(OBJECTIVES), 0), np.uint8)
+
+    def begin(
+        self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
+    ) -> None:
+        """Episodes of some worlds have begun, or are gone on with from where they stand.
+
+        There the belief is the one that was left for the present step, or made of the frames that
+        are kept. Results and frames are those of all worlds.
+        """
+        settings = self._session.settings
+        watched = None if settings.instance is None else (settings.instance, settings.world)
+        native = self._native
+        if native is None or watched != self._watched:
+            self._native = native = self._made(watched)
+            self._watched = watched
+        worlds = np.flatnonzero(begun).tolist()
+        native.begin(worlds, results["world"]["seed"][begun].tolist())
+        known = [world for world in worlds if self._goes_on(native, world, results[world])]
+        if known:
+            chosen = results[known].view(np.uint8)
+            self.features, self._paths = native.plan(known, chosen, None, None)
+        new = begun.copy()
+        new[known] = False
+        self._plan(new, results, frames)
+
+    def paths(self, choices: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The moves of each world's choice, `(n_worlds, T)`."""
+        return self._paths[np.arange(len(choices)), choices]
+
+    def see(
+        self,
+        moved: NDArray[np.bool_],
+        choices: NDArray[np.uint8],
+        results: NDArray[np.void],
+        frames: NDArray[np.uint8],
+    ) -> None:
+        """What some worlds show after a step, by the choices that were flown; of all worlds."""
+        self._plan(moved, results, frames, choices)
+
+    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """Nothing: `begin` needs the results, too."""
+
+    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """Nothing: `see` needs the results, too."""
+
+    def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The observations of all worlds, stacked."""
+        return self.features
+
+    def close(self, results: NDArray[np.void] | None) -> None:
+        """Leaves the beliefs to those who fly next in a running server's worlds."""
+        native, self._native = self._native, None
+        if native is None:
+            return
+        try:
+            session = self._session
+            is_left = session.settings.instance is not None and session.is_open
+            if is_left and results is not None and not session.is_unfinished:
+                self._leave(native, results)
+        finally:
+            native.close()
+
+    def _leave(self, native: _native.Options, results: NDArray[np.void]) -> None:
+        lease = self._session.lease
+        for world, result in enumerate(results):
+            at = WorldResult(*result["world"].item()), RobotResult(*result["robot"].item())
+            try:
+                left = native.left(world)
+                if left is not None:
+                    lease.leave_belief(StepResult(*at), *left, robot=lease.robots[world])
+            except EmberwatchError:
+                return  # a server that is gone, or keeps none: the next one recalls frames
+
+    def _plan(
+        self,
+        worlds: NDArray[np.bool_],
+        results: NDArray[np.void],
+        frames: NDArray[np.uint8],
+        flown: NDArray[np.uint8] | None = None,
+    ) -> None:
+        assert self._native is not None
+        if not worlds.any():
+            return
+        if not worlds.all():
+            results, frames = results[worlds], frames[worlds]
+            flown = None if flown is None else flown[worlds]
+        self.features, self._paths = self._native.plan(
+            np.flatnonzero(worlds).tolist(),
+            results.view(np.uint8),
+            frames,
+            None if flown is None else flown.tolist(),
+        )
+
+    def _goes_on(self, native: _native.Options, world: int, result: np.void) -> bool:
+        """Gives a belief what is known before the present step; whether that is in it, too."""
+        step = int(result["world"]["step"])
+        if step == 0:
+            return False
+        left = self._session.left_belief(world)
+        if left is not None and native.take_over(world, left.kind, left.data):
+            return True
+        for past in self._session.history(world, step):
+            native.see([world], past.results.view(np.uint8), past.frames)
+        return False
+
+    def _made(self, watched: tuple[str, int] | None = None) -> _native.Options:
+        session = self._session
+        return _native.Options(session.spec, session.n_worlds, *self._arguments, watched)
+
+
+class PlansOwner:
+    """What environments of one world and of many tell of their plans."""
+
+    _plans: Plans
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """The names of the actions."""
+        return OBJECTIVES
+
+    @property
+    def feature_names(self) -> tuple[str, ...]:
+        """The names of an observation's columns."""
+        return FEATURES
+
+    @property
+    def estimator(self) -> str:
+        """What keeps the belief."""
+        return self._plans.estimator

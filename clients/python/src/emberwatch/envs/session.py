@@ -1,0 +1,466 @@
+"""The robots behind an environment, in worlds of its own or of a running server.
+
+Worlds of its own are simulated in this process. Nothing is opened before the first reset, so that
+an environment may be made in one process and used in a forked child, as Gymnasium's
+`AsyncVectorEnv` does.
+"""
+
+import inspect
+import os
+import threading
+import warnings
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from enum import Enum
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emberwatch.client import wire
+from emberwatch.client.client import Client, connect, embed_settings
+from emberwatch.client.connection import RESET_TIMEOUT
+from emberwatch.client.lease import Lease
+from emberwatch.client.observer import Newest, Present, Truth, TruthReader
+from emberwatch.client.replies import LeftBelief
+from emberwatch.client.wire import StepAnswer, WorldResult
+from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
+from emberwatch.errors import (
+    EmberwatchError,
+    LeaseLostError,
+    RequestTimeoutError,
+    ServerGoneError,
+    TrainingOnTestWorldsWarning,
+    invalid,
+)
+from emberwatch.model.tasks import FIRST_TRAINING_SEED
+
+# Seconds after its last use that a lease on a running server ends: learners may think long, and
+# the server notices a dead holder at once anyway.
+_LEASE: Final = 3600.0
+
+#: Errors after which the worlds are no longer held, or may stand elsewhere than expected.
+LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
+
+
+#: Number of forks between the first process and this one.
+_n_forks = 0
+
+
+def _count_fork() -> None:
+    global _n_forks
+    _n_forks += 1
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_count_fork)
+
+
+class State(Enum):
+    """What a session may do next."""
+
+    #: Nothing is open: the next reset opens it.
+    CLOSED = "closed"
+    #: The worlds stand where the last step or reset has shown them.
+    READY = "ready"
+    #: A step or reset has begun, and has changed nothing yet: a refusal makes it READY again.
+    BEGUN = "begun"
+    #: A step or reset has changed worlds, and the environment has not processed all of it yet.
+    MOVED = "moved"
+    #: A reset follows a call that was interrupted: the server may still work on its request.
+    TORN = "torn"
+    #: A request was not answered in time.
+    TIMED_OUT = "timed out"
+    #: The episode of a world that others fly in is over.
+    OVER = "over"
+
+
+#: States in which, between calls, worlds may have moved unseen: only a reset or resume may follow.
+_UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIMED_OUT))
+
+
+class Session:
+    """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
+
+    It flies all robots of its worlds, or one robot of a world that others fly in. An environment
+    holds `turn` during each step and reset, since threads may share the environment. It calls
+    `begin_step` or `begin_reset` first and `finish` last. Ctrl-C or a signal handler may interrupt
+    anything in between; then the state stays unfinished, and steps are refused.
+    """
+
+    def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
+        """`n_rows`: number of robots; None: all robots of one world."""
+        self.settings: Final = settings
+        self._asked_rows = n_rows
+        self._client: Client | None = None
+        self._lease: Lease | None = None
+        self._truth: Newest[Truth] | Present | None = None
+        self._has_warned = False
+        self._state = State.CLOSED
+        self._made_after, self._turn = _n_forks, threading.RLock()
+        #: Whether test worlds are meant, as in an evaluation.
+        self.allows_test_worlds = False
+        # Nobody else moves worlds of which it flies all robots.
+        self._accepts_late = settings.robot is not None
+        #: World steps that passed unseen before the last answer, since a path came too late.
+        self.n_skipped = 0
+        if settings.instance is None:
+            self.spec, self._robots = own_spec(settings, n_rows)
+        else:
+            with self._connect(settings.instance) as client:
+                self.spec, self._robots = running_spec(settings, n_rows, client.info)
+        self.n_rows: Final = len(self._robots)
+        self._first = self._robots.start
+        n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
+        self.n_worlds: Final = n_worlds
+        self._worlds: Final = range(settings.world, settings.world + n_worlds)
+        if settings.truth and settings.instance and n_worlds > wire.TRUTH_BUFFER:
+            raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", n_worlds)
+        described = self.spec.described
+        if described is not None and not described.reward.any():
+            kind = "model" if self.spec.description is None else "description"
+            _warn(
+                f"{kind} {described.name!r}: no state pays: every reward will be 0; give a state "
+                f"a `reward` in the {kind}'s file"
+            )
+
+    @property
+    def turn(self) -> threading.RLock:
+        """Lets one thread at a time step or reset; use it in a `with`."""
+        if self._made_after != _n_forks:
+            # The thread that held it may not exist in a forked child.
+            self._made_after, self._turn = _n_forks, threading.RLock()
+        return self._turn
+
+    @property
+    def instance(self) -> str:
+        """Name of the running server."""
+        if self.settings.instance is None:
+            raise invalid("instance", "an environment made with instance=...", "one without")
+        return self._opened().client.instance
+
+    @property
+    def lease(self) -> Lease:
+        """The lease under which it flies."""
+        return self._opened()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._lease is not None
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether worlds may have moved unseen: then all are reset, or resumed."""
+        return self._state in _UNFINISHED
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the lock: a copy waits for no thread of this session."""
+        return {name: value for name, value in vars(self).items() if name != "_turn"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _turn=threading.RLock())
+
+    def begin_step(self) -> None:
+        """Begins a step; refuses one before a reset, and after a call that did not finish."""
+        if self._state is not State.READY:
+            raise self._no_step()
+        self._state = State.BEGUN
+
+    def begin_reset(self) -> None:
+        """Begins a reset of all worlds, or of some."""
+        self._state = State.TORN if self.is_unfinished else State.BEGUN
+
+    def finish(self) -> None:
+        """The environment has processed what `begin_step` or `begin_reset` began."""
+        self._state = State.READY
+
+    def refuse_over(self) -> EmberwatchError:
+        """The error for one robot of a world that is over; steps raise it until the next reset."""
+        self._state = State.OVER
+        return self._no_step()
+
+    def resume(self) -> StepAnswer:
+        """Continues from where the worlds stand, such as after another agent."""
+        if self.settings.instance is None and not self.is_open:
+            self._state = State.CLOSED
+            raise invalid("options", "a reset before resume=True", "the first one")
+        self._open(0)
+        with self._classified():
+            return self._observe()
+
+    def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
+
+        If the server has ended, a reset of all worlds opens another one.
+        """
+        may_move = self.is_open and len(indices) == self.n_worlds
+        try:
+            return self._begin(indices, seeds)
+        except ServerGoneError:
+            if not may_move:
+                raise
+        return self._begin(indices, seeds)
+
+    def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
+        """Flies paths with all robots, or with the robots of some consecutive worlds.
+
+        Waits for slow teammates as long as the server lives. A path that came too late for them is
+        given up, and the answer is how the world stands.
+        """
+        lease = self._opened()
+        first, n_robots = self._first, self.n_rows
+        if rows is not None:
+            first, n_robots = first + rows.start, len(rows)
+        try:
+            answer, self.n_skipped = lease.native.fly(
+                paths, first, n_robots, self._accepts_late, self.settings.timeout
+            )
+        except LOST as error:
+            raise self._lost(error) from None
+        except EmberwatchError as error:
+            self._refused(error)
+            raise
+        self._state = State.MOVED
+        return StepAnswer(answer)
+
+    def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
+        """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
+        if self._truth is None:
+            raise EmberwatchError("truth: expected an open session made with truth=True", "closed")
+        first = answer.first_robot // self.spec.n_robots - self.settings.world
+        moments = [WorldResult(*world.item()).moment for world in answer.worlds]
+        truths = self._truth.at(moments, self.settings.timeout, first)
+        return np.stack([truth.states for truth in truths])[answer.world_of]
+
+    def teams(self, answer: StepAnswer) -> StepAnswer:
+        """Results of all robots in the answer's worlds, and the frame of each world's team."""
+        # Of one robot's world, which may stand elsewhere by now.
+        shape, client = self.spec.shape, self._client
+        if client is None:
+            raise not_reset()
+        first = answer.first_robot // shape.n_robots * shape.n_robots
+        step = int(answer.worlds["step"][0])
+        return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
+
+    def left_belief(self, row: int) -> LeftBelief | None:
+        """The belief that was left for a robot's present step."""
+        if self._client is None:
+            raise not_reset()
+        try:
+            return self._client.belief(self._robots[row], timeout=self.settings.timeout)
+        except LOST as error:
+            raise self._lost(error) from None
+
+    def history(self, row: int, step: int) -> Iterator[StepAnswer]:
+        """The steps of a robot's episode before this one, from the first on whose are all kept."""
+        client, robot, past = self._client, self._robots[row], 0
+        while client is not None and past < step:
+            try:
+                yield client.recall(past, robot, timeout=self.settings.timeout)
+            except LOST as error:
+                raise self._lost(error) from None
+            except EmberwatchError as error:
+                if error.code != "not_kept":
+                    raise
+                if past > 0:
+                    return
+                past = error.detail - 1
+            past += 1
+
+    def close(self) -> None:
+        """Gives the worlds back; a new reset opens it again.
+
+        May be called again, also after it was interrupted.
+        """
+        self._state = State.CLOSED
+        lease, self._lease = self._lease, None
+        try:
+            # Worlds of its own end with their client.
+            if lease is not None and self.settings.instance is not None:
+                lease.release(timeout=self.settings.timeout)
+        except EmberwatchError:
+            pass  # lost, or the server is gone: nothing is held any more
+        finally:
+            for part in (self._truth, self._client):
+                if part is not None:
+                    part.close()
+            self._truth = self._client = None
+
+    def _open(self, seed: int) -> None:
+        """Opens the worlds and holds them, or waits until an unfinished call is over.
+
+        `seed` is the seed of world 0, if the worlds are its own.
+        """
+        if self.is_open:
+            if self._state is State.TORN:
+                with self._classified():
+                    self._settle()
+            return
+        settings = self.settings
+        self.close()  # what an interrupted call has left
+        try:
+            if settings.instance is None:
+                chosen = {"seed": seed, **settings.of_server(self.n_worlds)}
+                self._client = client = embed_settings(chosen, warns=False)
+                self._truth = Present(client.truths) if settings.truth else None
+            else:
+                self._client = client = self._connect(settings.instance)
+                self._check_unchanged(client)
+                if settings.truth:
+                    self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
+            self._lease = self._acquire(client, settings.takeover)  # from here on it is open
+            self._state = State.MOVED
+        except BaseException:
+            self.close()
+            raise
+
+    def _acquire(self, client: Client, takeover: bool) -> Lease:
+        return client.acquire(
+            self._robots.start,
+            self.n_rows,
+            takeover=takeover,
+            ttl=None if self.settings.instance is None else _LEASE,
+            timeout=RESET_TIMEOUT,
+        )
+
+    def _settle(self) -> None:
+        """Waits until the server has finished an interrupted step or reset."""
+        client = self._client
+        assert client is not None
+        # A server that does not answer is not waited for as long as a burn-in may take.
+        client.status(timeout=self.settings.timeout)
+        try:
+            # Answered after the burn-in of a reset; paths under the old lease are refused by then.
+            self._lease = self._acquire(client, takeover=False)
+        except EmberwatchError as error:
+            if error.code == "busy":
+                words = f"lease lost to pid {error.detail}, which took the robots over"
+                raise LeaseLostError(words, detail=error.detail) from None
+            raise
+        self._state = State.MOVED
+
+    def _connect(self, instance: str) -> Client:
+        return connect(instance, timeout=self.settings.timeout, wait=self.settings.timeout)
+
+    def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        self._warn_of_test_worlds(seeds)
+        self._open((seeds[0] - indices[0]) & (2**64 - 1))
+        with self._classified():
+            lease = self._opened()
+            lease.reset(seeds, worlds=[self._worlds[index] for index in indices])
+            self._state = State.MOVED
+            answer = self._observe()
+        self._warn_of_barren(answer)
+        return answer
+
+    def _warn_of_barren(self, answer: StepAnswer) -> None:
+        """Warns once of worlds in which there is nothing to find."""
+        worlds = answer.worlds
+        barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
+        if self._has_warned or self.spec.is_recorded or not len(barren):
+            return
+        self._has_warned = True
+        _warn(
+            f"no cell of world {barren[0]} (of {len(barren)} of {len(worlds)} worlds) is in the "
+            "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
+            "model='wildfire-small'"
+        )
+
+    def _warn_of_test_worlds(self, seeds: Sequence[int]) -> None:
+        task = self.spec.task
+        if (
+            task is None
+            or self.allows_test_worlds
+            or not any(it in task.test_seeds for it in seeds)
+        ):
+            return
+        tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
+        # Of this line, wherever the reset is: Python shows it once in a process.
+        warnings.warn(
+            f"task {task.name!r}: an episode begins on a test world, as seeds {tests.start} to "
+            f"{tests.stop - 1} do; train on seeds from {others} on, with reset(seed={others}) or a "
+            f"trainer's seed={others}; to test, use emberwatch.benchmark.evaluate, or ignore "
+            "emberwatch.TrainingOnTestWorldsWarning with warnings.filterwarnings",
+            TrainingOnTestWorldsWarning,
+            stacklevel=1,
+        )
+
+    def _lost(self, error: EmberwatchError) -> EmberwatchError:
+        """Closes what is gone, so that a reset opens it again; remembers a timeout."""
+        if isinstance(error, RequestTimeoutError):
+            self._state = State.TIMED_OUT
+        else:
+            self.close()
+        return error
+
+    def _refused(self, error: EmberwatchError) -> None:
+        """Makes the session ready again after a refusal, if nothing has changed."""
+        if self._state is State.BEGUN and error.code not in ("late", "early"):
+            self._state = State.READY
+
+    @contextmanager
+    def _classified(self) -> Generator[None]:
+        """Updates the state from the errors of a reset or resume."""
+        try:
+            yield
+        except LOST as error:
+            raise self._lost(error) from None
+        except EmberwatchError as error:
+            self._refused(error)
+            raise
+
+    def _no_step(self) -> EmberwatchError:
+        if not self.is_unfinished and self._state is not State.OVER:
+            return not_reset()
+        if self._state is State.OVER:
+            return EmberwatchError(
+                "the episode of the world is over: a reset is for a client that holds all its "
+                "robots",
+                "episode_over",
+            )
+        what, code = "did not finish (Ctrl-C or an error)", "interrupted"
+        if self._state is State.TIMED_OUT:
+            what, code = "timed out", "closed"
+        return EmberwatchError(
+            f"an earlier step or reset {what}, and the world may have moved: reset, or continue "
+            "from where it stands with reset(options={'resume': True})",
+            code,
+        )
+
+    def _opened(self) -> Lease:
+        if self._lease is None:
+            raise not_reset()
+        return self._lease
+
+    def _observe(self) -> StepAnswer:
+        return self._opened().observe(timeout=self.settings.timeout)
+
+    def _check_unchanged(self, client: Client) -> None:
+        """Another server may serve the instance by now."""
+        spec, _ = running_spec(self.settings, self._asked_rows, client.info)
+        if spec != self.spec:
+            raise invalid(
+                f"instance {client.instance!r}",
+                f"the server as it was when the environment was made, {_told(self.spec)}",
+                f"{_told(spec)} or another model: make the environment again",
+            )
+
+
+def _told(spec: WorldSpec) -> WorldSpec:
+    return replace(spec, model=None, description=None)
+
+
+def _warn(message: str) -> None:
+    """Warns at the caller's line: the first outside this package and Gymnasium."""
+    frame, level = inspect.currentframe(), 1
+    while frame and frame.f_globals["__name__"].partition(".")[0] in ("emberwatch", "gymnasium"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
+
+
+def not_reset() -> EmberwatchError:
+    """The error of an environment without an episode."""
+    return EmberwatchError("the environment is closed: reset it first", "closed")

@@ -1,0 +1,368 @@
+"""The keywords of every environment: their names, defaults and checks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
+from inspect import Parameter, Signature, signature
+from pathlib import Path
+from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
+
+import numpy as np
+
+from emberwatch import _native
+from emberwatch.client.connection import STEP_TIMEOUT
+from emberwatch.client.replies import ServerInfo
+from emberwatch.client.wire import Shape
+from emberwatch.common.arguments import as_setting, check_settings
+from emberwatch.common.paths import local, utf8
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.model import Description, Model
+from emberwatch.model.airspace import MAX_RADIUS, Airspace, Zones
+from emberwatch.model.tasks import Task, built_in_tasks
+
+#: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
+SEEDS: Final = 2**53
+
+#: Keywords whose settings of a server have other names.
+_KEYWORDS: Final = {
+    "moves": "n_moves",
+    "worlds": "num_envs",
+    "worlds times robots": "num_envs",
+    "cells times robots": "height times width times robots",
+}
+
+_Init = TypeVar("_Init")
+
+
+class WorldArguments(TypedDict, total=False):
+    """The keywords, as type checkers see them; `Settings` has the defaults."""
+
+    instance: str | None
+    world: int
+    robot: int | None
+    robots: int | None
+    takeover: bool
+    task: str | Path | None
+    model: str | Path | None
+    states: str | Path | None
+    states_symmetries: bool
+    states_offset: int
+    height: int | None
+    width: int | None
+    n_moves: int | None
+    burn_in: int | None
+    sensor_radius: int | None
+    start: str | None
+    truth: bool
+    timeout: float
+    render_mode: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """The keywords; `WildfireEnv` explains them. None: as the server has it."""
+
+    instance: str | None = None
+    world: int = 0
+    robot: int | None = None
+    robots: int | None = None
+    takeover: bool = False
+    task: str | Path | None = None
+    model: str | Path | None = None
+    states: str | Path | None = None
+    states_symmetries: bool = False
+    states_offset: int = 0
+    height: int | None = None
+    width: int | None = None
+    n_moves: int | None = None
+    burn_in: int | None = None
+    sensor_radius: int | None = None
+    start: str | None = None
+    truth: bool = False
+    timeout: float = STEP_TIMEOUT
+    render_mode: str | None = None
+    #: Whether infos and pictures show the hidden states; `truth` may be for rewards alone.
+    reveals: bool = False
+
+    def __post_init__(self) -> None:
+        kinds = get_type_hints(Settings)
+        for each in fields(self):
+            value: Any = getattr(self, each.name)
+            kind = kinds[each.name]
+            if isinstance(value, np.generic):
+                value = cast("Any", value.item())
+                object.__setattr__(self, each.name, value)
+            is_kind = isinstance(value, int | float if kind is float else kind)
+            if not is_kind or (isinstance(value, bool) and kind is not bool):
+                raise invalid(each.name, each.type, repr(value))
+        for name in ("task", "model", "states", "start"):
+            if getattr(self, name) is not None:
+                utf8(name, getattr(self, name))
+        if self.sensor_radius is not None and not 0 <= self.sensor_radius <= MAX_RADIUS:
+            raise invalid("sensor_radius", f"0 to {MAX_RADIUS}, or None", self.sensor_radius)
+        if self.robots is not None and self.robots < 1:
+            raise invalid("robots", "at least 1", self.robots)
+        if not self.timeout > 0:
+            raise invalid("timeout", "seconds above 0", self.timeout)
+
+    @classmethod
+    def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
+        """The settings from what is left of an environment's keywords.
+
+        Raises:
+            TypeError: If a keyword is unknown; names the most similar one, and all.
+        """
+        parameters = signature(environment).parameters.values()
+        known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}
+        for name in world:
+            if name not in known:
+                alike = get_close_matches(name, known, 1)
+                hint = f" (did you mean {alike[0]!r}?)" if alike else ""
+                # In Python's words, by which TorchRL knows what to leave out.
+                raise TypeError(
+                    f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
+                    f"known are {', '.join(sorted(known))}"
+                )
+        asked = cls(**world)
+        return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
+
+    def of_server(self, n_worlds: int) -> dict[str, Any]:
+        """The settings of these worlds, by their names in `config/server.toml`."""
+        given = {
+            "worlds": n_worlds,
+            "robots": self.robots,
+            "task": self.task,
+            "model": self.model,
+            "states": self.states,
+            "height": self.height,
+            "width": self.width,
+            "moves": self.n_moves,
+            "burn_in": self.burn_in,
+            "sensor_radius": self.sensor_radius,
+            "start": self.start,
+            "publish_truth": self.truth,
+            # Refused where there is no states file.
+            "states_symmetries": self.states_symmetries or None,
+            "states_offset": self.states_offset or None,
+        }
+        return {name: as_setting(name, it) for name, it in given.items() if it is not None}
+
+    def check(self, n_worlds: int) -> dict[str, Any]:
+        """All settings of a server with these worlds. A refusal names the keyword."""
+        try:
+            return check_settings(self.of_server(n_worlds))
+        except InvalidArgumentError as error:
+            setting, colon, words = str(error).partition(":")
+            words = f"{_KEYWORDS.get(setting, setting)}{colon}{words}"
+            raise InvalidArgumentError(words) from None
+
+
+def shows_keywords(init: _Init) -> _Init:
+    """Puts the keywords and their defaults in the place of ``**world``, for `help` and editors."""
+    plain: Any = init
+    own = signature(plain).parameters.values()
+    kinds = get_type_hints(Settings)
+    shared = [
+        Parameter(
+            each.name, Parameter.KEYWORD_ONLY, default=each.default, annotation=kinds[each.name]
+        )
+        for each in fields(Settings)
+        if each.name in WorldArguments.__annotations__
+    ]
+    plain.__signature__ = Signature(
+        [*(each for each in own if each.kind is not each.VAR_KEYWORD), *shared]
+    )
+    return init
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldSpec:
+    """What an environment must know of its worlds before they are there."""
+
+    #: None if a running server hides it, or the worlds were recorded.
+    model: Model | None
+    height: int
+    width: int
+    n_moves: int
+    n_observations: int
+    burn_in: int
+    #: Where robots may fly and what they see.
+    airspace: Airspace
+    #: Which land each cell is, for pictures; None where all are alike, or a server hides it.
+    zones: Zones | None
+    #: Robots of a world.
+    n_robots: int
+    #: Whether hidden states come from a states file, not from a model.
+    is_recorded: bool
+    #: What recorded worlds say of their states; None if a running server hides it.
+    description: Description | None = None
+    #: The task that the worlds are, if it is known.
+    task: Task | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def described(self) -> Description | None:
+        """What states are called and pay."""
+        return self.description or self.model
+
+    @property
+    def shape(self) -> Shape:
+        return Shape(self.n_robots, self.height, self.width)
+
+
+def draw_seed(generator: np.random.Generator) -> int:
+    """The world's seed of a reset without one: the environment's own generator goes on."""
+    return int(generator.integers(SEEDS))
+
+
+def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
+    """Describes the worlds that this process will simulate, and numbers the robots to fly.
+
+    `n_rows`: number of robots; None: all robots of one world.
+    """
+    shared = ("takeover", False), ("world", 0), ("robot", None)
+    for name, default in shared:
+        if getattr(settings, name) != default:
+            raise InvalidArgumentError(
+                f"{name}: applies only with instance=..., the name of a running server; without "
+                "it, the environment simulates worlds of its own"
+            )
+    task = None if settings.task is None else Task.named(settings.task)
+    n_robots = settings.robots or (1 if task is None else task.robots)
+    robots = _robots(settings, n_rows, n_robots)
+    checked = settings.check(len(robots) // n_robots)
+    described = _described(checked)
+    spec = WorldSpec(
+        model=described if isinstance(described, Model) else None,
+        height=checked["height"],
+        width=checked["width"],
+        n_moves=checked["moves"],
+        n_observations=described.n_observations,
+        burn_in=checked["burn_in"],
+        airspace=described.airspace,
+        zones=described.zones if isinstance(described, Model) else None,
+        n_robots=checked["robots"],
+        is_recorded=bool(checked["states"]),
+        description=described if checked["states"] else None,
+        task=task,
+    )
+    return spec, robots
+
+
+def running_spec(
+    settings: Settings, n_rows: int | None, info: ServerInfo
+) -> tuple[WorldSpec, range]:
+    """A running server's worlds, which the settings must agree with, and the robots to fly."""
+    own = ("start", None), ("states", None), ("states_symmetries", False), ("states_offset", 0)
+    for name, default in own:
+        if getattr(settings, name) != default:
+            raise InvalidArgumentError(
+                f"{name}: expected {default}, as the running server has its own"
+            )
+    task = built_in_tasks().get(info.task or "")
+    if settings.task is not None:
+        task = _check_task(settings.task, info)
+    if settings.model is not None and info.model is not None:
+        raise InvalidArgumentError("model: expected None, as the running server reveals its own")
+    known = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
+    known |= {"robots": info.n_robots, "sensor_radius": info.airspace.radius}
+    for name, has in known.items():
+        asked = getattr(settings, name)
+        if asked not in (None, has):
+            raise invalid(name, f"{has}, as the server has, or None", asked)
+    robots = _robots(settings, n_rows, info.n_robots)
+    first, last = settings.world, (robots.stop - 1) // info.n_robots
+    if not 0 <= first <= last < info.n_worlds:
+        got = f"{first} to {last}; start the server with --worlds N for more"
+        raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", got)
+    if settings.truth and not info.publish_truth:
+        raise invalid("truth", "a server started with --publish-truth", "one without")
+    model = None if info.model is None else Model.from_toml(info.model)
+    if settings.model is not None:
+        model = Model.named(settings.model).with_radius(info.airspace.radius)
+        has, got = (info.n_observations, info.airspace), (model.n_observations, model.airspace)
+        if has != got:
+            raise invalid("model", f"the server's sensor and no-fly cells, {has}", f"{got}")
+    description = info.recorded_states
+    if description is not None:
+        description = description.with_radius(info.airspace.radius)
+    spec = WorldSpec(
+        model=model,
+        height=info.height,
+        width=info.width,
+        n_moves=info.n_moves,
+        n_observations=info.n_observations,
+        burn_in=info.burn_in,
+        airspace=info.airspace,
+        zones=info.zones,
+        n_robots=info.n_robots,
+        is_recorded=info.recorded_world is not None,
+        description=description,
+        task=task,
+    )
+    return spec, robots
+
+
+def _check_task(asked: str | Path, info: ServerInfo) -> Task:
+    """The task; refuses a server of another, and one whose worlds are not the task's."""
+    task = Task.named(asked)
+    if task.name != info.task:
+        raise invalid("task", f"{info.task!r}, as the server has, or None", repr(task.name))
+    own = check_settings({"task": utf8("task", asked)})
+    has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
+    has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
+    for name, got in has.items():
+        if own[name] != got:
+            raise invalid(f"{name} of task {task.name!r}", f"{got}, as the server has", own[name])
+    described = _described(own)
+    if described.sensor_radius != info.airspace.radius:
+        expected = f"{info.airspace.radius}, as the server has"
+        name = f"sensor_radius of task {task.name!r}"
+        raise invalid(name, expected, described.sensor_radius)
+    served: Description | None = info.recorded_states
+    if served is not None:
+        served = served.with_radius(info.airspace.radius)
+    elif info.model is not None:
+        served = Model.from_toml(info.model)
+    if served not in (None, described):
+        raise invalid(f"states of task {task.name!r}", "those that the server has", described.name)
+    return task
+
+
+def _described(checked: dict[str, Any]) -> Description:
+    """What states are called and how they are seen, by settings that the server has accepted."""
+    if checked["states"]:
+        described: Description = _description(local(checked["states"]))
+    else:
+        described = Model.checked(local(checked["model"]))
+    radius = checked["sensor_radius"]
+    return described.with_radius(radius) if radius >= 0 else described
+
+
+def _description(states: str) -> Description:
+    """That of recorded worlds whose states the server has accepted."""
+    text = _native.built_in("states").get(states)
+    if text is None:
+        place = Path(states)
+        path = place / "states.toml" if place.is_dir() else place.with_suffix(".toml")
+        text = path.read_text("utf-8")
+    return Description.from_toml(text)
+
+
+def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
+    """The numbers of the robots to fly: one, or all of some worlds."""
+    first = settings.world * n_robots
+    if settings.robot is not None:
+        if n_rows != 1:
+            raise InvalidArgumentError("robot: expected None, as all robots of a world are flown")
+        if not 0 <= settings.robot < n_robots:
+            raise invalid("robot", f"0 to {n_robots - 1}", settings.robot)
+        return range(first + settings.robot, first + settings.robot + 1)
+    n_rows = n_robots if n_rows is None else n_rows
+    if n_rows // n_robots * n_robots != n_rows:
+        raise InvalidArgumentError(
+            f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
+            "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "
+            f"num_envs, a multiple of {n_robots}, got {n_rows}"
+        )
+    return range(first, first + n_rows)

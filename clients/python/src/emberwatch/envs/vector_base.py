@@ -1,0 +1,412 @@
+"""What the vector environments share: episodes, their ends, infos, pictures.
+
+Rows are robots: all of the first world, then those of the next. The robots of a world begin and end
+their episodes together.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from emberwatch._native import columns
+from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
+from emberwatch.common.arguments import as_array, as_integer, as_seed, told
+from emberwatch.envs.base import (
+    NOTHING_TO_DRAW,
+    WorldEnv,
+    as_options,
+    wants_to_resume,
+)
+from emberwatch.envs.observations import Observations, of_row
+from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.plans import Plans
+from emberwatch.envs.session import Session
+from emberwatch.envs.settings import Settings, draw_seed
+from emberwatch.envs.view import View
+from emberwatch.errors import invalid
+from emberwatch.model.moves import fly
+
+
+class Columns(NamedTuple):
+    """The numbers of all rows, `(n_rows,)` each."""
+
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    steps: NDArray[np.int64]
+    n_visited: NDArray[np.int64]
+    #: Row and column of each robot, `(n_rows, 2)`.
+    cells: NDArray[np.int64]
+    #: Whether any episode is over.
+    is_over: bool
+
+
+class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
+    SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]
+):
+    """Many robots, stepped together."""
+
+    # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
+    closed = True
+
+    def __init__(
+        self,
+        session: Session,
+        observations: Observations | Plans,
+        action_space: spaces.Space[Any],
+        *,
+        pays: int,
+        max_episode_steps: int | None,
+        autoreset_mode: AutoresetMode | str,
+    ) -> None:
+        """`pays`: which of `base.REWARDS` a step pays."""
+        if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
+            max_episode_steps = None
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise invalid("max_episode_steps", "at least 1 or None", max_episode_steps)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self._session, self._spec = session, session.spec
+        spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
+        self._observations = observations
+        self._views = [View(mode, spec) for _ in range(num_envs)]
+        self._max_steps = max_episode_steps
+        self._reveals = session.settings.reveals
+        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        self.num_envs = num_envs
+        self.render_mode = mode
+        self.single_observation_space = observations.space
+        self.observation_space = batch_space(observations.space, num_envs)
+        self.single_action_space = action_space
+        self.action_space = batch_space(action_space, num_envs)
+        self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
+        self._pays = pays
+        self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
+        self._results = np.zeros(num_envs, RESULT_DTYPE)
+        #: The numbers of the results.
+        self._columns = self._columns_of(self._results)
+        self._every = np.ones(num_envs, np.bool_)
+        self._none = np.zeros(num_envs, np.bool_)
+        self._elapsed = np.zeros(num_envs, np.int64)
+        self._over, self._has_ended = self._none, False
+        #: Robots that completed a path in this step; None: none of them.
+        self._exchanged: NDArray[np.bool_] | None = None
+        self._truths: NDArray[np.uint8] | None = None
+        self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
+        self.closed = False
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins episodes in all worlds, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: For world 0, the others follow; or one per row, of which each world takes its
+                first; None: each world's own generator goes on.
+            options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
+                robots of a world; or `resume`, see `WildfireEnv`.
+        """
+        rest = as_options(options)
+        mask = self._check_mask(rest.pop("reset_mask", None))
+        seeds = self._check_seeds(seed)
+        resumes = wants_to_resume(rest, seed)
+        with self._session.turn:
+            if not mask.all() and not self.is_open:
+                raise gymnasium.error.ResetNeeded(
+                    "reset_mask: expected a reset of all worlds before"
+                )
+            if not mask.all() and self._session.is_unfinished:
+                raise gymnasium.error.ResetNeeded(
+                    "reset_mask: expected all worlds, as an earlier step or reset did not finish"
+                )
+            self.closed = False
+            self._session.begin_reset()
+            chosen = np.flatnonzero(mask).tolist()
+            if resumes:
+                self._take(self._session.resume())
+                self._reset_episodes(chosen)
+            else:
+                self._restart(chosen, seeds)
+            outcome = self._seen(), self._infos(mask)
+            self._session.finish()
+        return outcome
+
+    def step(
+        self, actions: NDArray[np.integer[Any]]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """One step of each robot.
+
+        Raises:
+            gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
+            EmberwatchError: As `WildfireEnv.step`.
+        """
+        chosen = self._check_actions(actions)
+        with self._session.turn:
+            over, has_ended = self._over, self._has_ended
+            if has_ended and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+                raise gymnasium.error.ResetNeeded(
+                    f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
+                    "options={'reset_mask': ...}"
+                )
+            self._session.begin_step()
+            flown = ~over if has_ended else self._every
+            self._exchanged = None
+            rewards = self._fly(chosen, flown)
+            self._elapsed += flown
+            if has_ended:
+                rewards = np.where(flown, rewards, 0.0)
+                self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
+            outcome = self._outcome(flown, rewards)
+            self._session.finish()
+        return outcome
+
+    def render(self) -> tuple[Any, ...] | None:
+        """The picture of each robot, as `WildfireEnv.render` draws it."""
+        if self.render_mode is None or not self.is_open:
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
+            return None
+        if self.render_mode == "human":
+            return (None,) * self.num_envs
+        return tuple(self.draw(slice(row, row + 1)) for row in range(self.num_envs))
+
+    def draw(self, rows: slice) -> Any:
+        """The picture of some robots of one world, and of what they saw together."""
+        row: int = rows.start
+        frame, cells = self.seen(rows)
+        robots = [(at[0], at[1]) for at in cells.tolist()]
+        paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
+        truth = self._truths[row] if self._truths is not None and self._reveals else None
+        return self._views[row].draw(frame, robots, paths, truth)
+
+    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """What some robots of one world saw together, `(H, W)`, and their cells; new arrays."""
+        return self._frames[rows].min(axis=0), self._robots()[rows]
+
+    @property
+    def results(self) -> NDArray[np.void]:
+        """The last result of each robot and its world, for reports, not for learners.
+
+        `(num_envs,)` of `wire.RESULT_DTYPE`.
+        """
+        return self._results.copy()
+
+    @property
+    def truths(self) -> NDArray[np.uint8] | None:
+        """The hidden states of each robot's world, where they are read; as `results`.
+
+        `(num_envs, H, W)`; not to be written to.
+        """
+        return self._truths
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._session.close()
+        for view in self._views:
+            view.close()
+
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        raise NotImplementedError
+
+    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Steps the rows `flown`; of the rewards, those of the others do not count."""
+        raise NotImplementedError
+
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        """Episodes have begun in some rows, or go on."""
+
+    def _robots(self) -> NDArray[np.int64]:
+        """Row and column of each robot, a new array."""
+        return self._columns.cells.copy()
+
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        """The cells of a robot's path, where there is a render mode."""
+        return self._paths[row]
+
+    def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
+        """Flies whole paths in some rows, in one message where they are consecutive."""
+        if moved is self._every or moved.all():
+            self._take(self._session.step(paths))
+        elif moved.any():
+            self._frames = self._frames.copy()  # the learner has the others
+            for run in _runs(moved):
+                self._exchange_run(paths, run)
+        self._exchanged = moved
+        self._observations.update(moved, self._frames)
+        if self.render_mode is not None:
+            for row in np.flatnonzero(moved).tolist():
+                robot = self._results["robot"][row]
+                start = int(robot["start_row"]), int(robot["start_col"])
+                self._paths[row] = fly(start, paths[row], self._spec)
+
+    def _exchange_run(self, paths: NDArray[np.uint8], run: range) -> None:
+        chosen = slice(run.start, run.stop)
+        answer = self._session.step(paths[chosen], run)
+        self._frames[chosen], self._results[chosen] = answer.frames, answer.results
+        self._columns = self._columns_of(self._results)
+        if self._truths is not None:
+            self._truths[chosen] = self._session.truth(answer)
+
+    def _restart(self, rows: list[int], seeds: Sequence[int | None]) -> None:
+        """Begins episodes in the worlds of some rows; `seeds` are those of all worlds."""
+        n_robots = self._spec.n_robots
+        worlds, chosen = [row // n_robots for row in rows[::n_robots]], list[int]()
+        for world in worlds:
+            seed, generator = seeds[world], self._generators[world]
+            if seed is not None or generator is None:
+                generator, _ = seeding.np_random(seed)
+                self._generators[world] = generator
+            chosen.append(draw_seed(generator) if seed is None else seed)
+        self._take(self._session.reset(worlds, chosen))
+        self._reset_episodes(rows)
+
+    def _reset_episodes(self, rows: list[int]) -> None:
+        self._elapsed[rows] = 0
+        self._over = self._over.copy()
+        self._over[rows] = False
+        self._has_ended = bool(self._over.any())
+        begun = np.zeros(self.num_envs, np.bool_)
+        begun[rows] = True
+        self._observations.reset(begun, self._frames)
+        self._begin(begun)
+        for row in rows:
+            self._paths[row] = None
+
+    def _take(self, answer: StepAnswer) -> None:
+        self._frames, self._results = answer.frames, answer.results
+        self._columns = self._columns_of(self._results)
+        if self._session.settings.truth:
+            self._truths = self._session.truth(answer)
+
+    def _columns_of(self, results: NDArray[np.void]) -> Columns:
+        return Columns(*columns(results.view(np.uint8), self._pays))
+
+    def _outcome(
+        self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """What `step` returns."""
+        terminations, truncations, may_end = self._none, self._none, False
+        if self._exchanged is not None and self._columns.is_over:
+            terminations = self._exchanged & self._columns.terminated
+            truncations = self._exchanged & self._columns.truncated
+            may_end = True
+        if self._max_steps is not None:
+            truncations = truncations | (flown & (self._elapsed >= self._max_steps))
+            may_end = True
+        terminations, truncations = terminations.copy(), truncations.copy()
+        over = terminations | truncations if may_end else self._none
+        has_ended = may_end and bool(over.any())
+        infos: dict[str, Any] = {}
+        if has_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            infos = self._final(over)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
+        else:
+            self._over, self._has_ended = over, has_ended
+        infos |= self._infos(self._every)
+        return self._seen(), rewards, terminations, truncations, infos
+
+    def _final(self, over: NDArray[np.bool_]) -> dict[str, Any]:
+        """The last observations and infos of episodes that end in this step."""
+        observations = np.full(self.num_envs, None, dtype=object)
+        seen = self._observations.all(self._frames.copy(), self._robots())
+        for index in np.flatnonzero(over).tolist():
+            observations[index] = of_row(seen, index)
+        return {
+            "final_obs": observations,
+            "_final_obs": over.copy(),
+            "final_info": self._infos(over),
+            "_final_info": over.copy(),
+        }
+
+    def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """The infos of some rows, zero for the others, as Gymnasium stacks them."""
+        infos: dict[str, Any] = {}
+        for name, values in self._reported().items():
+            if mask is self._every:
+                infos[name] = values.copy()
+            else:
+                infos[name] = np.zeros_like(values)
+                infos[name][mask] = values[mask]
+            infos[f"_{name}"] = mask.copy()
+        return infos
+
+    def _reported(self) -> dict[str, NDArray[Any]]:
+        """What the infos of `WorldEnv` report, of all rows."""
+        reported: dict[str, NDArray[Any]] = {
+            "step": self._columns.steps,
+            "n_visited": self._columns.n_visited,
+        }
+        if self._reveals:
+            world, robot = self._results["world"], self._results["robot"]
+            reported["n_target_cells"] = world["n_target_cells"].astype(np.int64)
+            reported["n_hits"] = robot["n_hits"].astype(np.int64)
+            if self._truths is not None:
+                reported["truth"] = self._truths
+        return reported
+
+    def _seen(self) -> Any:
+        if self.render_mode == "human":
+            self.draw(slice(0, self._spec.n_robots))
+        return self._observations.all(self._shown(), self._robots())
+
+    def _shown(self) -> NDArray[np.uint8]:
+        """The frames, which the learner may write to: pictures come from others."""
+        return self._frames if self.render_mode is None else self._frames.copy()
+
+    def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        """The seed of each world."""
+        n_worlds = self._session.n_worlds
+        if seed is None:
+            return [None] * n_worlds
+        # Checked before any world's generator is replaced.
+        first = as_integer(seed)
+        if first is not None:
+            return [as_seed(first + world) for world in range(n_worlds)]
+        if isinstance(seed, np.ndarray):
+            seed = as_array(seed, "seed", "integers").tolist()
+        if not isinstance(seed, Sequence) or len(seed) != self.num_envs:
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", told(seed))
+        seeds = [None if one is None else as_seed(one) for one in seed]
+        return seeds[:: self._spec.n_robots]
+
+    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
+        shape = (self.num_envs,)
+        if mask is None:
+            return np.ones(shape, np.bool_)
+        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
+        if got != f"bool {shape}" or np.ma.is_masked(mask) or not mask.any():
+            expected = f"an array {shape} of bool with at least one True, none masked"
+            raise invalid("reset_mask", expected, got)
+        worlds = mask.reshape(-1, self._spec.n_robots)
+        if (worlds.any(axis=1) != worlds.all(axis=1)).any():
+            raise invalid("reset_mask", "all robots of a world or none", "some")
+        return mask
+
+
+def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """The info of one row among stacked ones, its numbers as Python's own."""
+    shown = {name: values[row] for name, values in infos.items() if not name.startswith("_")}
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in shown.items()
+    }
+
+
+def vector_session(settings: Settings, num_envs: int | None) -> Session:
+    """A session of all robots of some worlds."""
+    if settings.robot is not None:
+        raise invalid("robot", "None, as a vector environment flies all", settings.robot)
+    return Session(settings, num_envs)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[range]:
+    """The runs of consecutive true entries."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
+    return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

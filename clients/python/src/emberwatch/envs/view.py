@@ -1,0 +1,56 @@
+"""The picture of an environment in its render mode."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.envs.settings import WorldSpec
+from emberwatch.errors import invalid
+from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
+from emberwatch.render.scenery import Scenery
+
+#: The render modes of every environment here.
+RENDER_MODES: Final = ("human", "rgb_array", "ansi")
+
+#: Pictures a second of a film, and at most in a window.
+RENDER_FPS: Final = 10
+
+
+class View:
+    """Draws one world: the frame, robots and their paths, and the truth where it is known."""
+
+    def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise invalid(
+                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
+            )
+        self.mode: Final = render_mode
+        source, n_rings = spec.described or spec.n_observations, spec.airspace.n_rings
+        self._scenery: Final = Scenery.of(spec.airspace, spec.zones)
+        self._palette: Final = Palette.of(source, n_rings=n_rings)
+        self._screen: Screen | None = None
+
+    def draw(
+        self,
+        frame: NDArray[np.uint8],
+        robots: Sequence[tuple[int, int]],
+        paths: Sequence[NDArray[np.intp]],
+        truth: NDArray[np.uint8] | None,
+    ) -> Any:
+        """An image, a text, or `None` after showing it to a human, as the mode has it."""
+        picture = Picture(frame, robots, self._palette, paths, truth, self._scenery)
+        if self.mode == "rgb_array":
+            return rgb_array(picture)
+        if self.mode == "ansi":
+            return ansi(picture)
+        if self._screen is None:
+            self._screen = Screen(fps=RENDER_FPS)
+        self._screen.show(picture)
+        return None
+
+    def close(self) -> None:
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None

@@ -1,0 +1,212 @@
+"""The hidden Markov model on a grid: what a model file says, as arrays.
+
+Paper section II: states with the transition kernel ``w`` and bias ``b`` of eq. 2, and the
+observation matrix ``O`` of eq. 1. Whether a file makes sense is for the server to say; this module
+reads what the server has accepted. `emberwatch.belief` applies the parameters to a belief.
+"""
+
+from dataclasses import dataclass, fields
+from os import PathLike, fspath
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch import _native
+from emberwatch.common.arguments import as_count, check_settings
+from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.model.airspace import MAX_RADIUS, Airspace, Zones
+
+Color = tuple[int, int, int]
+"""Red, green and blue, 0 to 255 each."""
+
+MAX_VALUES = 64
+"""Most states, and most observations, of a model."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Description:
+    """What is known of states and observations: of recorded worlds, that is all.
+
+    S is the number of states, O that of observations: those that the file names, once for each
+    observation matrix of the sensor. Two descriptions are equal if all they say is, whatever their
+    files look like.
+    """
+
+    name: str
+    """Name shown to people."""
+    state_names: tuple[str, ...]
+    """By state."""
+    state_colors: tuple[Color, ...]
+    """By state."""
+    observation_names: tuple[str, ...]
+    """By observed value; those of rings around the path end in the ring, as in `fire ring 1`."""
+    observation_colors: tuple[Color, ...]
+    """By observed value."""
+    observation_matrix: NDArray[np.float64]
+    """``O[state, observed value]``, each row a distribution for each of the `n_rings` matrices,
+    shape (S, O)."""
+    reward: NDArray[np.float64]
+    """What a step pays for each distinct cell that pays by its state, shape (S,)."""
+    airspace: Airspace
+    """Where robots may fly and what they see."""
+    toml: str
+    """Text of the file, for other programs."""
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """Reads the text of a file that a server has accepted."""
+        text = text.removeprefix(BYTE_ORDER_MARK)
+        try:
+            values = cls._read(text)
+            values["airspace"] = Airspace(**values["airspace"])
+            return cls(**values, toml=text)
+        except (TypeError, ValueError) as error:
+            expected = "a file that `emberwatch-server --check` accepts"
+            raise invalid(cls.__name__.lower(), expected, error) from None
+
+    def with_radius(self, radius: int) -> Self:
+        """The same with a sensor that sees so many rows and columns beyond each cell of a path."""
+        radius = as_count(radius, "radius", 0, MAX_RADIUS)
+        if radius == self.airspace.radius:
+            return self
+        return self.from_toml(self._with_radius(self.toml, radius))
+
+    @property
+    def sensor_radius(self) -> int:
+        """Rows and columns that robots see beyond each cell of their path."""
+        return self.airspace.radius
+
+    @property
+    def n_rings(self) -> int:
+        """Observation matrices: of the path, then of each ring around it."""
+        return self.airspace.n_rings
+
+    @property
+    def pays(self) -> str:
+        """Which distinct cells pay: `"visited"`, or `"seen"`."""
+        return self.airspace.pays
+
+    @property
+    def no_fly(self) -> NDArray[np.bool_] | None:
+        """Where no robot may be, shape (H, W); None: nowhere."""
+        return self.airspace.no_fly
+
+    @property
+    def n_states(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def n_observations(self) -> int:
+        return len(self.observation_names)
+
+    @property
+    def target_state(self) -> int:
+        """The state that pays most, the first of them: fire in the wildfire model."""
+        return int(np.argmax(self.reward))
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def _values(self) -> list[object]:
+        values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
+        return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
+
+    @staticmethod
+    def _read(text: str) -> dict[str, Any]:
+        """All fields but the text."""
+        return _native.read_description(text)
+
+    @staticmethod
+    def _with_radius(text: str, radius: int) -> str:
+        return _native.description_with_radius(text, radius)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Model(Description):
+    """A model; make one with `named` or `from_toml`.
+
+    (KH, KW) is the kernel's size, both odd.
+    """
+
+    kernels: NDArray[np.float64]
+    """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
+    downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
+    is in, shape (S, S, S, KH, KW). Where there are zones, as many for each, zone by zone: shape
+    (n_zones, ...) or (n_zones * S, ...)."""
+    bias: NDArray[np.float64]
+    """``b``, added to each next state's weight, shape (S,)."""
+    initial: NDArray[np.float64]
+    """Distribution of a cell at the start of the burn-in, shape (S,)."""
+    zone_names: tuple[str, ...]
+    """Of the zones of land; empty where all cells are alike."""
+    zone_colors: tuple[Color, ...]
+    """By zone."""
+    zone_map: NDArray[np.uint8] | None
+    """The zone of each cell, shape (H, W); None where all cells are alike."""
+
+    @classmethod
+    def named(cls, name: str | PathLike[str]) -> Self:
+        """The built-in model of a name, or that of a file, which the server checks first."""
+        settings = {"model": utf8("model", name)}
+        try:
+            check_settings(settings)
+        except InvalidArgumentError:
+            grid = _native.grid_of_maps(fspath(name))
+            if grid is None:
+                raise
+            check_settings({**settings, "height": grid[0], "width": grid[1]})
+        return cls.checked(name)
+
+    @classmethod
+    def checked(cls, name: str | PathLike[str]) -> Self:
+        """The same of a name or file that the server has accepted already."""
+        text = _native.built_in("models").get(fspath(name))
+        if text is not None:
+            return cls.from_toml(text)
+        try:
+            text = _native.model_text(fspath(name))
+        except ValueError as error:  # it has changed since
+            raise InvalidArgumentError(f"model: {error}") from None
+        return cls.from_toml(text)
+
+    @classmethod
+    def wildfire(cls) -> Self:
+        """The built-in wildfire of the paper's section II, as ``config/models/wildfire.toml``."""
+        return cls.checked("wildfire")
+
+    @property
+    def zones(self) -> Zones | None:
+        """The zones of land; None where all cells are alike."""
+        if self.zone_map is None:
+            return None
+        colors = tuple("#{:02x}{:02x}{:02x}".format(*color) for color in self.zone_colors)
+        return Zones(names=self.zone_names, colors=colors, map=self.zone_map)
+
+    @property
+    def kernel(self) -> NDArray[np.float64]:
+        """The first: that of all cells, unless there are zones or it `sees_own_state`."""
+        return self.kernels[0]
+
+    @property
+    def sees_own_state(self) -> bool:
+        """Whether a cell's weights depend on the state that it is in itself."""
+        return len(self.kernels) > max(1, len(self.zone_names))
+
+    @staticmethod
+    def _read(text: str) -> dict[str, Any]:
+        return _native.read_model(text)
+
+    @staticmethod
+    def _with_radius(text: str, radius: int) -> str:
+        return _native.model_with_radius(text, radius)
+
+
+def color_from_hex(text: str) -> Color:
+    """A colour such as `#c8371b`."""
+    red, green, blue = bytes.fromhex(text.removeprefix("#"))
+    return red, green, blue

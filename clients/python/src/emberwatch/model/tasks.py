@@ -1,0 +1,51 @@
+"""Tasks: worlds with a name, fixed completely, and the seeds to test on."""
+
+import tomllib
+from dataclasses import dataclass
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Final, Self
+
+from emberwatch import _native
+from emberwatch.common.arguments import check_settings
+from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
+
+#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+FIRST_TRAINING_SEED: Final = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What is known of a task before its worlds are there."""
+
+    name: str
+    n_moves: int
+    robots: int
+    #: Steps of an episode.
+    max_steps: int
+    test_seeds: range
+
+    @classmethod
+    def named(cls, name: str | PathLike[str]) -> Self:
+        """The built-in task of a name, or that of a file, which the server checks first."""
+        check_settings({"task": utf8("task", name)})
+        text = _native.built_in("tasks").get(fspath(name))
+        return cls.from_toml(Path(name).read_text("utf-8") if text is None else text)
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """Reads the text of a file that a server has accepted."""
+        file = tomllib.loads(text.removeprefix(BYTE_ORDER_MARK))
+        return cls(
+            name=file["name"],
+            n_moves=file["moves"],
+            robots=file.get("robots", 1),
+            max_steps=file["max_steps"],
+            test_seeds=range(file["test_seeds"]["start"], file["test_seeds"]["end"]),
+        )
+
+
+def built_in_tasks() -> dict[str, Task]:
+    """The tasks that the programs know, by name."""
+    files = _native.built_in("tasks").items()
+    return {name: Task.from_toml(text) for name, text in files}

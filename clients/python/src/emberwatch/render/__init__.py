@@ -1,0 +1,361 @@
+"""Pictures of one world: what was seen along the path, beside the truth where it is known.
+
+`rgb_array` and `ansi` are pure: arrays in, a picture or a text out. `Screen` shows either to
+people, for ``render_mode="human"``. The path of one robot is dark or light, whichever is further
+from the colours below it, and the robot a circle of both; each robot of a team has a colour.
+"""
+
+import contextlib
+import importlib
+import io
+import itertools
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.common.codes import UNOBSERVED
+from emberwatch.errors import invalid
+from emberwatch.model import Color
+from emberwatch.render.palette import DARK, LIGHT, ROBOTS, mark_on
+from emberwatch.render.palette import Palette as Palette
+from emberwatch.render.scenery import Scenery
+
+_EDGE = (0xB4, 0xB4, 0xB4)
+_LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
+_GAP = 8  # pixels between panels
+LEAST_LINE_SCALE = 3  # pixels a cell needs to show its colour beside a line
+_LEAST_RIM_SCALE = 12  # the same with a rim around the line
+_TINT = 0.45  # share of white in visited cells too small for a line
+_LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # pixels of the robot's mark
+_MOST_WIDE_ROWS = 32  # rows that fit a terminal at one line each
+_NOTHING = Scenery()
+_SYMBOLS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz+/"
+
+_LOG = logging.getLogger(__name__)
+
+Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
+"""Visited cells (row, column) in order, shape (n, 2); each a neighbour of the last, or the same."""
+
+
+class Picture:
+    """What to draw, checked."""
+
+    def __init__(
+        self,
+        frame: NDArray[np.uint8],
+        robots: Sequence[tuple[int, int]],
+        palette: Palette,
+        paths: Sequence[Cells] = (),
+        truth: NDArray[np.uint8] | None = None,
+        scenery: Scenery = _NOTHING,
+    ) -> None:
+        """Takes what is known of a world.
+
+        Args:
+            frame: Observed values, 255 where nothing was observed; shape (H, W).
+            robots: The cell (row, column) of each robot to draw.
+            palette: The colours.
+            paths: Visited cells in order, of each robot that flew.
+            truth: Hidden states, shape (H, W).
+            scenery: What lies on its grid.
+        """
+        if frame.ndim != 2 or not frame.size:
+            raise invalid("frame", "shape (H, W)", frame.shape)
+        if truth is not None and truth.shape != frame.shape:
+            raise invalid("truth", f"shape {frame.shape}", truth.shape)
+        self.frame, self.robots, self.palette, self.truth = frame, robots, palette, truth
+        self.scenery = scenery
+        self.paths = [np.asarray(path, dtype=np.intp).reshape(-1, 2) for path in paths]
+        for what, places in (("robot", _cells(robots)), *(("path", path) for path in self.paths)):
+            off = ((places < 0) | (places >= frame.shape)).any(axis=1)
+            if off.any():
+                got = tuple(places[np.argmax(off)].tolist())
+                raise invalid(what, f"cells of a {frame.shape} grid", got)
+        for path in self.paths:
+            jumps = np.abs(np.diff(path, axis=0)).sum(axis=1) > 1
+            if jumps.any():
+                at = int(np.argmax(jumps))
+                got = [tuple(cell) for cell in path[at : at + 2].tolist()]
+                raise invalid("path", "neighbours one after the other", got)
+
+    def painted(self) -> NDArray[np.uint8]:
+        """The colour of each cell of the frame, shape (H, W, 3)."""
+        colors = self.palette.paint_frame(self.frame)
+        return self.scenery.tint(colors, self.frame, self.palette.unobserved)
+
+    def color_of(self, robot: int) -> Color | None:
+        """The colour of a robot of a team; None if it is alone."""
+        return ROBOTS[divmod(robot, len(ROBOTS))[1]] if len(self.robots) > 1 else None
+
+
+def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
+    """Draws a frame with path and robot, and the truth beside it (below it on wide grids).
+
+    The path is a line, or a tint where cells are below 3 pixels. The size depends on the grid, the
+    scale and whether there is a truth, on nothing else; it is even both ways, for video codecs.
+
+    Args:
+        scale: Side of a cell in pixels, at least 1; the default makes panels about 512 long.
+
+    Returns:
+        Shape (height, width, 3), red, green, blue.
+    """
+    palette = picture.palette
+    height, width = picture.frame.shape
+    if scale is None:  # even, where cells can be
+        scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
+    if scale < 1:
+        raise invalid("scale", "at least 1 pixel", scale)
+    colors = picture.painted()
+    if scale < LEAST_LINE_SCALE:
+        panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]
+        picture.scenery.draw(panels[0], picture.frame, scale)
+    else:
+        seen = (picture.frame != UNOBSERVED)[:, :, None]
+        line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
+        panels = [_enlarge(colors, scale)]
+        picture.scenery.draw(panels[0], picture.frame, scale)
+        for robot, path in enumerate(picture.paths):
+            _draw_path(panels[0], path, line, picture.color_of(robot), scale)
+    if picture.truth is not None:
+        panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
+        picture.scenery.draw(panels[1], picture.truth, scale)
+    for panel in panels:
+        for robot, cell in enumerate(picture.robots):
+            _draw_robot(panel, cell, picture.color_of(robot), scale)
+    return _join(panels, axis=0 if width >= 2 * height else 1)
+
+
+def ansi(picture: Picture, *, color: bool = True) -> str:
+    """Draws the same for a terminal, the truth at the right, without a line break at the end.
+
+    In colour (24 bits), a cell is two characters, or on grids of more than 32 rows half of one,
+    which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
+    or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path, ``x`` for a
+    no-fly cell or a space.
+    """
+    palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
+    grids = [(picture.frame, picture.painted(), cells)]
+    if picture.truth is not None:
+        grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
+    if not color:
+        panels = [_ascii_lines(values, _marks(picture, at, robots)) for values, _, at in grids]
+    elif len(picture.frame) <= _MOST_WIDE_ROWS:
+        panels = [_wide_lines(colors, _marks(picture, at, robots)) for _, colors, at in grids]
+    else:
+        panels = list[Iterator[str]]()
+        for values, colors, at in grids:
+            colors = _tinted(colors, at)
+            picture.scenery.draw(colors, values, 1)
+            panels.append(_half_lines(colors, robots))
+    return "\n".join("  ".join(lines).rstrip(" ") for lines in zip(*panels, strict=True))
+
+
+class Screen:
+    """Shows pictures to people: in a window, else in the terminal, else not at all.
+
+    A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
+    pygame has one per process. Without it, the standard output must be a terminal. Without either,
+    a warning is logged once and nothing is shown. Closable the window ends only the show.
+    """
+
+    def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
+        """Opens nothing yet; `fps`: most pictures a second, by waiting; 0 does not wait."""
+        self._title, self._fps = title, fps
+        self._next: float | None = None
+        self._window: Any = None
+        self._pygame = _pygame_with_display()
+        #: Where pictures go.
+        self.kind: Literal["window", "terminal", "nothing"] = "window"
+        if self._pygame is None:
+            self.kind = "terminal" if sys.stdout.isatty() else "nothing"
+        if self.kind == "nothing":
+            _LOG.warning(
+                "render_mode 'human' shows nothing: there is no display with pygame installed, and "
+                "the output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
+            )
+
+    def show(self, picture: Picture) -> None:
+        """Draws in place of the last picture."""
+        if self.kind == "window":
+            self._show_in_window(rgb_array(picture))
+        elif self.kind == "terminal":
+            clear = "\x1b[2J" if self._next is None else ""
+            sys.stdout.write(f"{clear}\x1b[H{ansi(picture)}\x1b[K\n\x1b[J")
+            sys.stdout.flush()
+        self._pace()
+
+    def close(self) -> None:
+        """Closes the window, if there is one; later pictures are not shown. May be called again."""
+        # Another screen of this process may have taken the window over.
+        if self._window is not None and self._pygame.display.get_surface() is self._window:
+            self._pygame.display.quit()
+        self._window, self.kind = None, "nothing"
+
+    def _show_in_window(self, image: NDArray[np.uint8]) -> None:
+        pygame, (height, width, _) = self._pygame, image.shape
+        if pygame.display.get_surface() is not self._window:
+            self._window = None
+        if self._window is None or self._window.get_size() != (width, height):
+            self._window = pygame.display.set_mode((width, height))
+            pygame.display.set_caption(self._title)
+        surface = pygame.image.frombuffer(image.tobytes(), (width, height), "RGB")
+        self._window.blit(surface, (0, 0))
+        pygame.display.flip()
+        if any(event.type == pygame.QUIT for event in pygame.event.get()):
+            self.close()
+
+    def _pace(self) -> None:
+        now = time.monotonic()
+        at = now if self._next is None else max(now, self._next)
+        if self.kind != "nothing":
+            time.sleep(at - now)
+            self._next = at + (1.0 / self._fps if self._fps > 0.0 else 0.0)
+
+
+def _cells(places: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
+    return np.array(places, np.intp).reshape(-1, 2)
+
+
+def _visited(picture: Picture) -> NDArray[np.intp]:
+    """The cells of all paths."""
+    return np.concatenate([_cells([]), *picture.paths])
+
+
+def _tinted(colors: NDArray[np.uint8], cells: NDArray[np.intp]) -> NDArray[np.uint8]:
+    tinted, (rows, cols) = colors.copy(), cells.T
+    tinted[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
+    return tinted
+
+
+def _enlarge(colors: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    return colors.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _draw_path(
+    image: NDArray[np.uint8],
+    cells: NDArray[np.intp],
+    colors: NDArray[np.uint8],
+    color: Color | None,
+    scale: int,
+) -> None:
+    """A line through the cells' middles, and a square where it begins.
+
+    In each cell's colour, dark or light, or in one `color`.
+    """
+    if not len(cells):
+        return
+    rims = np.where(colors[:, :, :1] == DARK[0], LIGHT, DARK).astype(np.uint8)
+    if color is not None:
+        colors, rims = np.full_like(colors, color), np.full_like(colors, mark_on(color))
+    line = max(1, min(6, scale // 4))
+    rim = 0 if scale < _LEAST_RIM_SCALE else max(1, line // 3)
+    ink, other = _enlarge(colors, scale), _enlarge(rims, scale)
+    middles = cells * scale + (scale - line) // 2
+    legs = list(zip(middles, middles[1:], strict=False))
+    begin = (middles[0], middles[0])
+    for drawn, grow, source in (
+        (legs, rim, other),
+        (legs, 0, ink),
+        ([begin], rim + 2, ink),
+        ([begin], rim + 1, other),
+    ):
+        for ends in drawn:
+            top, left = np.maximum(np.minimum(*ends) - grow, 0)
+            bottom, right = np.maximum(*ends) + line + grow
+            image[top:bottom, left:right] = source[top:bottom, left:right]
+
+
+def _draw_robot(
+    image: NDArray[np.uint8], robot: tuple[int, int], color: Color | None, scale: int
+) -> None:
+    """A circle around a dot, or a disc of one `color`, at least as large as can be seen."""
+    row, col = ((2 * at + 1) * scale / 2 - 0.5 for at in robot)
+    radius = min(_MOST_RADIUS, max(_LEAST_RADIUS, 0.46 * scale))
+    top, left = max(0, int(row - radius)), max(0, int(col - radius))
+    window = image[top : int(row + radius) + 2, left : int(col + radius) + 2]
+    rows, cols = np.ogrid[: window.shape[0], : window.shape[1]]
+    distance = np.hypot(rows + top - row, cols + left - col)
+    rings = ((1.0, LIGHT), (0.8, DARK), (0.55, color or LIGHT), (0.3, color or DARK))
+    for share, ink in rings:
+        window[distance <= radius * share] = ink
+
+
+def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
+    """Panels along an axis with a gap between, both sides rounded up to even."""
+    shape = list(panels[0].shape)
+    shape[axis] = _GAP
+    gap = np.full(shape, _EDGE, dtype=np.uint8)
+    image = np.concatenate([part for panel in panels for part in (gap, panel)][1:], axis=axis)
+    height, width, _ = image.shape
+    return np.pad(image, ((0, height & 1), (0, width & 1), (0, 0)), mode="edge")
+
+
+def _marks(picture: Picture, cells: NDArray[np.intp], robots: NDArray[np.intp]) -> NDArray[np.str_]:
+    marks = np.full(picture.frame.shape, " ")
+    if picture.scenery.no_fly is not None:
+        marks[picture.scenery.no_fly] = "x"
+    marks[tuple(cells.T)] = "*"
+    marks[tuple(robots.T)] = "@"
+    return marks
+
+
+def _ascii_lines(values: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
+    symbols = np.full(256, ".")
+    symbols[: len(_SYMBOLS)] = list(_SYMBOLS)
+    for line in np.stack([symbols[values], marks], axis=-1):
+        yield "".join(line.ravel().tolist())
+
+
+def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
+    """Lines of cells two characters wide, on the cell's colour."""
+    wide = {" ": "  ", "*": "··", "@": "()", "x": "xx"}
+    for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
+        cells: list[tuple[str, str]] = []
+        for (red, green, blue), mark in zip(line, line_marks, strict=True):
+            ink, _, _ = mark_on((red, green, blue))
+            cells.append((f"38;2;{ink};{ink};{ink};48;2;{red};{green};{blue}", wide[mark]))
+        yield _styled(cells)
+
+
+def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator[str]:
+    """Lines of cells half a character high: the upper one in front, the lower one behind it."""
+    colors = colors.copy()
+    colors[tuple(robots.T)] = LIGHT
+    for row in range(0, len(colors), 2):
+        cells: list[tuple[str, str]] = []
+        for col, (red, green, blue) in enumerate(colors[row].tolist()):
+            behind = "49"
+            if row + 1 < len(colors):
+                behind = "48;2;{};{};{}".format(*colors[row + 1, col].tolist())
+            cells.append((f"38;2;{red};{green};{blue};{behind}", "▀"))
+        yield _styled(cells)
+
+
+def _styled(cells: list[tuple[str, str]]) -> str:
+    """Texts with their style, which is written only where it changes."""
+    runs = itertools.groupby(cells, key=lambda cell: cell[0])
+    texts = (f"\x1b[{style}m" + "".join(text for _, text in run) for style, run in runs)
+    return "".join(texts) + "\x1b[0m"
+
+
+def _pygame_with_display() -> Any:
+    """Pygame with its display ready, or None."""
+    if not any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")):
+        return None
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
+            pygame = importlib.import_module("pygame")
+    except ImportError:
+        return None
+    try:
+        pygame.display.init()
+    except pygame.error:
+        return None
+    return pygame

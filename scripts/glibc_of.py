@@ -1,0 +1,13 @@
+"""Prints the newest version of glibc that the files of a wheel ask for."""
+
+import re
+import sys
+import zipfile
+
+with zipfile.ZipFile(sys.argv[1]) as wheel:
+    versions = {
+        tuple(map(int, version.split(b".")))
+        for name in wheel.namelist()
+        for version in re.findall(rb"\0GLIBC_(\d+(?:\.\d+)+)\0", wheel.read(name))
+    }
+print(".".join(map(str, max(versions))) if versions else "none")
