@@ -39,3 +39,39 @@ fn start<'s>(scope: &Scope<'s>, helper: usize, n_helpers: usize, work: &'s (impl
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rayon::ThreadPoolBuilder;
+    use std::collections::HashSet;
+    use std::sync::Barrier;
+    use std::thread::current;
+
+    fn pool(n_threads: usize) -> ThreadPool {
+        let pool = ThreadPoolBuilder::new().num_threads(n_threads).build();
+        pool.expect("test threads")
+    }
+
+    #[test]
+    fn every_job_is_done_once() {
+        for (n_threads, n_jobs) in [(1, 0), (1, 5), (2, 1), (3, 100), (8, 3), (8, 1000)] {
+            let mut done = vec![0; n_jobs];
+            share(&pool(n_threads), n_jobs, done.iter_mut(), |job| *job += 1);
+            assert_eq!(done, vec![1; n_jobs], "{n_threads} threads");
+        }
+    }
+
+    #[test]
+    fn all_threads_take_part_the_calling_one_among_them() {
+        let (seen, all) = (Mutex::new(HashSet::new()), Barrier::new(4));
+        share(&pool(4), 4, 0..4, |_| {
+            // Each waits for the others: one thread cannot have two of these jobs.
+            all.wait();
+            seen.lock().expect("no panic").insert(current().id());
+        });
+        let seen = seen.into_inner().expect("no panic");
+        assert_eq!(seen.len(), 4);
+        assert!(seen.contains(&current().id()));
+    }
+}

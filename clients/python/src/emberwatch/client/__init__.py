@@ -1,1 +1,8 @@
-"""The client of a server, or of worlds in this process: connect, lease, observe, record."""
+"""The client of a running server, or of worlds in this process: connect, lease, observe, record."""
+
+from emberwatch.client.client import Client as Client
+from emberwatch.client.client import connect as connect
+from emberwatch.client.client import embed as embed
+from emberwatch.client.lease import Lease as Lease
+from emberwatch.client.observer import Observer as Observer
+from emberwatch.client.observer import observe as observe
