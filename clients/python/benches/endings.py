@@ -14,9 +14,10 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+from emberwatch.programs import Program, unused_instance
+
 import emberwatch
 from emberwatch.errors import ServerGoneError
-from emberwatch.programs import Program, unused_instance
 
 N_ROUNDS = 20
 

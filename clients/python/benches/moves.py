@@ -15,10 +15,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from emberwatch.programs import Program, unused_instance
 from gymnasium.vector import SyncVectorEnv
 
 import emberwatch
-from emberwatch.programs import Program, unused_instance
 
 MOVES = "emberwatch:emberwatch/WildfireMoves-v0"
 OBJECTIVE = "emberwatch:emberwatch/WildfireObjective-v1"

@@ -15,9 +15,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from emberwatch.programs import Program, unused_instance
 
 import emberwatch
-from emberwatch.programs import Program, unused_instance
 
 WILDFIRE = "emberwatch:emberwatch/Wildfire-v0"
 SEEN: dict[str, Any] = {"observation": "frame", "max_episode_steps": 2**31 - 1}

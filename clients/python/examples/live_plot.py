@@ -12,9 +12,9 @@ from collections import deque
 
 import matplotlib
 import numpy as np
+from emberwatch.programs import Program, find, unused_instance
 
 import emberwatch
-from emberwatch.programs import Program, find, unused_instance
 
 
 def main() -> None:

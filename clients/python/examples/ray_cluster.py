@@ -20,6 +20,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import ray
+from emberwatch.programs import Program, unused_instance
 from gymnasium.wrappers.vector import TransformObservation
 from ray.cluster_utils import Cluster
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -29,7 +30,6 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import emberwatch
 from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings
 
 MOVES = "emberwatch/WildfireMoves-v0"

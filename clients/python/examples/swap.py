@@ -11,9 +11,9 @@ import argparse
 import subprocess
 
 import numpy as np
+from emberwatch.programs import Program, find, unused_instance
 
 import emberwatch
-from emberwatch.programs import Program, find, unused_instance
 
 
 def main() -> None:

@@ -14,11 +14,10 @@ from typing import Any
 
 import pytest
 from failures import fails
-from processes import server
+from processes import Program, server, unused_instance
 
 from emberwatch import programs
 from emberwatch.model import Model
-from emberwatch.programs import Program, unused_instance
 
 #: Runs Python code, its arguments behind, in a mount namespace with a `/dev/shm` of its own.
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -363,9 +363,7 @@ def test_a_robot_that_is_not_there_is_named(keywords: dict[str, Any], words: str
         make(instance=instance, **keywords)
 
 
-def test_private_worlds_and_vectors_have_no_single_robot() -> None:
-    with refuses("takeover, world, robot: expected instance"):
-        make(robot=0)
+def test_own_worlds_and_vectors_have_no_single_robot() -> None:
     with refuses("robots: expected one robot in a world, got 2"):
         make(robots=2)
     with refuses("a multiple of 2, got 3"):

@@ -64,7 +64,7 @@ class State(Enum):
     OVER = "over"
 
 
-#: States after which, between calls, worlds may have moved unseen: only a reset or resume is allowed.
+#: After a call that left one of these, worlds may have moved unseen: steps are refused.
 _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIMED_OUT))
 
 

@@ -339,7 +339,10 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _reported(self) -> dict[str, NDArray[Any]]:
         """What the infos of `WorldEnv` report, of all rows."""
-        reported = {"step": self._columns.steps, "n_visited": self._columns.n_visited}
+        reported: dict[str, NDArray[Any]] = {
+            "step": self._columns.steps,
+            "n_visited": self._columns.n_visited,
+        }
         if self._reveals:
             world, robot = self._results["world"], self._results["robot"]
             reported["n_target_cells"] = world["n_target_cells"].astype(np.int64)
