@@ -75,6 +75,11 @@ class Program:
         self._output.seek(0)
         return re.sub(r"(?m)^\S+Z +[A-Z]+ ", "", self._output.read().decode()).strip()
 
+    def ended(self) -> str:
+        """What it has printed, once it has ended by itself."""
+        self.process.wait(PATIENCE)
+        return self.output()
+
     def stop(self) -> None:
         """Stops it, if it still runs, and waits for its end."""
         self.process.terminate()
