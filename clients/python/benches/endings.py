@@ -9,14 +9,15 @@ import os
 import select
 import signal
 import statistics
+import subprocess
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 
 import emberwatch
 from emberwatch.errors import ServerGoneError
-from emberwatch.programs import Program, unused_instance
 
 N_ROUNDS = 20
 
@@ -32,10 +33,10 @@ class Stopped:
     """A server that is paused, and a lease of it."""
 
     def __init__(self) -> None:
-        instance = unused_instance()
+        instance = f"endings-{uuid.uuid4().hex}"
         flags = [f"--instance={instance}", "--height=5", "--width=7", "--moves=6", "--burn-in=20"]
-        self.program = Program("emberwatch-server", flags)
-        self.client = self.program.wait_for(lambda: emberwatch.connect(instance))
+        self.program = subprocess.Popen(["emberwatch-server", *flags])
+        self.client = emberwatch.connect(instance, wait=20)
         self.lease = self.client.acquire()
         os.kill(self.program.pid, signal.SIGSTOP)
 
@@ -45,10 +46,9 @@ class Stopped:
 
     def close(self) -> None:
         """Ends the server."""
-        with suppress(ProcessLookupError):
-            os.kill(self.program.pid, signal.SIGKILL)
+        self.program.kill()
+        self.program.wait()
         self.client.close()
-        self.program.stop()
 
 
 def interrupted(call: Callable[[], object]) -> float:

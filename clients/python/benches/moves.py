@@ -17,14 +17,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
-import emberwatch
-from emberwatch.programs import Program, unused_instance
-
 MOVES = "emberwatch:emberwatch/WildfireMoves-v0"
 OBJECTIVE = "emberwatch:emberwatch/WildfireObjective-v1"
 NO_END = 2**31 - 1
-#: Of one server.
-CLIENTS = 16
 
 
 class Trivial(gymnasium.Env[Any, Any]):
@@ -42,16 +37,6 @@ class Trivial(gymnasium.Env[Any, Any]):
         return self._seen, 0.0, False, False, {}
 
 
-def serve(model: str) -> tuple[Program, str]:
-    """A server for as many single environments as may be its clients."""
-    instance = unused_instance()
-    flags = {"worlds": CLIENTS, "height": 16, "width": 16, "moves": 16, "burn-in": 3000}
-    flags |= {"model": model, "instance": instance}
-    server = Program("emberwatch-server", [f"--{name}={value}" for name, value in flags.items()])
-    server.wait_for(lambda: emberwatch.connect(instance)).close()
-    return server, instance
-
-
 def main() -> None:
     """Races moves, then decisions."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -62,41 +47,30 @@ def main() -> None:
     args = parser.parse_args()
     world: dict[str, Any] = {"height": 16, "width": 16, "n_moves": 16, "burn_in": 3000}
     world |= {"model": args.model, "max_episode_steps": NO_END}
-    servers = [serve(args.model) for _ in range(0, args.worlds, CLIENTS)]
     actions = np.random.default_rng(0).integers(0, 4, (args.moves, args.worlds))
-    instances = [instance for _, instance in servers]
-    race(moves(world, instances, args.worlds), actions, args.rounds, "moves/s")
-    n_agents = min(args.worlds, CLIENTS)
-    peers = decisions(world, instances[0], n_agents)
-    race(peers, actions[:, :n_agents], args.rounds, "decisions/s")
-    for server, _ in servers:
-        server.stop()
+    race(moves(world, args.worlds), actions, args.rounds, "moves/s")
+    n_agents = min(args.worlds, 16)
+    race(decisions(world, n_agents), actions[:, :n_agents], args.rounds, "decisions/s")
 
 
-def moves(world: dict[str, Any], instances: list[str], n_worlds: int) -> dict[str, Any]:
+def moves(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
     """Environments whose steps are moves."""
     world = {"observation": "local", **world}
-    there = {"observation": "local", "max_episode_steps": NO_END}
     one = gymnasium.make(MOVES, **world).unwrapped
-    places = [divmod(index, CLIENTS) for index in range(n_worlds)]
-    single = [
-        partial(gymnasium.make, MOVES, instance=instances[server], world=number, **there)
-        for server, number in places
-    ]
+    single = [partial(gymnasium.make, MOVES, **world)] * n_worlds
     return {
         "native vector": gymnasium.make_vec(MOVES, n_worlds, **world),
-        "native vector, embedded": gymnasium.make_vec(MOVES, n_worlds, backend="embedded", **world),
         "native vector, reward='move'": gymnasium.make_vec(MOVES, n_worlds, reward="move", **world),
         "SyncVectorEnv": SyncVectorEnv(single),
         "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * n_worlds),
     }
 
 
-def decisions(world: dict[str, Any], instance: str, n_worlds: int) -> dict[str, Any]:
-    """Environments whose steps are decisions; the single ones share a server."""
-    there = {"instance": instance, "prior": "initial", "max_episode_steps": NO_END}
-    single = [partial(gymnasium.make, OBJECTIVE, world=n, **there) for n in range(n_worlds)]
-    native = gymnasium.make_vec(OBJECTIVE, n_worlds, prior="initial", **world)
+def decisions(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
+    """Environments whose steps are decisions."""
+    world = {"prior": "initial", **world}
+    single = [partial(gymnasium.make, OBJECTIVE, **world)] * n_worlds
+    native = gymnasium.make_vec(OBJECTIVE, n_worlds, **world)
     return {f"native vector, {n_worlds} worlds": native, "SyncVectorEnv": SyncVectorEnv(single)}
 
 

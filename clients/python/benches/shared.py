@@ -1,4 +1,4 @@
-"""Steps a second of several processes, each with a private server or all with one that they share.
+"""Steps a second of several processes, which simulate their worlds or share one server.
 
 Each process steps worlds of its own together, and all of them at the same time. Rounds take turns,
 so that a noisy machine is noisy for all. Prints the median over rounds, of all processes together.
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import statistics
+import subprocess
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -17,7 +19,6 @@ import gymnasium
 import numpy as np
 
 import emberwatch
-from emberwatch.programs import Program, unused_instance
 
 WILDFIRE = "emberwatch:emberwatch/Wildfire-v0"
 SEEN: dict[str, Any] = {"observation": "frame", "max_episode_steps": 2**31 - 1}
@@ -27,12 +28,12 @@ def work(pipe: Connection, instance: str, process: int, n_worlds: int) -> None:
     """Steps for as long as it is told and tells how fast, until it is told to end."""
     shared = {"instance": instance, "world": process * n_worlds}
     peers = {
-        "private": gymnasium.make_vec(WILDFIRE, n_worlds, **SEEN),
+        "own": gymnasium.make_vec(WILDFIRE, n_worlds, **SEEN),
         "shared": gymnasium.make_vec(WILDFIRE, n_worlds, **shared, **SEEN),
     }
     for envs in peers.values():
         envs.reset(seed=1000)
-    paths = peers["private"].action_space.sample().astype(np.uint8)
+    paths = peers["own"].action_space.sample().astype(np.uint8)
     pipe.send("ready")
     for kind, seconds in iter(pipe.recv, None):
         n_steps, began = 0, time.perf_counter()
@@ -52,11 +53,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.5, help="of a round")
     parser.add_argument("--rounds", type=int, default=7)
     args = parser.parse_args()
-    instance, most = unused_instance(), max(args.processes)
-    server = Program(
-        "emberwatch-server", [f"--instance={instance}", f"--worlds={most * args.worlds}"]
+    instance, most = f"shared-{os.getpid()}", max(args.processes)
+    server = subprocess.Popen(
+        ["emberwatch-server", f"--instance={instance}", f"--worlds={most * args.worlds}"]
     )
-    server.wait_for(lambda: emberwatch.connect(instance)).close()
+    emberwatch.connect(instance, wait=20).close()
     context = multiprocessing.get_context("spawn")
     pipes, processes = [], []
     for number in range(most):
@@ -70,7 +71,7 @@ def main() -> None:
     rates: dict[tuple[int, str], list[float]] = {}
     for _ in range(args.rounds):
         for n_processes in args.processes:
-            for kind in ("private", "shared"):
+            for kind in ("own", "shared"):
                 for pipe in pipes[:n_processes]:
                     pipe.send((kind, args.seconds))
                 rate = sum(pipe.recv() for pipe in pipes[:n_processes])
@@ -81,7 +82,8 @@ def main() -> None:
     for pipe, process in zip(pipes, processes, strict=True):
         pipe.send(None)
         process.join()
-    server.stop()
+    server.terminate()
+    server.wait()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import multiprocessing
+import os
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -19,7 +21,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import emberwatch  # noqa: F401  (registers the environments)
+import emberwatch
 
 NO_END = 2**31 - 1
 
@@ -74,22 +76,30 @@ def _spread(values: Any) -> str:
     return f"{statistics.median(values):8.1f} ({min(values):.1f} to {max(values):.1f})"
 
 
-def emberwatch_row(n_envs: int, backend: str = "server") -> Row:
+def emberwatch_row(n_envs: int, instance: str | None = None) -> Row:
     """Wildfire-v0, the simulation included: single, or the vector environment."""
-    world: dict[str, Any] = {"max_episode_steps": NO_END, "backend": backend, "burn_in": 1000}
+    world: dict[str, Any] = {"max_episode_steps": NO_END, "burn_in": 1000, "instance": instance}
     envs: Any = (
         gymnasium.make("emberwatch/Wildfire-v0", **world)
         if n_envs == 1
         else gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=n_envs, **world)
     )
     envs.reset(seed=0)
-    name = f"emberwatch, {backend}, worlds: {n_envs}"
+    place = "in process" if instance is None else "at a server"
+    name = f"emberwatch, {place}, worlds: {n_envs}"
     return Row(name, envs, envs.action_space.sample(), n_envs)
 
 
-def embedded_row(n_envs: int) -> Row:
-    """The same inside this process."""
-    return emberwatch_row(n_envs, "embedded")
+@contextlib.contextmanager
+def server_row() -> Iterator[Callable[[int], Row]]:
+    """The same through a server."""
+    instance = f"step-{os.getpid()}"
+    flags = [f"--instance={instance}", "--worlds=64", "--burn-in=1000"]
+    server = subprocess.Popen(["emberwatch-server", *flags])
+    emberwatch.connect(instance, wait=20).close()
+    yield lambda n_envs: emberwatch_row(n_envs, instance)
+    server.terminate()
+    server.wait()
 
 
 def async_row(n_envs: int) -> Row:
@@ -133,7 +143,7 @@ def spin() -> None:
 
 
 def start_up(n: int) -> None:
-    """From `gymnasium.make` to the first step, with a private server."""
+    """From `gymnasium.make` to the first step."""
     seconds: list[float] = []
     for seed in range(n):
         start = time.perf_counter()
@@ -173,8 +183,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.busy is None:
         start_up(5)
-        race([emberwatch_row, embedded_row, async_row, envpool_row], 1, 4000, args.rounds)
-        race([emberwatch_row, embedded_row, async_row, envpool_row], 64, 200, args.rounds)
+        with server_row() as at_server:
+            race([emberwatch_row, at_server, async_row, envpool_row], 1, 4000, args.rounds)
+            race([emberwatch_row, at_server, async_row, envpool_row], 64, 200, args.rounds)
     for n in args.busy or [3]:
         print(f"beside {n} busy processes:")
         with busy_processes(n):

@@ -1,7 +1,7 @@
 """Plots what happens on a running server, live: an observer, which never slows the server.
 
 emberwatch-server & emberwatch-agent run & python live_plot.py
-python live_plot.py --private --frames 200 --out plot.png    # without a screen
+python live_plot.py --start --frames 200 --out plot.png      # without a screen
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import matplotlib
 import numpy as np
 
 import emberwatch
-from emberwatch.programs import Program, find, unused_instance
 
 
 def main() -> None:
@@ -22,7 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--instance", default="default")
     parser.add_argument("--world", type=int, default=0)
-    parser.add_argument("--private", action="store_true", help="start a server and an agent")
+    parser.add_argument("--start", action="store_true", help="start a server and an agent")
     parser.add_argument(
         "--frames", type=int, default=0, help="end after this many frames; 0: never"
     )
@@ -33,13 +32,13 @@ def main() -> None:
         matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    server = agent = None
-    if args.private:
-        args.instance = unused_instance()
-        server = Program("emberwatch-server", ["--instance", args.instance])
-        server.wait_for(lambda: emberwatch.connect(args.instance)).close()
-        command = [str(find("emberwatch-agent")), "run", "--instance", args.instance]
-        agent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    programs = []
+    if args.start:
+        server = ["emberwatch-server", "--instance", args.instance]
+        agent = ["emberwatch-agent", "run", "--instance", args.instance]
+        programs.append(subprocess.Popen(server))
+        emberwatch.connect(args.instance, wait=20).close()
+        programs.append(subprocess.Popen(agent, stderr=subprocess.DEVNULL))
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
     seen, rewards = None, deque(maxlen=1000)
@@ -68,10 +67,9 @@ def main() -> None:
             break
     if args.out:
         figure.savefig(args.out, dpi=100)
-    if server is not None and agent is not None:
-        agent.terminate()
-        agent.wait(timeout=20)
-        server.stop()
+    for program in reversed(programs):
+        program.terminate()
+        program.wait(timeout=20)
 
 
 if __name__ == "__main__":

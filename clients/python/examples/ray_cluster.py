@@ -13,7 +13,9 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import subprocess
 import threading
+import uuid
 from collections import defaultdict
 from typing import Any
 
@@ -29,8 +31,6 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 import emberwatch
 from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, unused_instance
-from emberwatch.settings import Settings
 
 MOVES = "emberwatch/WildfireMoves-v0"
 WORLD: dict[str, Any] = {
@@ -40,6 +40,8 @@ WORLD: dict[str, Any] = {
     "n_moves": 16,
     "burn_in": 3000,
 }
+#: The same worlds, as flags of a server.
+FLAGS = [f"--{name.replace('n_', '').replace('_', '-')}={value}" for name, value in WORLD.items()]
 SEEN = {"observation": "local", "max_episode_steps": 96}
 
 
@@ -48,8 +50,9 @@ class NodeServer:
     """Keeps a server on its node, which ends with it."""
 
     def __init__(self, n_worlds: int) -> None:
-        self._instance = unused_instance()
-        self._flags = [f"--instance={self._instance}", *Settings(**WORLD).server_flags(n_worlds)]
+        self._instance = f"ray-{uuid.uuid4().hex}"
+        self._command = ["emberwatch-server", f"--instance={self._instance}", *FLAGS]
+        self._command += [f"--worlds={n_worlds}", f"--exit-with={os.getpid()}"]
         self._start()
 
     def instance(self) -> str:
@@ -57,13 +60,14 @@ class NodeServer:
         try:
             emberwatch.connect(self._instance).close()
         except EmberwatchError:
-            self._server.stop()
+            self._server.kill()
+            self._server.wait()
             self._start()
         return self._instance
 
     def _start(self) -> None:
-        self._server = Program("emberwatch-server", self._flags)
-        self._server.wait_for(lambda: emberwatch.connect(self._instance)).close()
+        self._server = subprocess.Popen(self._command)
+        emberwatch.connect(self._instance, wait=20).close()
 
 
 @ray.remote(num_cpus=0)
@@ -89,7 +93,7 @@ def on(node: str) -> dict[str, Any]:
 def make(settings: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     """Makes all environments of a runner, in its process."""
     n_worlds = settings["num_envs"]
-    if settings["private"]:
+    if settings["own"]:
         return scaled(gymnasium.make_vec(MOVES, n_worlds, **WORLD, **SEEN))
     node = ray.get_runtime_context().get_node_id()
     instance = ray.get(ray.get_actor("servers").instance.remote(node))
@@ -171,7 +175,7 @@ def main() -> None:
     parser.add_argument("--runners", type=int, default=4, help="at most 15 on a node")
     parser.add_argument("--worlds", type=int, default=8, help="of each runner")
     parser.add_argument("--batch", type=int, default=4000, help="moves of an iteration")
-    parser.add_argument("--private", action="store_true", help="a server for each runner instead")
+    parser.add_argument("--own", action="store_true", help="worlds in each runner's process")
     parser.add_argument("--kill", action="store_true", help="a runner and a server, on nodes here")
     args = parser.parse_args()
     if args.kill and args.address is not None:
@@ -188,7 +192,7 @@ def main() -> None:
     servers = Servers.options(name="servers", **here).remote(args.runners * args.worlds)
     config = (
         PPOConfig()
-        .environment("wildfire", env_config={"runners": args.runners, "private": args.private})
+        .environment("wildfire", env_config={"runners": args.runners, "own": args.own})
         .env_runners(
             num_env_runners=args.runners,
             num_envs_per_env_runner=args.worlds,

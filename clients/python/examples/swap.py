@@ -13,19 +13,19 @@ import subprocess
 import numpy as np
 
 import emberwatch
-from emberwatch.programs import Program, find, unused_instance
 
 
 def main() -> None:
     """Runs the three agents one after another and prints where each begins and ends."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--steps", type=int, default=200, help="steps of the Python agent")
+    parser.add_argument("--instance", default="swap", help="name of the server that is started")
     args = parser.parse_args()
-    instance = unused_instance()
-    server = Program("emberwatch-server", ["--instance", instance])
-    client = server.wait_for(lambda: emberwatch.connect(instance))
+    instance = args.instance
+    server = subprocess.Popen(["emberwatch-server", "--instance", instance])
+    client = emberwatch.connect(instance, wait=20)
 
-    agent = [str(find("emberwatch-agent")), "run", "--instance", instance]
+    agent = ["emberwatch-agent", "run", "--instance", instance]
     first = subprocess.Popen(agent, stderr=subprocess.DEVNULL)
     for frame in emberwatch.observe(instance, timeout=60):
         if frame.result.step >= args.steps:
@@ -48,8 +48,9 @@ def main() -> None:
     last = client.observe().result().world
     print(f"the second Rust agent flew from k = {given.step} to k = {last.step}")
     assert last.step == given.step + args.steps
+    client.shutdown()
     client.close()
-    server.stop()
+    server.wait(timeout=20)
 
 
 if __name__ == "__main__":

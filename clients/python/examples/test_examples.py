@@ -54,7 +54,7 @@ EXAMPLES = [
     ),
     ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
     ("swap.py", "--steps 50", r"Python takes over\n(.*\n)*.*code 3 .*\n.*second Rust agent flew"),
-    ("live_plot.py", "--private --frames 60 --out OUT/plot.png", ""),
+    ("live_plot.py", "--start --instance plot --frames 60 --out OUT/plot.png", ""),
 ]
 
 

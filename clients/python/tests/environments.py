@@ -9,9 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from processes import Server, at_the_end
-
-import emberwatch
+from processes import Server, at_the_end, server
 
 WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
@@ -23,16 +21,23 @@ LIVELY = str(Path(__file__).with_name("lively.toml"))
 #: A description of recorded worlds.
 RECORDED = Path(__file__).with_name("recorded.toml")
 
-#: Keywords of a small world behind a private server.
+#: Keywords of a small world.
 SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "model": LIVELY}
+
+#: The same as a server names them.
+FLAGS: dict[str, Any] = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY}
 
 
 @contextlib.contextmanager
 def serving(**flags: object) -> Iterator[str]:
-    """A running server of `SMALL` worlds, by its instance name; `flags` as on its command line."""
-    small = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY, "threads": 1}
-    with contextlib.closing(Server(**{**small, **flags}, ready=False)) as server:
-        yield server.instance
+    """The instance name of a server of `SMALL` worlds; `flags` as on its command line."""
+    with contextlib.closing(Server(**{**FLAGS, **flags}, ready=False)) as started:
+        yield started.instance
+
+
+def small_server(**flags: object) -> Server:
+    """A server of `SMALL` worlds, which ends with the test."""
+    return server(**{**FLAGS, **flags}, ready=False)
 
 
 def closed_later(env: Any) -> Any:
@@ -49,12 +54,6 @@ def make(name: str = WILDFIRE, **keywords: Any) -> Any:
 def make_vec(n_worlds: int, name: str = WILDFIRE, **keywords: Any) -> Any:
     """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
     return closed_later(gymnasium.make_vec(name, num_envs=n_worlds, **_usual(name, keywords)))
-
-
-def private_pid(env: Any) -> int:
-    """The process of a private server."""
-    with emberwatch.connect(env.unwrapped.instance) as client:
-        return client.info.pid
 
 
 @contextlib.contextmanager

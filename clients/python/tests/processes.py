@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import select
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,10 +18,11 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from emberwatch.client import Client
-from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, unused_instance
-from emberwatch.replies import ServerStatus
+import pytest
+
+from emberwatch.client.client import Client, connect
+from emberwatch.client.replies import ServerStatus
+from emberwatch.errors import EmberwatchError, NoServerError
 
 #: How long anything may take that should take milliseconds, seconds.
 PATIENCE = 20.0
@@ -31,8 +36,55 @@ SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 #: Where iceoryx2 keeps files of nodes and services.
 CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
+#: Imports of this module in a `script`.
+IMPORTS = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+
 #: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
 at_the_end = ExitStack()
+
+
+def find(name: str) -> str:
+    """The path of one of our programs."""
+    path = shutil.which(name)
+    assert path is not None, f"expected {name} on the PATH"
+    return path
+
+
+def unused_instance() -> str:
+    """An instance name that no other program uses."""
+    return f"test-{secrets.token_hex(8)}"
+
+
+class Program:
+    """One of our programs in a process of its own, which ends with this process at the latest."""
+
+    def __init__(self, name: str, *arguments: str) -> None:
+        self._output = tempfile.TemporaryFile()
+        self.process = subprocess.Popen(
+            [find(name), *arguments, f"--exit-with={os.getpid()}"],
+            env={"RUST_LOG": "warn"} | os.environ,
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=self._output,
+            process_group=0,
+        )
+        self.pid = self.process.pid
+
+    def output(self) -> str:
+        """Everything that it has printed, without times and levels."""
+        self._output.seek(0)
+        return re.sub(r"(?m)^\S+Z +[A-Z]+ ", "", self._output.read().decode()).strip()
+
+    def ended(self) -> str:
+        """What it has printed, once it has ended by itself."""
+        self.process.wait(PATIENCE)
+        return self.output()
+
+    def stop(self) -> None:
+        """Stops it, if it still runs, and waits for its end."""
+        self.process.terminate()
+        self.process.wait(PATIENCE)
+        self._output.close()
 
 
 def server(instance: str | None = None, *, ready: bool = True, **flags: object) -> Server:
@@ -59,11 +111,14 @@ class Server:
             if value is not None:
                 word = str(value).lower() if isinstance(value, bool) else value
                 arguments.append(f"--{name.replace('_', '-')}={word}")
-        self.program = Program("emberwatch-server", arguments)
+        self.program = Program("emberwatch-server", *arguments)
         self._held = ExitStack()
         self._held.callback(self.program.stop)
         try:
-            self._client = self.program.wait_for(lambda: Client(self.instance))
+            try:
+                self._client = connect(self.instance, timeout=PATIENCE, wait=PATIENCE)
+            except NoServerError as error:
+                raise AssertionError(f"{error}: {self.program.output()}") from None
             self._held.enter_context(self._client)
             self._held.callback(self._shut_down)
             self._held.callback(self.wake_up)
@@ -105,7 +160,7 @@ class Server:
     def kill(self) -> None:
         """Ends it as no handler can prevent; returns when it has ended."""
         self.signal(signal.SIGKILL)
-        self.program._process.wait(PATIENCE)
+        self.program.process.wait(PATIENCE)
 
     def close(self) -> None:
         """Closes the connections and stops it."""
@@ -154,6 +209,28 @@ class Script:
         """Kills it."""
         self._process.kill()
         self._process.communicate()
+
+
+#: Runs a command; returns how it ended.
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def isolated(options: str, *, pids: bool = False) -> Run:
+    """Runs commands with a `/dev/shm` of their own, mounted with these options.
+
+    Skips the test where no mount namespace, or with `pids` no PID namespace in it, may be made.
+    """
+    unshare = ["unshare", "-m", *([] if os.getuid() == 0 else ["-r"]), "sh", "-c"]
+
+    def run(*command: str) -> subprocess.CompletedProcess[str]:
+        shell = f'mount -t tmpfs -o {options} tmpfs /dev/shm && exec "$@"'
+        words = [*unshare, shell, "sh", *command]
+        return subprocess.run(words, capture_output=True, text=True, timeout=120)
+
+    trial = ["unshare", "-p", "-f", "--mount-proc", "true"] if pids else ["true"]
+    if shutil.which("unshare") is None or run(*trial).returncode != 0:
+        pytest.skip("needs namespaces of its own: `unshare` is not permitted here")
+    return run
 
 
 def eventually(holds: Callable[[], bool], limit: float = PATIENCE) -> bool:

@@ -1,7 +1,6 @@
 """Sensors that see beyond the path, no-fly cells and zones, against loops over all cells."""
 
 import copy
-import dataclasses
 import pickle
 import warnings
 from itertools import product
@@ -32,15 +31,14 @@ from processes import server
 
 import emberwatch
 from emberwatch._native import Flights
-from emberwatch.airspace import Airspace
 from emberwatch.belief import Filter, Transition
+from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Description, Model, built_in
-from emberwatch.moves import fly
+from emberwatch.model.airspace import Airspace
+from emberwatch.model.moves import fly
 from emberwatch.planning import beam_search
-from emberwatch.prior import simulated_prior
 
 SHAPE = (7, 5)
-BACKENDS = ("server", "embedded")
 ALL_MOVES = (
     *("frame", "robot", "age", "belief", "local", "recent", "visited", "move"),
     "action_mask",
@@ -59,12 +57,9 @@ def seeing(tmp_path: Path) -> Any:
     return written
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("radius", "n_rings"), [(0, 1), (1, 1), (1, 2), (2, 2), (3, 4)])
-def test_a_frame_shows_what_is_in_sight_of_the_path(
-    seeing: Any, backend: str, radius: int, n_rings: int
-) -> None:
-    env = make(**seeing(radius=radius, n_rings=n_rings), backend=backend, truth=True)
+def test_a_frame_shows_what_is_in_sight_of_the_path(seeing: Any, radius: int, n_rings: int) -> None:
+    env = make(**seeing(radius=radius, n_rings=n_rings), truth=True)
     air = env.unwrapped.world_spec.airspace
     assert (air.radius, air.n_rings, air.no_fly.tolist()) == (radius, n_rings, land.NO_FLY.tolist())
     assert env.unwrapped.world_spec.n_observations == 3 * n_rings
@@ -86,10 +81,9 @@ def test_a_frame_shows_what_is_in_sight_of_the_path(
     assert n_stays > 20
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("robots", [1, 3])
-def test_what_is_seen_can_pay(seeing: Any, backend: str, robots: int) -> None:
-    keywords = {**seeing(radius=2, pays="seen"), "backend": backend, "robots": robots}
+def test_what_is_seen_can_pay(seeing: Any, robots: int) -> None:
+    keywords = {**seeing(radius=2, pays="seen"), "robots": robots}
     for reward in ("share", "team", "marginal"):
         env = make_vec(2 * robots, truth=True, reward=reward, **keywords)
         env.reset(seed=3)
@@ -190,20 +184,17 @@ def test_action_masks_are_those_of_a_loop(no_fly: Any) -> None:
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
-def test_the_checker_and_both_backends_agree(seeing: Any, name: str) -> None:
+def test_the_checker_and_a_server_agree(seeing: Any, name: str) -> None:
     keywords = seeing(radius=2, n_rings=2, pays="seen", zone_map=np.eye(*SHAPE, dtype=np.uint8))
     parts = ALL_MOVES if name == MOVES else ("frame", "image", "robot", "age", "belief")
-    at_server, embedded = (
-        make(name, **keywords, observation=parts, backend=backend) for backend in BACKENDS
-    )
-    assert at_server.observation_space == embedded.observation_space
-    assert_same(rollout(at_server, 60, seed=5), rollout(embedded, 60, seed=5))
-    check_env(make(name, **keywords, backend="embedded").unwrapped, skip_render_check=True)
+    here = make(name, **keywords, observation=parts)
+    check_env(make(name, **keywords).unwrapped, skip_render_check=True)
     flags = {"model": keywords["model"], "start": "2,2", "moves": 6}
     with serving(**flags) as instance:
         running = make(name, instance=instance, observation=parts)
-        assert running.unwrapped.world_spec == dataclasses.replace(at_server.unwrapped.world_spec)
-        assert_same(rollout(running, 60, seed=5), rollout(at_server, 60, seed=5))
+        assert running.observation_space == here.observation_space
+        assert running.unwrapped.world_spec == here.unwrapped.world_spec
+        assert_same(rollout(running, 60, seed=5), rollout(here, 60, seed=5))
 
 
 def test_a_radius_may_be_given_beside_a_model() -> None:
@@ -250,10 +241,9 @@ def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
     far, near = tmp_path / "far.toml", tmp_path / "near.toml"
     far.write_text(small.replace('"small"', '"far"') + "sensor_radius = 2\n")
     near.write_text(small.replace('"small"', '"far"') + "sensor_radius = 1\n")
-    for backend in BACKENDS:
-        env = closed_later(gymnasium.make(WILDFIRE, task=far, backend=backend))
-        assert env.unwrapped.model.sensor_radius == 2
-        assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
+    env = closed_later(gymnasium.make(WILDFIRE, task=far))
+    assert env.unwrapped.model.sensor_radius == 2
+    assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
     none = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
     with serving(**none, task=far) as instance:
         env = closed_later(gymnasium.make(WILDFIRE, task=far, instance=instance))
@@ -280,12 +270,9 @@ def test_recorded_worlds_are_seen_from_afar_too(tmp_path: Path) -> None:
         "hot ring 1",
     )
     assert env.observation_space["image"].shape == (7, 5, 5)
-    near, embedded = (
-        make(MOVES, **keywords, sensor_radius=0, backend=backend) for backend in BACKENDS
-    )
+    near = make(MOVES, **keywords, sensor_radius=0)
     assert near.observation_space["image"].shape == (7, 5, 3)
     assert near.unwrapped.world_spec.description.n_rings == 1
-    assert_same(rollout(near, 20, seed=1), rollout(embedded, 20, seed=1))
     flags = dict.fromkeys(("height", "width", "burn_in", "model"))
     with serving(**flags, states=path, start="2,2", sensor_radius=1) as instance:
         spec = make(instance=instance).unwrapped.world_spec
@@ -422,21 +409,19 @@ def pocket(tmp_path: Path) -> dict[str, Any]:
     return {"model": path, "height": 12, "width": 9, "n_moves": 4, "burn_in": 0}
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_random_starts_are_in_no_pocket(pocket: dict[str, Any], backend: str) -> None:
-    env = make(**pocket, backend=backend, start="random")
+def test_random_starts_are_in_no_pocket(pocket: dict[str, Any]) -> None:
+    env = make(**pocket, start="random")
     starts = {tuple(env.reset(seed=seed)[0]["robot"].tolist()) for seed in range(600)}
     assert len(starts) == 12 * 9 - 12, "all cells but 10 no-fly cells and two in a pocket"
     assert not starts & {(4, 4), (4, 5)}
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_start_in_a_pocket_is_warned_of(pocket: dict[str, Any], backend: str) -> None:
+def test_a_start_in_a_pocket_is_warned_of(pocket: dict[str, Any]) -> None:
     words = r"start: no-fly cells close in \(4, 4\): .* reach 2 of 98 free cells"
     with pytest.warns(UserWarning, match=words):
-        env = make(**pocket, backend=backend, start="4,4")
+        env = make(**pocket, start="4,4")
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         assert env.reset(seed=1)[0]["robot"].tolist() == [4, 4]
-        make(**pocket, backend=backend, start="centre").reset(seed=1)
+        make(**pocket, start="centre").reset(seed=1)
     assert not [each for each in found if "start" in str(each.message)], "once, when it is made"

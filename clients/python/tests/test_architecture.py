@@ -33,6 +33,6 @@ def imports(path: Path) -> set[str]:
 
 def test_no_module_imports_itself_through_others() -> None:
     graph = {name: imports(path) & modules().keys() for name, path in modules().items()}
-    assert len(graph) > 30 and "emberwatch.wire" in graph["emberwatch.connection"]
+    assert len(graph) > 30 and "emberwatch.client.wire" in graph["emberwatch.client.connection"]
     order = list(TopologicalSorter(graph).static_order())
-    assert order.index("emberwatch.errors") < order.index("emberwatch.env")
+    assert order.index("emberwatch.errors") < order.index("emberwatch.envs.path_env")

@@ -12,8 +12,8 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from emberwatch.belief import Filter, initial_prior, uniform_prior
+from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
-from emberwatch.prior import simulated_prior
 from emberwatch.wrappers import BeliefObservation
 
 WILDFIRE = Model.wildfire()

@@ -13,12 +13,11 @@ import pytest
 from environments import LIVELY, MOVES, RECORDED, WILDFIRE
 from failures import refuses
 from numpy.typing import NDArray
-from processes import server
+from processes import find, server
 
 import emberwatch
-from emberwatch import recording
 from emberwatch.benchmark import Row, evaluate, read, summary
-from emberwatch.programs import find
+from emberwatch.client import recording
 
 WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 6, "model": LIVELY, "burn_in": 60}
 SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}

@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 from environments import LIVELY
 from failures import refuses
-from processes import script
+from processes import find, script
 
 from emberwatch.benchmark import Row, evaluate, read, row_file
 from emberwatch.benchmark.row_file import Kind, Mark, RowFile
-from emberwatch.programs import find
 
 WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
 
@@ -31,7 +30,6 @@ sys.stdin.readline()  # so that both begin together
 evaluate(
     lambda frames: np.ones(len(frames), int), name=name, csv=csv, seeds=range(20), batch=1, steps=3,
     model=model, height=7, width=9, n_moves=4, burn_in=60, observation="frame", progress=None,
-    backend="embedded",
 )
 print("done")
 """

@@ -103,7 +103,7 @@ def test_another_policy_or_setting_runs_again_and_says_so(
 
 def test_defaults_that_are_named_are_other_worlds_only_if_they_differ(file: Path) -> None:
     rows, _ = go(file)
-    again, said = go(file, env=MOVES, start="corner", sensor_radius=0, backend="embedded", batch=2)
+    again, said = go(file, env=MOVES, start="corner", sensor_radius=0, batch=2)
     assert again == rows and "3 rows kept" in said
 
 

@@ -9,7 +9,7 @@ from failures import fails
 from processes import LONG, PATIENCE, asleep, eventually, script, server
 
 from emberwatch import errors
-from emberwatch.client import connect
+from emberwatch.client.client import connect
 
 US = os.getpid()
 
@@ -87,15 +87,12 @@ def test_closing_again_is_fine_and_a_closed_client_says_so() -> None:
 
 FORK = """
 import multiprocessing, os, sys, threading
-from emberwatch.client import Client
+from emberwatch.client.client import Client
 from emberwatch.errors import EmberwatchError
-from emberwatch.observer import observe
-from emberwatch.programs import Program, unused_instance
+from emberwatch.client.observer import observe
 
-how, instance = sys.argv[1], unused_instance()
-small = "--height=5 --width=7 --moves=6 --burn-in=20".split()
-program = Program("emberwatch-server", [f"--instance={instance}", *small])
-client = program.wait_for(lambda: Client(instance))
+how, instance = sys.argv[1:]
+client = Client(instance)
 lease, observer = client.acquire(), observe(instance, timeout=0)
 lease.step([3] * 6)
 
@@ -110,7 +107,6 @@ def child():
             os._exit(9)
     client.close()
     observer.close()
-    program.stop()
     with Client(instance) as own:
         assert own.observe().result().world.step == 1
     if how == "sys.exit":
@@ -142,7 +138,7 @@ print("child", code)
     [("sys.exit", 5), ("os._exit", 5), ("exception", 1), ("multiprocessing", 0)],
 )
 def test_a_forked_child_is_refused_and_its_parent_goes_on(how: str, code: int) -> None:
-    ended, out, err = script(FORK, how).end()
+    ended, out, err = script(FORK, how, server().instance).end()
     assert (ended, out) == (0, f"child {code}\n"), err
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from failures import fails, refuses
 from numpy.typing import NDArray
-from processes import PATIENCE, eventually, is_running, script, server
+from processes import PATIENCE, eventually, find, is_running, script, server
 
 import emberwatch
-from emberwatch import errors, wire
-from emberwatch.client import Client, connect
-from emberwatch.programs import find
+from emberwatch import errors
+from emberwatch.client import wire
+from emberwatch.client.client import Client, connect
 
 US = os.getpid()
 

@@ -3,35 +3,29 @@
 Each in a mount namespace of its own; skipped where none may be made.
 """
 
-import os
 import resource
-import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from failures import fails
-from processes import server
-
-from emberwatch import programs
-from emberwatch.model import Model
-from emberwatch.programs import Program, unused_instance
+from processes import IMPORTS, isolated, server
 
 #: Runs Python code, its arguments behind, in a mount namespace with a `/dev/shm` of its own.
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
-SMALL = "height=5, width=7, n_moves=6, burn_in=5"
-
 #: Says what an error says: its code and its words.
-HEAD = """
+HEAD = f"""{IMPORTS}
 import os, subprocess, sys, time
 import emberwatch
-from emberwatch.env import WildfireEnv
 from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, find
+from processes import Program, find
+"""
+HEAD += """
+def start(*flags):
+    server = Program("emberwatch-server", "--instance=lab", *flags)
+    return server, emberwatch.connect("lab", wait=20)
 def fill(left=0):
     with open("/dev/shm/filler", "wb") as file:
         while True:
@@ -47,18 +41,12 @@ def tell(what, call):
 @pytest.fixture
 def apart() -> Run:
     """Runs Python code where `/dev/shm` is its own."""
-    user = [] if os.getuid() == 0 else ["-r"]
-    unshare = ["unshare", "-m", *user, "sh", "-c"]
 
-    def run(code: str, options: str = "size=64m") -> subprocess.CompletedProcess[str]:
-        shell = f'mount -t tmpfs -o {options} tmpfs /dev/shm && exec "$@"'
-        command = [*unshare, shell, "sh", sys.executable, "-W", "ignore", "-c", HEAD + code]
-        return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    def python(code: str, options: str = "size=64m") -> subprocess.CompletedProcess[str]:
+        run = isolated(options, pids=True)
+        return run(sys.executable, "-W", "ignore", "-c", HEAD + code)
 
-    pid = [*unshare, "unshare -p -f --mount-proc true"]
-    if shutil.which("unshare") is None or subprocess.run(pid, check=False).returncode != 0:
-        pytest.skip("needs mount and PID namespaces: `unshare` is not permitted here")
-    return run
+    return python
 
 
 #: Runs code in a PID namespace of its own.
@@ -70,35 +58,16 @@ def inside(code, *arguments):
 """
 
 
-def test_private_servers_of_two_pid_namespaces_are_never_mixed_up(apart: Run) -> None:
-    code = f"""
-code = '''
-import os, sys
-from emberwatch.env import WildfireEnv
-env = WildfireEnv({SMALL.replace("height=5", "height=int(sys.argv[1])")})
-frame = env.reset(seed=1)[0]["frame"]
-print(os.getpid(), frame.shape[0], flush=True)
-sys.stdin.readline()
-for _ in range(20): info = env.step([1] * 6)[4]
-env.close()
-print(info["step"], flush=True)
-'''
-first, second = inside(code, "5"), inside(code, "6")
-print([it.stdout.readline().split() for it in (first, second)])
-print([it.communicate()[0].split() for it in (first, second)])
-"""
-    ended = apart(INSIDE + code, "size=256m")
-    assert ended.stdout == "[['1', '5'], ['1', '6']]\n[['20'], ['20']]\n", ended.stderr
-
-
 def test_a_server_of_another_pid_namespace_is_named_so_and_goes_on(apart: Run) -> None:
-    code = """
-server = Program("emberwatch-server", ["--instance=lab", "--burn-in=5"])
-client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+    code = (
+        """
+server, client = start("--burn-in=5")
 lease = client.acquire()
-code = '''
+code = """
+        + repr(IMPORTS)
+        + """ + '''
 import emberwatch, subprocess
-from emberwatch.programs import find
+from processes import find
 try: emberwatch.connect("lab")
 except emberwatch.EmberwatchError as error: print(error.code, error)
 for command in ("status", "stop"):
@@ -108,8 +77,9 @@ words = [find("emberwatch-server"), "--instance=lab", "--burn-in=5"]
 print("second", subprocess.run(words, capture_output=True, text=True).stderr.strip())
 '''
 print(inside(code).communicate()[0], end="")
-print(lease.step([1] * 64).result().world.step, server.exit_code() is None)
+print(lease.step([1] * 64).result().world.step, server.process.poll() is None)
 """
+    )
     ended = apart(INSIDE + code, "size=256m")
     lines = ended.stdout.splitlines()
     assert len(lines) == 5, ended
@@ -124,13 +94,11 @@ print(lease.step([1] * 64).result().world.step, server.exit_code() is None)
 @pytest.mark.parametrize("left", [0, 4096, 16384, 131072])
 def test_with_little_shared_memory_programs_say_so_and_do_not_die(apart: Run, left: int) -> None:
     code = f"""
-server = Program("emberwatch-server", ["--instance=lab", "--burn-in=5"])
-client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+server, client = start("--burn-in=5")
 lease = client.acquire()
 fill({left})
 tell("connect", lambda: emberwatch.connect("lab"))
 tell("observe", lambda: next(iter(emberwatch.observe("lab", timeout=2))))
-tell("environment", lambda: WildfireEnv(burn_in=0).reset(seed=1))
 words = [find("emberwatch-server"), "status", "--instance=lab"]
 print("status", subprocess.run(words, capture_output=True, text=True).stderr.strip())
 for _ in range(200): lease.step([1] * 64)
@@ -139,7 +107,7 @@ print(client.status().n_steps)
     ended = apart(code)
     assert ended.returncode == 0, ended
     *lines, n_steps = ended.stdout.splitlines()
-    assert (len(lines), n_steps) == (4, "200"), ended
+    assert (len(lines), n_steps) == (3, "200"), ended
     for line in lines:
         assert "shared memory: expected 512 KiB free in /dev/shm, got" in line, line
         assert "--shm-size" in line, line
@@ -147,9 +115,7 @@ print(client.status().n_steps)
 
 def test_a_full_shared_memory_kills_no_server_with_observers(apart: Run) -> None:
     code = """
-flags = ["--instance=lab", "--worlds=8", "--publish-truth=true", "--burn-in=5"]
-server = Program("emberwatch-server", flags)
-client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+server, client = start("--worlds=8", "--publish-truth=true", "--burn-in=5")
 lease = client.acquire(0, 8)
 others = [emberwatch.connect("lab") for _ in range(4)]
 observers = [emberwatch.observe("lab", timeout=5) for _ in range(3)]
@@ -172,9 +138,7 @@ print(lease.reset(range(8))[0].step, server.pid == client.status().pid)
 
 def test_an_observer_that_comes_to_a_full_server_harms_nobody(apart: Run) -> None:
     code = """
-server = Program("emberwatch-server", ["--instance=lab", "--height=200", "--width=200",
-    "--burn-in=0", "--moves=6"])
-client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+server, client = start("--height=200", "--width=200", "--burn-in=0", "--moves=6")
 lease = client.acquire()
 fill(600 * 1024)
 observer = emberwatch.observe("lab", timeout=1)
@@ -190,9 +154,8 @@ print(next(iter(observer)).result.step)
 
 def test_a_long_answer_without_room_is_refused_and_kills_no_server(apart: Run) -> None:
     code = """
-flags = ["--instance=lab", "--worlds=256", "--robots=8", "--height=5", "--width=5", "--moves=4"]
-server = Program("emberwatch-server", [*flags, "--burn-in=0"])
-client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+small = ("--height=5", "--width=5", "--moves=4", "--burn-in=0")
+server, client = start("--worlds=256", "--robots=8", *small)
 fill()
 tell("status", client.status)
 os.unlink("/dev/shm/filler")
@@ -224,29 +187,10 @@ def test_a_low_limit_on_file_sizes_is_called_so() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_private_names_are_random() -> None:
-    first, second = unused_instance(), unused_instance()
-    assert first.rpartition("-")[2] != second.rpartition("-")[2]
-
-
-def test_a_server_that_was_not_started_is_not_taken_for_the_own() -> None:
-    other = server()
-    own = Program("emberwatch-server", [f"--instance={unused_instance()}", "--burn-in=0"])
-    with fails("program", match=f"which was started, got pid {other.program.pid}"):
-        own.wait_for(other.connect)
-    assert other.status().pid == other.program.pid
-
-
-def _no_folder(*_: Any, **keywords: Any) -> Any:
-    if keywords.get("dir") is None:
-        raise FileNotFoundError(2, "No usable temporary directory found")
-    return FOLDER(**keywords)
-
-
-FOLDER = tempfile.TemporaryDirectory
-
-
-def test_no_temporary_folder_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs.tempfile, "TemporaryFile", _no_folder)
-    assert server().status().pid > 0
-    assert Model.named("wildfire-small").n_states > 1
+def test_a_server_too_large_for_shared_memory_does_not_start(apart: Run) -> None:
+    code = """
+print(Program("emberwatch-server", "--height=512", "--width=512", "--burn-in=0").ended())
+"""
+    ended = apart(code)
+    for words in ("/dev/shm", "MiB", "free"):
+        assert words in ended.stdout, ended

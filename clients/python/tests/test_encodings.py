@@ -13,7 +13,7 @@ from failures import refuses
 import emberwatch
 from emberwatch.benchmark import evaluate
 from emberwatch.model import Model
-from emberwatch.tasks import Task
+from emberwatch.model.tasks import Task
 
 TASK = """name = "mine"
 model = "wildfire-small"

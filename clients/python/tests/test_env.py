@@ -6,7 +6,6 @@ import os
 import pickle
 import pydoc
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -30,27 +29,25 @@ from environments import (
     make,
     make_vec,
     no_warnings,
-    private_pid,
     rollout,
     serving,
+    small_server,
 )
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
-from processes import stopped
+from processes import find, stopped
 
 import emberwatch
+from emberwatch.envs.parallel import WildfireParallelEnv
+from emberwatch.envs.settings import Settings
 from emberwatch.errors import (
-    EmberwatchError,
     LeaseLostError,
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
 )
 from emberwatch.model import Model
-from emberwatch.parallel import WildfireParallelEnv
-from emberwatch.programs import find
-from emberwatch.settings import Settings
 
 PARTS = ["frame", "robot", "age"]
 
@@ -187,10 +184,10 @@ def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPa
             return answer
 
         monkeypatch.setattr(session, "step", step_and_be_late)
-        private = make(truth=True)
-        private.reset(seed=1)
-        for action in actions(private, 3):
-            assert_same(env.step(action), private.step(action))
+        alone = make(truth=True)
+        alone.reset(seed=1)
+        for action in actions(alone, 3):
+            assert_same(env.step(action), alone.step(action))
 
 
 def test_the_truth_is_found_among_many_worlds() -> None:
@@ -244,8 +241,7 @@ def test_seed_zero_is_a_seed() -> None:
     one.reset(seed=5)
     assert_same(one.reset(seed=0), other.reset(seed=0))
     assert one.unwrapped.np_random_seed == 0
-    with emberwatch.connect(one.unwrapped.instance) as client:
-        assert client.status().worlds[0].seed == 0
+    assert one.unwrapped.lease.client.status().worlds[0].seed == 0
 
 
 def test_a_seeded_reset_can_be_repeated() -> None:
@@ -275,11 +271,10 @@ def test_an_environment_never_seeded_is_random(making: Any) -> None:
     assert len(truths) == 4
 
 
-def test_private_attached_and_vector_worlds_are_the_same() -> None:
-    private = make(truth=True, observation=PARTS)
-    expected = rollout(private, 10, seed=1234)
-    paths = actions(private, 10)
-    private.close()
+def test_own_attached_and_vector_worlds_are_the_same() -> None:
+    own = make(truth=True, observation=PARTS)
+    expected = rollout(own, 10, seed=1234)
+    paths = actions(own, 10)
     with serving(publish_truth=True, worlds=3, seed=99) as instance:
         attached = make(instance=instance, world=1, truth=True, observation=PARTS)
         assert_same(rollout(attached, 10, seed=1234), expected)
@@ -299,7 +294,7 @@ def test_private_attached_and_vector_worlds_are_the_same() -> None:
 def test_rust_and_python_see_the_same_frames() -> None:
     n_steps = 12
     with serving(seed=321) as instance, emberwatch.observe(instance) as observer:
-        command = [str(find("emberwatch-agent")), "run", "--instance", instance, "--world", "0"]
+        command = [find("emberwatch-agent"), "run", "--instance", instance, "--world", "0"]
         command += ["--steps", str(n_steps), "--policy", "random_walk"]
         subprocess.run(command, check=True, capture_output=True, timeout=30)
         frames: dict[int, emberwatch.Frame] = {}
@@ -377,7 +372,7 @@ def test_a_server_may_truncate_earlier(name: str, n_actions: int) -> None:
 
 def test_resume_goes_on_where_another_agent_stopped() -> None:
     with serving() as instance:
-        command = [str(find("emberwatch-agent")), "run", "--instance", instance]
+        command = [find("emberwatch-agent"), "run", "--instance", instance]
         command += ["--steps", "5", "--policy", "random_walk"]
         subprocess.run(command, check=True, capture_output=True, timeout=30)
         with emberwatch.connect(instance) as client:
@@ -396,19 +391,7 @@ def test_resume_goes_on_where_another_agent_stopped() -> None:
         assert env.reset(seed=1)[1]["step"] == 0
 
 
-def test_a_closed_private_world_cannot_be_resumed() -> None:
-    env = make()
-    env.reset(seed=1)
-    env.close()
-    with refuses("options: expected a reset before resume=True"):
-        env.reset(options={"resume": True})
-    with fails("closed"):
-        env.step([0] * 4)
-
-
-def test_resume_of_a_private_world_is_where_it_stands() -> None:
-    with refuses("expected a reset before resume=True"):
-        make().reset(options={"resume": True})
+def test_resume_is_where_the_world_stands() -> None:
     env = make()
     env.reset()
     last = env.step([1, 1, 1, 1])
@@ -470,8 +453,9 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ({"timeout": None}, "timeout: expected float, got None"),
         ({"timeout": 0}, "timeout: expected seconds above 0, got 0"),
         ({"timeout": float("nan")}, "timeout: .* got nan"),
-        ({"world": 1}, "expected instance=..., .* got world 1"),
-        ({"takeover": True}, "expected instance=..."),
+        ({"world": 1}, "^world: applies only with instance=..., the name of a running server"),
+        ({"robot": 0}, "^robot: applies only with instance="),
+        ({"takeover": True}, "^takeover: applies only with instance="),
         ({"instance": "no spaces"}, "got 'no spaces'"),
         (
             {"name": MOVES, "reward": "cell"},
@@ -513,7 +497,12 @@ def test_an_unknown_render_mode_is_named() -> None:
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES, OBJECTIVE])
 @pytest.mark.parametrize(
     ("keyword", "hint"),
-    [("hight", r" \(did you mean 'height'\?\)"), ("num_envs", ""), ("renderMode", ".*_mode.*")],
+    [
+        ("hight", r" \(did you mean 'height'\?\)"),
+        ("num_envs", ""),
+        ("renderMode", ".*_mode.*"),
+        ("backend", ""),
+    ],
 )
 def test_an_unknown_keyword_is_named(name: str, keyword: str, hint: str) -> None:
     with pytest.raises(TypeError) as raised:
@@ -523,18 +512,21 @@ def test_an_unknown_keyword_is_named(name: str, keyword: str, hint: str) -> None
     assert ("checkpoint" in str(raised.value)) == (name == OBJECTIVE)
 
 
-def test_a_missing_model_is_named_by_make() -> None:
+def test_a_missing_or_wrong_model_is_named_by_make(tmp_path: Path) -> None:
     words = r"model file nowhere\.toml: No such file .*expected one, or wildfire, "
     with refuses(words):
         make(model="nowhere.toml")
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("name = 5\n")
+    with refuses(r"wrong\.toml: .*line 1, column 8"):
+        make(model=wrong)
 
 
 @pytest.mark.parametrize("name", ["wildfire-sparse", Path("wildfire-latent")])
 def test_a_model_may_be_named(name: str | Path) -> None:
     env = make(model=name)
     env.reset(seed=1)
-    with emberwatch.connect(env.unwrapped.instance) as client:
-        assert env.unwrapped.model == Model.from_toml(client.info.model)
+    assert env.unwrapped.model == Model.from_toml(env.unwrapped.lease.client.info.model)
     assert env.unwrapped.model.name == str(name)
 
 
@@ -679,21 +671,21 @@ def test_another_server_of_other_size_is_refused() -> None:
 
 
 def test_a_reset_waits_for_the_next_server() -> None:
-    with serving() as instance:
-        env = make(instance=instance, timeout=20.0)
-        expected = rollout(env, 5, seed=3)
-        os.kill(private_pid(env), signal.SIGKILL)
-        with ThreadPoolExecutor() as threads:
-            again = threads.submit(rollout, env, 5, seed=3)
-            with serving(instance=instance):
-                assert_same(again.result(60), expected)
+    started = small_server()
+    env = make(instance=started.instance, timeout=20.0)
+    expected = rollout(env, 5, seed=3)
+    started.kill()
+    with ThreadPoolExecutor() as threads:
+        again = threads.submit(rollout, env, 5, seed=3)
+        small_server(instance=started.instance)
+        assert_same(again.result(60), expected)
 
 
 def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
-    env = make()
+    started = small_server()
+    env = make(instance=started.instance)
     env.reset(seed=1)
-    pid = private_pid(env)
-    with stopped(pid), impatient(env), pytest.raises(RequestTimeoutError):
+    with stopped(started.program.pid), impatient(env), pytest.raises(RequestTimeoutError):
         env.step([1, 1, 3, 3])
     with fails("closed", match="timed out"):
         env.step([1, 1, 3, 3])
@@ -701,39 +693,6 @@ def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
         observation, info = env.reset(options={"resume": True})
         assert observation["robot"].tolist() == ([2, 2] if info["step"] else [0, 0])
     assert env.step([0, 0, 0, 0])[4]["step"] == info["step"] + 1
-
-
-def test_a_forked_child_makes_its_own_connection() -> None:
-    env = make()
-    expected = rollout(env, 3, seed=5)
-    pid = private_pid(env)
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        words = "nothing"
-        try:
-            try:
-                env.step([0, 0, 0, 0])
-            except EmberwatchError as error:
-                assert error.code == "forked"
-                words = f"{error}"
-            env.close()
-            assert_same(rollout(env, 3, seed=5), expected)
-            env.close()
-            words += "; the same"
-        except BaseException as error:
-            words += f"; {error!r}"
-        finally:
-            os.write(write, words.encode())
-            os._exit(0)
-    os.close(write)
-    with os.fdopen(read) as pipe:
-        words = pipe.read()
-    os.waitpid(child, 0)
-    assert "belongs to the process that forked" in words and words.endswith("; the same")
-    # The parent's is unharmed.
-    assert private_pid(env) == pid
-    assert env.step([0, 0, 0, 0])[4]["step"] == 4
 
 
 # Gymnasium's registry, vectorizers and wrappers
@@ -771,8 +730,8 @@ def test_an_environment_can_be_made_again_from_its_spec(name: str) -> None:
     gymnasium.spec(name).to_json()
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_async_vector_env_runs_a_server_in_each_worker(context: str) -> None:
+@pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
+def test_async_vector_env_simulates_in_each_worker(context: str) -> None:
     single = make()
     expected = rollout(single, 3, seed=21)
     paths = actions(single, 3)
@@ -788,7 +747,7 @@ def test_async_vector_env_runs_a_server_in_each_worker(context: str) -> None:
 
 
 def _make_small() -> gymnasium.Env[Any, Any]:
-    return gymnasium.make(WILDFIRE, **SMALL)
+    return gymnasium.make(f"emberwatch:{WILDFIRE}", **SMALL)
 
 
 def test_async_vector_env_attaches_its_workers() -> None:

@@ -1,6 +1,5 @@
 """Faults: processes killed and stopped at the worst moment."""
 
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -11,32 +10,27 @@ from processes import (
     CHANNELS,
     LONG,
     PATIENCE,
-    Script,
     Server,
     asleep,
     connects,
     eventually,
-    is_running,
     script,
     server,
     services,
 )
 
 from emberwatch import errors
-from emberwatch.client import connect
-from emberwatch.env import WildfireEnv
+from emberwatch.client.client import connect
 
-SMALL = {"height": 5, "width": 7, "n_moves": 6, "burn_in": 20}
-
-#: A learner with a private server: prints the server's pid and its instance.
-EMBEDDED = """
+#: A learner on worlds in its process, or at a server that its argument names.
+LEARNER = """
 import os, sys, time
-from emberwatch.env import WildfireEnv
-env = WildfireEnv(height=5, width=7, n_moves=6, burn_in=20)
+from emberwatch.envs.path_env import WildfireEnv
+instance = {"instance": sys.argv[1]} if len(sys.argv) > 1 else {}
+env = WildfireEnv(height=5, width=7, n_moves=6, burn_in=20, **instance)
 env.reset(seed=1)
 env.step([3] * 6)
-session = env._session
-print(session._client.info.pid, session.instance, flush=True)
+print("flies", flush=True)
 
 def fly():
     while True:
@@ -56,8 +50,6 @@ ENDS = {
     "import atexit; atexit.register(lambda: env.step([3] * 6))": 0,
     "import threading; threading.Thread(target=fly, daemon=True).start(); time.sleep(0.1)": 0,
 }
-
-ABRUPT = ("os._exit(4)", "os.abort()")
 
 #: How it may be ended while it steps.
 SIGNALS = {
@@ -139,7 +131,7 @@ def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps() -> None:
 
 
 class Remains:
-    """What two processes have in shared memory, and whether it is gone."""
+    """What processes have in shared memory, and whether it is gone."""
 
     def __init__(self, *pids: int) -> None:
         maps = "".join(Path(f"/proc/{pid}/maps").read_text() for pid in pids)
@@ -156,58 +148,56 @@ class Remains:
         return [*map(str, found), *(str(pid) for pid in pids if pid in self._pids)]
 
 
-def embedded(end: str) -> tuple[Script, int, str]:
-    """A learner with a private server: its process, the server's pid and instance."""
-    learner = script(EMBEDDED + end)
-    pid, instance = learner.line().split()
-    return learner, int(pid), instance
-
-
 @pytest.mark.parametrize("end", ENDS, ids=lambda end: end.partition(";")[0] or "normal")
-def test_a_private_server_ends_however_python_ends(end: str) -> None:
-    learner, pid, instance = embedded("input()\n" + end)
-    assert is_running(pid)
-    remains = Remains(learner.pid, pid)
-    learner.say()
-    code, _, _ = learner.end()
-    assert code == ENDS[end]
-    # A server that Python stops ends before it; else the server notices.
-    limit = PATIENCE if end in ABRUPT else 0.0
-    assert eventually(lambda: not is_running(pid), limit)
-    next_start(instance)
-    assert (remains.left(), services(instance)) == ([], [])
+def test_a_learner_ends_as_it_wants_and_leaves_nothing(end: str) -> None:
+    started = server()
+    for instance in ([], [started.instance]):
+        learner = script(LEARNER + "input()\n" + end, *instance)
+        assert learner.line() == "flies"
+        remains = Remains(learner.pid) if instance else None
+        learner.say()
+        assert learner.end()[0] == ENDS[end]
+    check_left(started, remains)
 
 
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-def test_a_private_server_ends_with_a_signalled_python(number: int) -> None:
-    learner, pid, instance = embedded("while True: env.step([1] * 6)")
-    remains = Remains(learner.pid, pid)
-    learner.signal(number)
-    code, _, _ = learner.end()
-    assert code == SIGNALS[number]
-    assert eventually(lambda: not is_running(pid))
-    next_start(instance)
-    assert (remains.left(), services(instance)) == ([], [])
+def test_a_learner_ends_by_a_signal_and_leaves_nothing(number: int) -> None:
+    started = server()
+    for instance in ([], [started.instance]):
+        learner = script(LEARNER + "while True: env.step([1] * 6)", *instance)
+        assert learner.line() == "flies"
+        remains = Remains(learner.pid) if instance else None
+        learner.signal(number)
+        assert learner.end()[0] == SIGNALS[number]
+    check_left(started, remains)
 
 
-def test_nothing_is_left_when_learner_and_private_server_are_killed() -> None:
-    learner, pid, instance = embedded("while True: env.step([1] * 6)")
-    remains = Remains(learner.pid, pid)
-    for process in (pid, learner.pid):
-        os.kill(process, signal.SIGKILL)
-    learner.end()
-    assert eventually(lambda: not is_running(pid))
-    next_start(instance)
-    assert (remains.left(), services(instance)) == ([], [])
+def check_left(started: Server, remains: Remains) -> None:
+    """The server's world is free; once the server has ended, the next one finds nothing left."""
+    assert eventually(lambda: started.status().n_clients == 1)
+    started.connect().acquire()
+    started.close()
+    check_removed(started.instance, remains)
 
 
-def next_start(instance: str) -> None:
-    """What any next start does first; nobody serves the instance of the last one."""
+def check_removed(instance: str, remains: Remains) -> None:
+    """The next server on this machine removes everything that the last one has left."""
     with pytest.raises(errors.NoServerError):
         connect(instance)
-    env = WildfireEnv(**SMALL)
-    env.reset(seed=1)
-    env.close()
+    server()
+    assert (remains.left(), services(instance)) == ([], [])
+
+
+def test_nothing_is_left_when_learner_and_server_are_killed() -> None:
+    started = server()
+    learner = script(LEARNER + "while True: env.step([1] * 6)", started.instance)
+    assert learner.line() == "flies"
+    remains = Remains(learner.pid, started.program.pid)
+    started.kill()
+    learner.signal(signal.SIGKILL)
+    learner.end()
+    started.close()
+    check_removed(started.instance, remains)
 
 
 def test_a_killed_client_frees_its_worlds_at_once() -> None:

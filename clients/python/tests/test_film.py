@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from test_recording import FILE_HEADER, deflated, packed
 
-from emberwatch import wire
 from emberwatch.belief import Filter, uniform_prior
-from emberwatch.film.__main__ import main
+from emberwatch.client import wire
 from emberwatch.model import Model
-from emberwatch.palette import ROBOTS
+from emberwatch.render.film.__main__ import main
+from emberwatch.render.palette import ROBOTS
 
 MODEL = Model.wildfire()
 HEIGHT, WIDTH, SCALE = 3, 5, 10
@@ -281,7 +281,7 @@ def test_recordings_that_make_no_sense_are_named(studio: Studio) -> None:
 def test_without_pillow_it_says_what_to_install(
     studio: Studio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "emberwatch.film.page", raising=False)
+    monkeypatch.delitem(sys.modules, "emberwatch.render.film.page", raising=False)
     monkeypatch.setitem(sys.modules, "PIL", None)
     assert "pip install emberwatch[film]" in studio.fails([server(), frame(0)])
 

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from emberwatch.programs import find, unused_instance
 from failures import fails
-from processes import server, stopped
+from processes import find, server, stopped, unused_instance
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, NotEnoughMemoryError
@@ -219,7 +218,7 @@ tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
     assert connected.startswith(f"EmberwatchError channel {words}"), connected
     assert "--security-opt seccomp" in connected, connected
     code = "refuse(int(sys.argv[1]), int(sys.argv[2])); os.execv(sys.argv[3], sys.argv[3:])"
-    program = str(find("emberwatch-server"))
+    program = find("emberwatch-server")
     for more in (["status", f"--instance={running.instance}"], [f"--instance={unused_instance()}"]):
         wrapped = [sys.executable, "-c", HEAD + code, str(CALLS[call]), str(number), program]
         ended = run(*wrapped, *more)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from emberwatch.merit import Merit, MeritTally
+from emberwatch.belief.merit import Merit, MeritTally
 
 FIRE = 2
 

@@ -13,12 +13,12 @@ import pytest
 from failures import refuses
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import find
 
 import emberwatch
-from emberwatch.env import WildfireEnv
+from emberwatch.envs.path_env import WildfireEnv
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Model
-from emberwatch.programs import find
 
 REPOSITORY = Path(__file__).parents[3]
 CONFIG = REPOSITORY / "config/models"

@@ -189,8 +189,8 @@ def test_paying_moves_needs_a_server_that_tells_enough() -> None:
     ):
         make(MOVES, instance=instance, reward="move")
     with serving(publish_truth=True) as instance:
-        env, private = make(MOVES, instance=instance, reward="move"), make(MOVES, reward="move")
-        assert_same(rollout(env, 20, seed=4), rollout(private, 20, seed=4))
+        env, alone = make(MOVES, instance=instance, reward="move"), make(MOVES, reward="move")
+        assert_same(rollout(env, 20, seed=4), rollout(alone, 20, seed=4))
         with fails("busy"):
             make(MOVES, instance=instance).reset()
 

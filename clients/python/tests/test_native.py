@@ -13,11 +13,12 @@ import pytest
 from failures import fails, refuses
 from processes import LONG, asleep, eventually, script, server
 
-from emberwatch import _native, errors, recording
+from emberwatch import _native, errors
 from emberwatch.belief import Transition, initial_prior
+from emberwatch.belief.prior import simulated_prior
+from emberwatch.client import recording
 from emberwatch.model import Model
 from emberwatch.planning import beam_search
-from emberwatch.prior import simulated_prior
 
 WILDFIRE = Model.wildfire()
 SEARCH: dict[str, Any] = {"values": np.zeros((1, 2, 2)), "robots": np.zeros((1, 2), int)}

@@ -23,11 +23,10 @@ from environments import (
 )
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
-from processes import eventually, server
+from processes import eventually, find, server
 
 import emberwatch
 from emberwatch import errors
-from emberwatch.programs import find
 from emberwatch.wrappers import BeliefObservation
 
 GOLDEN = np.load(golden_options.FILE)
@@ -122,10 +121,9 @@ def believing(name: str, checkpoints: Path) -> dict[str, Any]:
     return {"prior": "simulated", **golden_options.WORLD, **keywords}
 
 
-@pytest.mark.parametrize("backend", ["server", "embedded"])
 @pytest.mark.parametrize("name", golden_options.BELIEFS)
-def test_episodes_are_those_that_were_recorded(name: str, backend: str, checkpoints: Path) -> None:
-    keywords = {"backend": backend, **believing(name, checkpoints)}
+def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> None:
+    keywords = believing(name, checkpoints)
     env = make(**keywords)
     assert env.estimator == name.partition(",")[0]
     found = golden_options.episode(env)
@@ -170,7 +168,7 @@ def test_beliefs_are_shown_to_those_who_watch() -> None:
     started = server(worlds=3)
     envs = make_vec(2, instance=started.instance, world=1)
     envs.reset(seed=1000)
-    with emberwatch.observer.OutlookReader(started.instance) as reader:
+    with emberwatch.client.observer.OutlookReader(started.instance) as reader:
         expected = {(1, "exploit"), (2, "entropy")}
 
         def is_shown() -> bool:
@@ -232,12 +230,11 @@ def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> 
         gymnasium.make(OBJECTIVE, **world)
 
 
-@pytest.mark.parametrize("backend", ["server", "embedded"])
 @pytest.mark.parametrize("maker", [make, make_vec])
 def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
-    maker: Any, backend: str, monkeypatch: pytest.MonkeyPatch
+    maker: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, other = (maker(backend=backend) for _ in range(2))
+    one, other = (maker() for _ in range(2))
     for env in (one, other):
         env.reset(seed=1000)
         decide(env)
@@ -254,12 +251,14 @@ def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
     assert_same(found, seen)
 
 
-def test_another_holder_is_named(env: Any) -> None:
+def test_another_holder_is_named() -> None:
+    instance = server().instance
+    env = make(instance=instance)
     env.reset(seed=1000)
-    other = make(instance=env.instance)
+    other = make(instance=instance)
     with fails("busy", match=f"held by pid {os.getpid()}"):
         other.reset(seed=1001)
-    taken = make(instance=env.instance, takeover=True)
+    taken = make(instance=instance, takeover=True)
     _, info = taken.reset(options={"resume": True})
     assert info["step"] == 0
     with pytest.raises(errors.LeaseLostError):
@@ -267,7 +266,7 @@ def test_another_holder_is_named(env: Any) -> None:
 
 
 def test_a_copy_plans_by_itself() -> None:
-    env = make(backend="embedded")
+    env = make()
     expected = rollout(env, 3, seed=1000)
     env.close()
     copied = pickle.loads(pickle.dumps(env))
@@ -275,7 +274,7 @@ def test_a_copy_plans_by_itself() -> None:
 
 
 def test_no_thread_starts_before_the_first_reset(checkpoints: Path) -> None:
-    keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
+    keywords = believing("neural_belief", checkpoints)
     before = set(os.listdir("/proc/self/task"))
     envs = make_vec(2, **keywords)
     assert set(os.listdir("/proc/self/task")) <= before
@@ -283,7 +282,7 @@ def test_no_thread_starts_before_the_first_reset(checkpoints: Path) -> None:
 
 
 def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
-    keywords = {"backend": "embedded", **believing("neural_belief", checkpoints)}
+    keywords = believing("neural_belief", checkpoints)
     envs = make_vec(2, **keywords)
     expected = rollout(envs, 3, seed=1000)
     context = multiprocessing.get_context("fork")

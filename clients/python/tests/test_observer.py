@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from failures import fails, refuses
-from processes import PATIENCE, eventually, server, services
+from processes import PATIENCE, eventually, find, server, services, unused_instance
 
-from emberwatch import wire
-from emberwatch.observer import (
+from emberwatch.client import wire
+from emberwatch.client.observer import (
     Frame,
     Observer,
     OutlookReader,
@@ -17,7 +17,6 @@ from emberwatch.observer import (
     TruthReader,
     observe,
 )
-from emberwatch.programs import find, unused_instance
 
 
 def frames_until(observer: Observer, step: int, world: int = 0, seed: int = 0) -> list[Frame]:
@@ -219,7 +218,7 @@ def test_a_closed_observer_is_no_longer_counted() -> None:
 
 def test_an_agent_s_beliefs_are_read() -> None:
     started = server(height=16, width=24, moves=12, burn_in=500)
-    command = [str(find("emberwatch-agent")), "run", "--instance", started.instance]
+    command = [find("emberwatch-agent"), "run", "--instance", started.instance]
     with OutlookReader(started.instance) as reader:
         agent = subprocess.Popen(command)
         try:

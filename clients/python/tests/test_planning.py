@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.moves import DIRECTIONS
+from emberwatch.model.moves import DIRECTIONS
 from emberwatch.planning import beam_search
 
 RNG = np.random.default_rng(3)

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import script
+from processes import find, script
 
+from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
-from emberwatch.prior import simulated_prior
-from emberwatch.programs import find
 
 MODEL = Model.wildfire()
 WORLD: dict[str, Any] = {"height": 5, "width": 7, "burn_in": 40}
@@ -20,7 +19,7 @@ WORLD: dict[str, Any] = {"height": 5, "width": 7, "burn_in": 40}
 #: Takes hours.
 ENDLESS = """
 from emberwatch.model import Model
-from emberwatch.prior import simulated_prior
+from emberwatch.belief.prior import simulated_prior
 print("begun", flush=True)
 simulated_prior(Model.wildfire(), height=64, width=64, burn_in=1 << 40)
 """

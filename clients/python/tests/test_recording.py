@@ -16,12 +16,12 @@ from failures import fails
 from headers import header
 from hypothesis import given
 from hypothesis import strategies as st
-from processes import PATIENCE, eventually, server
+from processes import PATIENCE, eventually, find, server, unused_instance
 
 import emberwatch
-from emberwatch import programs, recording, wire
-from emberwatch.observer import Frame, Truth
-from emberwatch.recording import Record, RecordingCutWarning, RecordingDamagedWarning
+from emberwatch.client import recording, wire
+from emberwatch.client.observer import Frame, Truth
+from emberwatch.client.recording import Record, RecordingCutWarning, RecordingDamagedWarning
 
 INFO = document.examples()[1] | {"n_robots": 2, "deadline_millis": 0}
 TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
@@ -164,7 +164,7 @@ def test_random_bytes_are_never_read_whole(
 @contextmanager
 def program(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
     """Runs `emberwatch-server` with these arguments; ends it."""
-    process = subprocess.Popen([programs.find("emberwatch-server"), *map(str, arguments)])
+    process = subprocess.Popen([find("emberwatch-server"), *map(str, arguments)])
     try:
         yield process
     finally:
@@ -199,7 +199,7 @@ def test_what_a_recorder_wrote_is_what_the_server_answered(path: Path) -> None:
 
 def test_a_replay_is_observed_like_a_server_and_refuses_to_act(path: Path) -> None:
     path.write_bytes(GOOD)
-    instance = programs.unused_instance()
+    instance = unused_instance()
     with program("replay", path, "--instance", instance, "--loop") as replay:
         with emberwatch.observe(instance, timeout=PATIENCE) as observer:
             seen = [frame.n_lost for frame, _ in zip(observer, range(4), strict=False)]

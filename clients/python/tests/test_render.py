@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emberwatch.model import Model
-from emberwatch.palette import ROBOTS
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
+from emberwatch.render.palette import ROBOTS
 
 WILDFIRE = Palette.of(Model.wildfire())
 NORMAL, LATENT, FIRE = WILDFIRE.observations

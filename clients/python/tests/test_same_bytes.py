@@ -1,8 +1,8 @@
 """Every environment returns the same bytes as when `same_bytes.json` was recorded.
 
 The file has a digest for each 100 of 1,000 steps: of all that they return, with types, keys in
-their order, dtypes and shapes. `python test_same_bytes.py` records it again, from the package that
-is installed.
+their order, dtypes and shapes. It holds for worlds in this process and for those of a server.
+`python test_same_bytes.py` records it again, from the package that is installed.
 """
 
 import functools
@@ -34,6 +34,11 @@ FLAGS: dict[str, Any] = {"height": 9, "width": 11, "moves": T, "burn_in": 60, "m
 
 PARTS = ("frame", "image", "robot", "age", "belief", "team", "others")
 MOVES_PARTS = (*PARTS, "local", "recent", "visited", "move")
+
+#: Settings of worlds that a running server has, by the keyword.
+OF_SERVERS = {
+    name: name for name in ("height", "width", "burn_in", "model", "states", "robots")
+} | {"n_moves": "moves"}
 
 #: What an environment returns, call by call.
 Outcomes = Iterator[object]
@@ -73,9 +78,20 @@ def actions(high: int, *shape: int) -> Iterator[Any]:
     return (rng.integers(0, high, shape) for _ in range(N_STEPS))
 
 
-def single(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
+def placed(attaches: bool, n_worlds: int, keywords: dict[str, Any]) -> dict[str, Any]:
+    """Keywords of worlds in this process, or of the same at a server."""
+    if not attaches:
+        return keywords
+    flags = {flag: keywords.get(name) for name, flag in OF_SERVERS.items()}
+    instance = server(worlds=n_worlds, publish_truth=True, **flags).instance
+    kept = {name: value for name, value in keywords.items() if name not in OF_SERVERS}
+    return {"instance": instance, "timeout": 60.0, **kept}
+
+
+def single(name: str, high: int, *shape: int, attaches: bool, **keywords: Any) -> Outcomes:
     """Episodes of one environment, of which one is broken off and one resumed."""
-    env = make(name, **{**WORLD, "max_episode_steps": 70, **keywords})
+    keywords = {**WORLD, "max_episode_steps": 70, **keywords}
+    env = make(name, **placed(attaches, 1, keywords))
     yield env.reset(seed=11)
     for step, action in enumerate(actions(high, *shape)):
         outcome = env.step(action)
@@ -91,14 +107,20 @@ def single(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
 
 
 def vector(
-    name: str, mode: AutoresetMode, high: int, *shape: int, robots: int = 1, **keywords: Any
+    name: str,
+    mode: AutoresetMode,
+    high: int,
+    *shape: int,
+    attaches: bool,
+    robots: int = 1,
+    **keywords: Any,
 ) -> Outcomes:
     """Episodes of three worlds, which do not end together."""
     n_rows = 3 * robots
     if robots > 1:
         keywords["robots"] = robots
     keywords = {**WORLD, "max_episode_steps": 70, **keywords}
-    env = make_vec(n_rows, name, autoreset_mode=mode, **keywords)
+    env = make_vec(n_rows, name, autoreset_mode=mode, **placed(attaches, 3, keywords))
     yield env.reset(seed=21)
     over, last = np.zeros(n_rows, np.bool_), np.arange(n_rows) >= n_rows - robots
     for step, chosen in enumerate(actions(high, n_rows, *shape)):
@@ -116,10 +138,10 @@ def vector(
             yield env.unwrapped.results
 
 
-def team(action: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
+def team(action: str, high: int, *shape: int, attaches: bool, **keywords: Any) -> Outcomes:
     """All robots of a world through PettingZoo."""
     keywords = {**WORLD, "robots": 3, "max_episode_steps": 70, **keywords}
-    env = closed_later(emberwatch.parallel_env(action=action, **keywords))
+    env = closed_later(emberwatch.parallel_env(action=action, **placed(attaches, 1, keywords)))
     yield env.reset(seed=31)
     for chosen in actions(high, 3, *shape):
         yield env.step(dict(zip(env.agents, chosen, strict=True)))
@@ -139,10 +161,10 @@ def members() -> Outcomes:
         yield at_once(*(functools.partial(env.step, path) for env, path in calls))
 
 
-def lease(backend: str = "server") -> Outcomes:
+def lease(attaches: bool) -> Outcomes:
     """The plain client's answers: all robots of three worlds, or one world after the other."""
     flags = {"worlds": 3, "robots": 2, "coverage": "client", "history": 5, **FLAGS}
-    client = server(**flags).connect() if backend == "server" else emberwatch.embed(**flags)
+    client = server(**flags).connect() if attaches else emberwatch.embed(**flags)
     lease = client.acquire(0, 6)
     lease.reset([1, 2, 3])
     for step, paths in enumerate(actions(4, 6, T)):
@@ -166,26 +188,26 @@ def recorded(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
         yield from vector(name, AutoresetMode.NEXT_STEP, high, *shape, **keywords)
 
 
-def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
-    """All of them by name, those of several processes at a server."""
-    path = {"observation": PARTS, "truth": True, **backend}
-    moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True, **backend}
+def cases(attaches: bool) -> dict[str, Callable[[], Outcomes]]:
+    """All of them by name, in this process or at a server."""
+    where = {"attaches": attaches}
+    path = {"observation": PARTS, "truth": True, **where}
+    moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True, **where}
     team_moves = {"observation": MOVES_PARTS, "reward": "marginal", "max_episode_steps": 300}
-    team_moves |= backend
+    team_moves |= where
     found: dict[str, Callable[[], Outcomes]] = {
-        "wildfire": functools.partial(single, WILDFIRE, 4, T, render_mode="rgb_array", **backend),
+        "wildfire": functools.partial(single, WILDFIRE, 4, T, render_mode="rgb_array", **where),
         "wildfire, all parts": functools.partial(single, WILDFIRE, 4, T, **path),
-        "moves": functools.partial(single, MOVES, 4, **backend),
+        "moves": functools.partial(single, MOVES, 4, **where),
         "moves, all parts": functools.partial(single, MOVES, 4, **moves),
-        "objective": functools.partial(single, OBJECTIVE, 8, **backend),
-        "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True, **backend),
+        "objective": functools.partial(single, OBJECTIVE, 8, **where),
+        "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True, **where),
         "team, moves": functools.partial(team, "move", 4, **team_moves),
-        "members": members,
-        "lease": functools.partial(lease, **backend),
+        "lease": functools.partial(lease, **where),
         "recorded, paths": functools.partial(
-            recorded, WILDFIRE, 4, T, observation=PARTS[:4], **backend
+            recorded, WILDFIRE, 4, T, observation=PARTS[:4], **where
         ),
-        "recorded, moves": functools.partial(recorded, MOVES, 4, reward="move", **backend),
+        "recorded, moves": functools.partial(recorded, MOVES, 4, reward="move", **where),
     }
     for mode in AutoresetMode:
         of_paths = functools.partial(vector, WILDFIRE, mode, 4, T, robots=2, reward="marginal")
@@ -194,28 +216,25 @@ def cases(**backend: Any) -> dict[str, Callable[[], Outcomes]]:
             f"wildfire, {mode.name}": functools.partial(of_paths, **path),
             f"moves, {mode.name}": functools.partial(of_moves, **moves),
             f"objective, {mode.name}": functools.partial(
-                vector, OBJECTIVE, mode, 8, truth=True, **backend
+                vector, OBJECTIVE, mode, 8, truth=True, **where
             ),
         }
+    if attaches:
+        found["members"] = members
     return found
 
 
-EMBEDDED = cases(backend="embedded")
+CASES = {"here": cases(attaches=False), "at a server": cases(attaches=True)}
 
 
-@pytest.mark.parametrize("case", [it for it in EMBEDDED if it != "members"])
-def test_embedded_worlds_return_the_recorded_bytes(case: str) -> None:
-    assert digests(EMBEDDED[case]()) == json.loads(FILE.read_text())[case]
-
-
-@pytest.mark.parametrize("case", cases())
-def test_environments_return_the_recorded_bytes(case: str) -> None:
-    assert digests(cases()[case]()) == json.loads(FILE.read_text())[case]
+@pytest.mark.parametrize(("place", "case"), [(at, case) for at in CASES for case in CASES[at]])
+def test_environments_return_the_recorded_bytes(place: str, case: str) -> None:
+    assert digests(CASES[place][case]()) == json.loads(FILE.read_text())[case]
 
 
 if __name__ == "__main__":
     recording = list[str]()
-    for name, outcomes in cases().items():
+    for name, outcomes in CASES["at a server"].items():
         recording.append(f"{json.dumps(name)}: {json.dumps(digests(outcomes()))}")
         at_the_end.close()
     FILE.write_text("{\n" + ",\n".join(recording) + "\n}\n")

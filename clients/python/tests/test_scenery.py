@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emberwatch.palette import mark_on, mark_on_each
 from emberwatch.render import Palette, Picture, ansi, rgb_array
-from emberwatch.scenery import MOST_ZONES, Scenery
+from emberwatch.render.palette import mark_on, mark_on_each
+from emberwatch.render.scenery import MOST_ZONES, Scenery
 
 PALETTE = Palette.of(3)
 FRAME = np.array([[0, 255, 255], [2, 255, 1]], np.uint8)

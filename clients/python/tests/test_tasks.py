@@ -13,11 +13,11 @@ import pytest
 from environments import assert_same, closed_later, no_warnings, rollout, serving
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
+from processes import find
 
 import emberwatch
 from emberwatch.benchmark import evaluate, suite
-from emberwatch.programs import find
-from emberwatch.tasks import Task, built_in_tasks
+from emberwatch.model.tasks import Task, built_in_tasks
 
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import parallel_api_test

@@ -13,7 +13,7 @@ from processes import PATIENCE, at_once, eventually, server
 import emberwatch.benchmark
 from emberwatch import errors
 from emberwatch.benchmark import evaluate
-from emberwatch.wire import StepAnswer
+from emberwatch.client.wire import StepAnswer
 
 
 def paths(n_robots: int, seed: int = 0) -> np.ndarray:

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import find
 from tensorboard.backend.event_processing import event_accumulator
-
-from emberwatch.programs import find
 
 WORLDS = "--height 6 --width 9 --moves 5 --burn-in 60".split()
 SETTINGS = """[learning]
@@ -21,7 +20,7 @@ updates_per_step = 1.0
 
 
 def agent(*words: object) -> None:
-    program = [str(find("emberwatch-agent")), *map(str, words)]
+    program = [find("emberwatch-agent"), *map(str, words)]
     subprocess.run(program, check=True, timeout=60)
 
 

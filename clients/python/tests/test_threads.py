@@ -20,7 +20,7 @@ import emberwatch
 #: Forks while a thread opens connections, or steps with one; each child flies a robot of its own.
 FORKS = """
 import os, sys, threading, time
-from emberwatch.client import connect
+from emberwatch.client.client import connect
 from emberwatch.errors import EmberwatchError
 
 instance, what = sys.argv[1:]

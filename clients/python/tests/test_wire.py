@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from processes import server
 
-import emberwatch.connection
-from emberwatch import errors, wire
-from emberwatch.client import Client
-from emberwatch.errors import EmberwatchError
-from emberwatch.lease import Lease
-from emberwatch.replies import (
+import emberwatch.client.connection
+from emberwatch import errors
+from emberwatch.client import wire
+from emberwatch.client.client import Client
+from emberwatch.client.lease import Lease
+from emberwatch.client.replies import (
     LeftBeliefInfo,
     ServerInfo,
     ServerStatus,
@@ -29,6 +29,7 @@ from emberwatch.replies import (
     WorldStatus,
     record,
 )
+from emberwatch.errors import EmberwatchError
 
 LAYOUTS = document.layouts()
 #: What is in payloads: as bytes, as an array, as a tuple.
@@ -72,7 +73,7 @@ class Wired:
     def __init__(self, **hello: Any) -> None:
         sizes = {"height": 3, "width": 5, "n_moves": 4, "n_worlds": 1, "n_robots": 2}
         self.wire = Wire(HELLO | sizes | hello)
-        with patch.object(emberwatch.connection._native, "Server", lambda *_: self.wire):
+        with patch.object(emberwatch.client.connection._native, "Server", lambda *_: self.wire):
             self.client = Client("nowhere")
         notes = SimpleNamespace(note=lambda *_: None)
         self.client.lease = lambda *_: notes

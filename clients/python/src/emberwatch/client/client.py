@@ -39,7 +39,8 @@ _log: Final = logging.getLogger("emberwatch")
 #: After which leases of embedded worlds end, milliseconds.
 _EMBEDDED_LEASE: Final = 86_400_000
 
-#: How long to sleep between two attempts to connect, seconds.
+#: How long to sleep between two attempts to connect, at first and at most, seconds.
+_FIRST_RETRY: Final = 0.005
 _RETRY: Final = 0.2
 
 
@@ -210,7 +211,7 @@ def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:
     """Connects as soon as somebody answers, within `wait` seconds; logs once that it waits."""
-    deadline, waits = time.monotonic() + wait, False
+    deadline, waits, pause = time.monotonic() + wait, False, _FIRST_RETRY
     while True:
         try:
             return connect()
@@ -222,4 +223,5 @@ def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Conn
             if not waits:
                 _log.warning(f"{error}; waiting up to {wait:g} s for it")
             waits = True
-            time.sleep(min(_RETRY, left))
+            time.sleep(min(pause, left))
+            pause = min(2 * pause, _RETRY)

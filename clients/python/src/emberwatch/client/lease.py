@@ -5,13 +5,14 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Self
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.client import wire
 from emberwatch.client.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.client.replies import Grant, WorldInfo, records
 from emberwatch.client.wire import StepAnswer, StepResult
-from emberwatch.common.arguments import as_seeds
+from emberwatch.common.arguments import as_moves, as_seeds
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 
@@ -75,7 +76,7 @@ class Lease:
                 tells to where. With code `"episode_over"`: reset that world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
-        return StepAnswer(self.native.step(paths, *place, timeout))
+        return StepAnswer(self.native.step(self._array(paths, robots), *place, timeout))
 
     def fly(
         self,
@@ -105,7 +106,8 @@ class Lease:
             EmberwatchError: As `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
-        answer, n_skipped = self.native.fly(paths, *place, accepts_late, timeout)
+        given = self._array(paths, robots)
+        answer, n_skipped = self.native.fly(given, *place, accepts_late, timeout)
         return StepAnswer(answer), n_skipped
 
     def observe(
@@ -210,6 +212,16 @@ class Lease:
     def _ask(self, operation: str, timeout: float, **keys: Any) -> dict[str, Any]:
         request = {"op": operation, "lease": self.number, **keys}
         return self.client.control(request, timeout=timeout)
+
+    def _array(self, paths: ArrayLike, robots: range | None) -> NDArray[Any]:
+        """Paths as an array; the native module checks arrays quickly.
+
+        Lists are converted here: at the interpreter's end, Python must not end a daemon thread in
+        code that Rust has called.
+        """
+        if type(paths) is np.ndarray:
+            return paths
+        return as_moves(paths, len(robots or self.robots), self.client.info.n_moves)
 
     def _place(self, robots: range | None, flags: int) -> tuple[int, int, int]:
         """The first of some robots or of all, how many, and flags."""

@@ -60,6 +60,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
     def close(self) -> None:
         self._session.close()
         self._view.close()
+        self._answer = None  # which cannot be copied
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""

@@ -58,7 +58,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         window: int | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. No server of its own runs before the first reset."""
+        """See the class. Nothing is opened before the first reset."""
         if action not in _ENVIRONMENTS:
             raise invalid("action", "'move' or 'path'", repr(action))
         if world.get("instance") is None and world.get("task") is None:

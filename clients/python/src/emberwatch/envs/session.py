@@ -26,6 +26,7 @@ from emberwatch.client.lease import Lease
 from emberwatch.client.observer import Newest, Present, Truth, TruthReader
 from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
+from emberwatch.common.arguments import as_moves
 from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
 from emberwatch.errors import (
     EmberwatchError,
@@ -77,7 +78,7 @@ class State(Enum):
     OVER = "over"
 
 
-#: States in which, between calls, worlds may have moved unseen: only a reset or resume may follow.
+#: After a call that left one of these, worlds may have moved unseen: steps are refused.
 _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIMED_OUT))
 
 
@@ -214,6 +215,8 @@ class Session:
         first, n_robots = self._first, self.n_rows
         if rows is not None:
             first, n_robots = first + rows.start, len(rows)
+        if type(paths) is not np.ndarray:
+            paths = as_moves(paths, n_robots, self.spec.n_moves)
         try:
             answer, self.n_skipped = lease.native.fly(
                 paths, first, n_robots, self._accepts_late, self.settings.timeout

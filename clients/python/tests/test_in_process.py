@@ -1,43 +1,48 @@
-"""Worlds inside this process: `backend="embedded"` and `emberwatch.embed`."""
+"""Worlds in this process: nothing outside is needed, forks are safe, `embed` is like a server."""
 
-import copy
 import os
-import pickle
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from environments import (
-    LIVELY,
+    FLAGS,
     MOVES,
+    OBJECTIVE,
     SMALL,
-    WILDFIRE,
     actions,
     assert_same,
+    closed_later,
     make,
     make_vec,
     rollout,
+    small_server,
 )
 from failures import fails
-from gymnasium.vector import AsyncVectorEnv
-from processes import eventually, script, server
+from processes import eventually, isolated, script
 
 import emberwatch
-from emberwatch import programs
 from emberwatch.errors import EmberwatchError, LeaseLostError, ServerGoneError
 
-#: Settings of a small world, as a server names them.
-FLAGS: dict[str, Any] = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY}
+
+def make_team(**keywords: Any) -> Any:
+    return closed_later(emberwatch.parallel_env(robots=2, **SMALL, **keywords))
 
 
-def embedded(name: str = WILDFIRE, **keywords: Any) -> Any:
-    return make(name, backend="embedded", **keywords)
+#: Environments of all kinds.
+MAKERS: dict[str, Callable[[], Any]] = {
+    "path": make,
+    "moves": lambda: make_vec(2, MOVES),
+    "options": lambda: make_vec(2, OBJECTIVE),
+    "team": make_team,
+}
 
 
 @pytest.fixture
@@ -47,19 +52,138 @@ def client() -> Iterator[emberwatch.Client]:
         yield client
 
 
-def test_no_program_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(name: str) -> Path:
-        raise AssertionError(f"{name} was looked for")
+# What `make` opens
 
-    monkeypatch.setattr(programs, "find", refused)
-    rollout(embedded(truth=True), 3, seed=1)
-    rollout(make_vec(3, MOVES, backend="embedded", reward="move"), 9, seed=1)
+
+def threads() -> set[str]:
+    return set(os.listdir("/proc/self/task"))
+
+
+def opened() -> tuple[str, set[str], set[str]]:
+    """Child processes, open files, and files of this process in shared memory."""
+    us = os.getpid()
+    files = [path for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
+    return (
+        Path(f"/proc/self/task/{us}/children").read_text(),
+        {os.readlink(path) for path in files},
+        {name for name in os.listdir("/dev/shm") if f"{us:08x}_" in name},  # as iceoryx2 names them
+    )
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_nothing_is_opened_before_the_first_reset(kind: str) -> None:
+    before = opened(), threads()
+    env = MAKERS[kind]()
+    assert opened() == before[0]
+    # The thread that read the model's file ends at once.
+    assert eventually(lambda: threads() <= before[1])
+    env.reset(seed=1)
+    assert threads() > before[1]
+    children, _, shared = opened()
+    assert (children, shared) == (before[0][0], before[0][2])
+
+
+#: All that needs no server.
+ALONE = """
+import os, warnings
+import gymnasium, numpy as np
+from gymnasium.utils.env_checker import check_env
+import emberwatch
+warnings.simplefilter("ignore")
+assert os.listdir("/dev/shm") == [] and os.environ["PATH"] == ""
+small = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50}
+for name in ("Wildfire-v0", "WildfireMoves-v0", "WildfireObjective-v1"):
+    name = f"emberwatch/{name}"
+    env = gymnasium.make(name, render_mode="rgb_array", truth=True, **small)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    assert env.render().ndim == 3
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+    envs = gymnasium.make_vec(name, num_envs=3, **small)
+    envs.reset(seed=1)
+    envs.step(envs.action_space.sample())
+team = emberwatch.parallel_env(robots=2, **small)
+team.reset(seed=1)
+team.step({agent: space.sample() for agent, space in team.action_spaces.items()})
+print("done")
+"""
+
+
+def test_neither_shared_memory_nor_programs_are_needed() -> None:
+    run = isolated("ro")
+    ended = run("env", "PATH=", sys.executable, "-c", ALONE)
+    assert (ended.returncode, ended.stdout) == (0, "done\n"), ended.stderr
+
+
+# Forks
+
+
+def in_child(call: Callable[[], object]) -> Any:
+    """What a call returns, or the code of its error, in a forked child."""
+    context = get_context("fork")
+    receiver, sender = context.Pipe()
+
+    def child() -> None:
+        try:
+            sender.send(call())
+        except EmberwatchError as error:
+            sender.send(error.code)
+
+    process = context.Process(target=child)
+    process.start()
+    sender.close()
+    outcome = receiver.recv()
+    process.join()
+    assert process.exitcode == 0
+    return outcome
+
+
+def action(env: Any) -> Any:
+    """The same for all robots."""
+    agents: dict[str, Any] = getattr(env, "action_spaces", {})
+    zero = {agent: np.zeros(space.shape, int) for agent, space in agents.items()}
+    return zero or np.zeros(env.action_space.shape, int)
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+def test_a_forked_child_is_refused_what_was_reset_and_may_reset_again(kind: str) -> None:
+    env, unopened = MAKERS[kind](), MAKERS[kind]()
+    n_moves = SMALL["n_moves"] if kind in ("moves", "team") else 1  # until the worlds move
+    first = env.reset(seed=4)
+    expected = [env.step(action(env)) for _ in range(3 * n_moves)]
+    env.reset(seed=4)
+    for _ in range(n_moves):
+        env.step(action(env))
+
+    def refused() -> float:
+        start = time.monotonic()
+        with fails("forked", match="belongs to the process that forked"):
+            for _ in range(n_moves):
+                env.step(action(env))
+        return time.monotonic() - start
+
+    def closed_and_reset() -> list[Any]:
+        env.close()
+        return [env.reset(seed=4), env.step(action(env))]
+
+    assert in_child(refused) < 1.0
+    assert_same(in_child(closed_and_reset), [first, expected[0]])
+    assert_same(
+        in_child(lambda: [unopened.reset(seed=4), unopened.step(action(env))]), [first, expected[0]]
+    )
+    assert_same([env.step(action(env)) for _ in range(2 * n_moves)], expected[n_moves:])
+    assert_same([unopened.reset(seed=4), unopened.step(action(env))], [first, expected[0]])
+
+
+# The client
 
 
 def test_snapshots_and_forks_are_those_of_a_server(
     client: emberwatch.Client, tmp_path: Path
 ) -> None:
-    other = server(worlds=2, **FLAGS).connect()
+    other = small_server(worlds=2).connect()
     path, seen = tmp_path / "worlds", list[Any]()
     for at in (client, other):
         lease = at.acquire(0, 2)
@@ -74,13 +198,11 @@ def test_snapshots_and_forks_are_those_of_a_server(
     assert_same(seen[0], seen[1])
 
 
-def test_a_file_goes_from_one_backend_to_the_other(
-    client: emberwatch.Client, tmp_path: Path
-) -> None:
+def test_a_snapshot_goes_on_at_a_server(client: emberwatch.Client, tmp_path: Path) -> None:
     lease = client.acquire(0, 2)
     lease.step([[3] * 4] * 2)
     client.snapshot(tmp_path / "worlds")
-    guest = server(worlds=2, **FLAGS).connect().acquire(0, 2)
+    guest = small_server(worlds=2).connect().acquire(0, 2)
     guest.restore(tmp_path / "worlds")
     paths = [[1, 1, 3, 3]] * 2
     first, second = lease.step(paths), guest.step(paths)
@@ -90,7 +212,7 @@ def test_a_file_goes_from_one_backend_to_the_other(
 
 
 def test_an_environment_goes_on_from_its_own_snapshot(tmp_path: Path) -> None:
-    env = embedded(observation=("frame", "robot", "age", "belief"))
+    env = make(observation=("frame", "robot", "age", "belief"))
     rollout(env, 4, seed=3)
     lease = env.unwrapped.lease
     lease.client.snapshot(tmp_path / "world")
@@ -143,66 +265,9 @@ def test_wrong_settings_are_refused(settings: dict[str, Any], words: str) -> Non
         emberwatch.embed(**settings)
 
 
-@pytest.mark.parametrize(
-    ("name", "keywords", "words"),
-    [
-        (WILDFIRE, {"backend": "cloud"}, "expected 'server' or 'embedded', got 'cloud'"),
-        (WILDFIRE, {"backend": 3}, "backend"),
-        (WILDFIRE, {"instance": "lab"}, "expected 'server' with instance"),
-        (WILDFIRE, {"takeover": True}, "expected instance=..."),
-    ],
-)
-def test_wrong_backends_are_refused(name: str, keywords: dict[str, Any], words: str) -> None:
-    with fails("invalid_argument", match=words):
-        make(name, **{"backend": "embedded", **keywords})
-
-
 def test_there_is_no_instance_to_attach_to() -> None:
-    env = embedded()
-    env.reset(seed=1)
-    with fails("invalid_argument", match="expected backend='server'"):
-        _ = env.unwrapped.instance
-
-
-def test_forked_and_spawned_workers_have_worlds_of_their_own() -> None:
-    expected = rollout(make(), 5, seed=9)
-    path = actions(make(), 1)[0]
-    for context in ("fork", "spawn"):
-        makers = [lambda: gymnasium.make(f"emberwatch:{WILDFIRE}", backend="embedded", **SMALL)]
-        env = AsyncVectorEnv(makers, context=context)
-        env.reset(seed=9)
-        seen, reward, *_ = env.step(path[np.newaxis])
-        assert_same(seen["frame"][0], expected[1][0]["frame"])
-        assert reward[0] == expected[1][1]
-        env.close()
-
-
-def test_a_forked_child_is_refused_by_name_and_harms_nothing() -> None:
-    env, other = embedded(), embedded()
-    expected = rollout(other, 6, seed=4)
-    seen = rollout(env, 3, seed=4)
-    path = actions(env, 6)[3]
-
-    def child(sender: Any) -> None:
-        try:
-            env.step(path)
-        except EmberwatchError as error:
-            sender.send(error.code)
-        fresh = gymnasium.make(WILDFIRE, backend="embedded", **SMALL)
-        fresh.reset(seed=4)
-        sender.send(fresh.step(actions(fresh, 1)[0])[1])
-        fresh.close()
-        env.close()
-
-    context = get_context("fork")
-    receiver, sender = context.Pipe()
-    process = context.Process(target=child, args=(sender,))
-    process.start()
-    sender.close()
-    assert (receiver.recv(), receiver.recv()) == ("forked", expected[1][1])
-    process.join()
-    assert process.exitcode == 0
-    assert_same([*seen, env.step(path)], expected[:5])
+    with fails("invalid_argument", match="^instance: expected an environment made with instance="):
+        _ = make().unwrapped.instance
 
 
 def test_threads_take_turns(client: emberwatch.Client) -> None:
@@ -222,17 +287,6 @@ def test_threads_take_turns(client: emberwatch.Client) -> None:
         for world, got in enumerate(rewards):
             lease = again.acquire(world)
             assert got == [lease.step([3, 1, 2, 0]).result().world.reward for _ in range(200)]
-
-
-def test_a_closed_environment_is_copied_and_an_open_one_refused() -> None:
-    env = embedded()
-    expected = rollout(env, 3, seed=2)
-    with pytest.raises(TypeError, match="expected a closed environment"):
-        pickle.dumps(env.unwrapped)
-    env.close()
-    again = pickle.loads(pickle.dumps(copy.deepcopy(env)))
-    assert_same(rollout(again, 3, seed=2), expected)
-    again.close()
 
 
 def test_a_lease_that_nobody_knows_ends() -> None:
@@ -255,10 +309,17 @@ def test_settings_of_a_pipe_are_not_waited_for_without_end(tmp_path: Path) -> No
     assert "KeyboardInterrupt" in err
 
 
-def test_truths_are_those_of_embedded_worlds_that_publish_them(client: emberwatch.Client) -> None:
-    for at in (client, server(worlds=2, **FLAGS).connect()):
+def test_truths_are_those_of_worlds_here_that_publish_them(client: emberwatch.Client) -> None:
+    for at in (client, small_server().connect()):
         with fails("invalid_argument", match="embedded worlds with publish_truth"):
             at.truths(range(1))
+
+
+def test_many_worlds_may_reveal_the_truth() -> None:
+    env = make_vec(130, truth=True)
+    _, infos = env.reset(seed=1)
+    assert infos["truth"].shape == (130, 7, 5)
+    assert np.unique(infos["truth"].reshape(130, -1), axis=0).shape[0] > 100
 
 
 def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
@@ -271,7 +332,7 @@ def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
 #: A burn-in of hours, which Ctrl-C ends; then short ones.
 INTERRUPTED = """
 import gymnasium, emberwatch, time
-env = gymnasium.make("emberwatch/Wildfire-v0", backend="embedded", burn_in=10**9)
+env = gymnasium.make("emberwatch/Wildfire-v0", burn_in=10**9)
 print("ready", flush=True)
 try:
     env.reset(seed=1)
@@ -286,7 +347,7 @@ time.sleep(0.1)
 before = time.process_time()
 time.sleep(0.2)
 assert time.process_time() - before < 0.1
-env = gymnasium.make("emberwatch/Wildfire-v0", backend="embedded", burn_in=10)
+env = gymnasium.make("emberwatch/Wildfire-v0", burn_in=10)
 env.reset(seed=1)
 env.step(env.action_space.sample())
 print("closed", flush=True)
@@ -300,16 +361,3 @@ def test_ctrl_c_ends_a_burn_in() -> None:
     started.signal(signal.SIGINT)
     code, out, err = started.end()
     assert (code, out.split()) == (0, ["interrupted", "closed", "closed"]), err
-
-
-def test_truth_is_that_of_the_answer() -> None:
-    env, other = embedded(truth=True), make(truth=True)
-    for mine, servers in zip(rollout(env, 5, seed=8), rollout(other, 5, seed=8), strict=True):
-        assert_same(mine, servers)
-
-
-def test_many_worlds_may_reveal_the_truth() -> None:
-    env = make_vec(130, backend="embedded", truth=True)
-    _, infos = env.reset(seed=1)
-    assert infos["truth"].shape == (130, 7, 5)
-    assert np.unique(infos["truth"].reshape(130, -1), axis=0).shape[0] > 100

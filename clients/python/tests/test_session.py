@@ -1,0 +1,146 @@
+"""States of an environment's session: what a step, a resume and a reset do in each of them."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from environments import impatient, make, rollout, small_server
+from processes import Server
+
+from emberwatch.envs.session import State
+from emberwatch.errors import EmberwatchError
+
+PATH = [1, 3, 1, 3]
+
+
+def interrupt(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def interrupted(owner: object, name: str, call: Callable[[], object]) -> None:
+    """Ctrl-C where a call calls a method."""
+    with pytest.MonkeyPatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(owner, name, interrupt)
+        call()
+
+
+def begun(env: Any) -> None:
+    """Interrupts a step before its request."""
+    interrupted(env._session, "step", lambda: env.step(PATH))
+
+
+def moved(env: Any) -> None:
+    """Interrupts a step after its answer."""
+    interrupted(env, "_update", lambda: env.step(PATH))
+
+
+def torn(env: Any) -> None:
+    """Interrupts a step, and then the reset."""
+    begun(env)
+    interrupted(env._session, "_settle", lambda: env.reset(seed=2))
+
+
+#: From READY, how another state is reached.
+REACHED: dict[State, Callable[[Any], object]] = {
+    State.CLOSED: lambda env: env.close(),
+    State.READY: lambda env: None,
+    State.BEGUN: begun,
+    State.MOVED: moved,
+    State.TORN: torn,
+}
+
+#: Codes of a step and a resume in each state, or the step of the world that they show.
+OUTCOMES: dict[State, tuple[str | int, str | int]] = {
+    State.CLOSED: ("closed", "invalid_argument"),
+    State.READY: (3, 2),
+    State.BEGUN: ("interrupted", 2),
+    State.MOVED: ("interrupted", 3),
+    State.TORN: ("interrupted", 2),
+}
+
+
+@pytest.fixture
+def env() -> Any:
+    """Two steps into an episode, in this process."""
+    made = make().unwrapped
+    rollout(made, 2, seed=1)
+    return made
+
+
+@pytest.fixture
+def started() -> Iterator[Server]:
+    yield small_server(robots=2, max_steps=3)
+
+
+def outcome(call: Callable[[], Any]) -> str | int:
+    """The code of a refusal, or the step in the info."""
+    try:
+        return call()[-1]["step"]
+    except EmberwatchError as error:
+        return error.code
+
+
+def resume(env: Any) -> str | int:
+    return outcome(lambda: env.reset(options={"resume": True}))
+
+
+def step(env: Any) -> str | int:
+    return outcome(lambda: env.step(PATH))
+
+
+@pytest.mark.parametrize("state", OUTCOMES, ids=lambda state: state.value)
+def test_each_state_has_its_calls(env: Any, state: State) -> None:
+    for n, call in enumerate((step, resume)):
+        rollout(env, 2, seed=1)
+        REACHED[state](env)
+        assert env._session._state is state
+        assert call(env) == OUTCOMES[state][n]
+        # A step that was refused has changed nothing, and after a resume steps are allowed.
+        expected = State.READY if isinstance(OUTCOMES[state][n], int) else state
+        assert env._session._state is expected
+    for fails_first in (False, True):
+        REACHED[state](env)
+        if fails_first:
+            step(env)
+        assert env.reset(seed=1)[1]["step"] == 0
+        assert step(env) == 1
+
+
+def test_a_time_out_asks_for_a_reset_or_resume(started: Server) -> None:
+    env = make(instance=started.instance, robots=2, robot=0).unwrapped
+    env.reset()
+    started.stop()
+    with impatient(env):
+        assert step(env) == "timeout"
+    started.wake_up()
+    assert env._session._state is State.TIMED_OUT
+    assert step(env) == "closed"
+    k = resume(env)
+    assert k in (0, 1) and step(env) == k + 1
+
+
+def test_an_episode_that_is_over_waits_for_the_holder_of_all(started: Server) -> None:
+    env = make(instance=started.instance, robot=0).unwrapped
+    env.reset()
+    assert [step(env) for _ in range(3)] == [1, 2, 3]
+    assert [step(env), env._session._state] == ["episode_over", State.READY]
+    assert [resume(env), env._session._state] == ["episode_over", State.OVER]
+    assert [step(env), resume(env), step(env)] == ["episode_over"] * 3
+    env.close()
+    with started.connect().acquire(0, 2) as lease:
+        lease.reset()
+    assert [resume(env), step(env)] == [0, 1]
+
+
+@pytest.mark.parametrize("n_times", [1, 2])
+def test_a_refused_step_changes_no_state(env: Any, n_times: int) -> None:
+    for _ in range(n_times):
+        assert outcome(lambda: env.step([4] * 4)) == "invalid_argument"
+    assert step(env) == 3
+
+
+def test_a_lone_robot_is_never_late(env: Any) -> None:
+    env._session.lease._native.note(0, 0)  # as if steps had passed unseen
+    assert step(env) == "late"
+    assert step(env) == "interrupted"
+    assert [resume(env), step(env)] == [2, 3]
