@@ -1,4 +1,4 @@
-"""Which module imports which: no circles."""
+"""Which module imports which: no circles, and rooms use only those below them."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -7,6 +7,11 @@ from pathlib import Path
 import emberwatch
 
 PACKAGE = Path(emberwatch.__file__).parent
+
+#: The rooms of the package: each imports only from those before it.
+ROOMS = (
+    "errors common model belief planning client render envs wrappers sb3 landscape benchmark"
+).split()
 
 
 def modules() -> dict[str, Path]:
@@ -36,3 +41,21 @@ def test_no_module_imports_itself_through_others() -> None:
     assert len(graph) > 30 and "emberwatch.client.wire" in graph["emberwatch.client.connection"]
     order = list(TopologicalSorter(graph).static_order())
     assert order.index("emberwatch.errors") < order.index("emberwatch.envs.path_env")
+
+
+def room(name: str) -> str:
+    """The room of a module."""
+    return f"{name}.__init__".split(".")[1]
+
+
+def test_rooms_import_only_from_those_below_them() -> None:
+    rooms = {room(name) for name in modules()}
+    assert rooms == {*ROOMS, "__init__", "__main__", "_native"}
+    climbs = [
+        f"{name} imports {other}"
+        for name, path in modules().items()
+        for other in imports(path) & modules().keys()
+        if {room(name), room(other)} <= set(ROOMS)
+        and ROOMS.index(room(other)) > ROOMS.index(room(name))
+    ]
+    assert climbs == []
