@@ -132,7 +132,7 @@ class Session:
         """Lets one thread at a time step or reset; use it in a `with`."""
         if self._made_after != _n_forks:
             # The thread that held it may not exist in a forked child.
-            self._made_after, self._turn = _n_forks, threading.RLock()
+            self._turn, self._made_after = threading.RLock(), _n_forks
         return self._turn
 
     @property
