@@ -5,6 +5,7 @@ Needs Pillow, for the Python of README.md, which it runs.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -16,10 +17,14 @@ from pathlib import Path
 import gymnasium
 
 import emberwatch
-from emberwatch.programs import Program, find, unused_instance
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = ("emberwatch-server", "emberwatch-agent", "emberwatch-dashboard")
+
+
+def find(name: str) -> str:
+    """The path of an installed program."""
+    return str(Path(sys.prefix, "bin", name))
 
 
 def output(*command: str) -> str:
@@ -40,9 +45,7 @@ def check_versions() -> None:
     """One version of package and programs."""
     version = output(sys.executable, "-m", "emberwatch", "--version").split()[-1]
     for name in PROGRAMS:
-        path = find(name)
-        assert path.is_relative_to(sys.prefix), path
-        assert output(str(path), "--version").split() == [name, version]
+        assert output(find(name), "--version").split() == [name, version]
 
 
 def check_readme() -> None:
@@ -66,25 +69,24 @@ def check_vector() -> None:
 def check_training() -> None:
     """The agent learns a model for a few steps."""
     flags = "train --steps 64 --worlds 2 --height 32 --width 32 --burn-in 500 --out learned"
-    output(str(find("emberwatch-agent")), *flags.split())
+    output(find("emberwatch-agent"), *flags.split())
     assert Path("learned/checkpoint.safetensors").stat().st_size > 100
 
 
 def check_dashboard() -> None:
     """The page answers, beside a server."""
-    instance = unused_instance()
-    server = Program("emberwatch-server", [f"--instance={instance}", "--burn-in=100"])
-    server.wait_for(lambda: emberwatch.connect(instance)).close()
-    page = Program("emberwatch-dashboard", [f"--instance={instance}", "--listen=127.0.0.1:0"])
-    address, deadline = None, time.monotonic() + 30
-    while address is None:
-        address = re.search(r"http://\S+", page.output())
-        assert address is not None or time.monotonic() < deadline, page.output()
-        time.sleep(0.05)
+    instance = f"wheel-{os.getpid()}"
+    server = subprocess.Popen([find("emberwatch-server"), f"--instance={instance}"])
+    emberwatch.connect(instance, wait=30).close()
+    command = [find("emberwatch-dashboard"), f"--instance={instance}", "--listen=127.0.0.1:0"]
+    page = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert page.stdout is not None
+    address = next(filter(None, (re.search(r"http://\S+", line) for line in page.stdout)))
     with urllib.request.urlopen(address[0], timeout=30) as answer:
         assert b"<html" in answer.read()
-    page.stop()
-    server.stop()
+    for program in (page, server):
+        program.terminate()
+        program.wait(timeout=30)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -62,7 +63,11 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
+    # Programs that pip has installed next to Python.
+    env = os.environ | {"PATH": f"{os.environ['PATH']}:{Path(sys.executable).parent}"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=900, cwd=tmp_path, env=env
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     assert re.search(line, done.stdout), done.stdout
     assert "the state that pays most" not in done.stderr, "a world with nothing to find"

@@ -2,7 +2,9 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
 
 import pytest
@@ -16,6 +18,9 @@ settings.load_profile("emberwatch")
 # A shell may start this with signals ignored, which children would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+# Programs that pip has installed next to Python.
+os.environ["PATH"] += os.pathsep + str(Path(sys.executable).parent)
 
 # Not the user's; here nothing can be kept.
 os.environ["XDG_CACHE_HOME"] = "/dev/null"

@@ -1,10 +1,11 @@
-"""Emberwatch: explore a wildfire that a robot only partly sees, over shared memory.
+"""Emberwatch: explore a wildfire that a robot only partly sees.
 
 Importing this package registers its environments with Gymnasium:
 
     import gymnasium, emberwatch
     env = gymnasium.make("emberwatch/Wildfire-v0")
 
+Worlds are simulated in this process, or with `instance="lab"` by a running `emberwatch-server`.
 Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
 """
 

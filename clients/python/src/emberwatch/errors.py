@@ -16,7 +16,7 @@ class EmberwatchError(Exception):
             memory nor embedded worlds survive `fork`), `"embedded"` (worlds in this process could
             not be made), `"threads"` (the system starts no more), `"channel"` (iceoryx2, or a
             system call that it needs, failed), `"bad_answer"` (client and server
-            are not of one release), `"program"` (could not be started, or failed),
+            are not of one release), `"program"` (a prior or a network failed),
             `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
     """

@@ -120,7 +120,7 @@ def evaluate(
     keywords["burn_in"] = burn_in
     keywords.setdefault("timeout", _TIMEOUT)
     served = _served(keywords.get("instance"))
-    # A private server publishes hidden states.
+    # Worlds of this process can reveal hidden states.
     if keywords.setdefault("truth", served is None or served.publish_truth):
         batch = min(batch, wire.TRUTH_BUFFER)
     parts = set(names_of(keywords.get("observation")))

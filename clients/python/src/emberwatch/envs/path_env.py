@@ -130,8 +130,8 @@ class WildfireEnv(WorldEnv):
 
     ## Vectorized environment
 
-    `gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=64)` is `WildfireVectorEnv`: one
-    message steps all worlds.
+    `gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=64)` is `WildfireVectorEnv`: one call
+    steps all worlds.
 
     ## Version History
 
@@ -177,7 +177,7 @@ class WildfireEnv(WorldEnv):
         Raises:
             InvalidArgumentError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
             LeaseLostError: If another client took the world over.
-            ServerGoneError: If the server has ended; the next reset starts or finds another.
+            ServerGoneError: If the server has ended; the next reset attaches to its successor.
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
                 as after Ctrl-C: reset or resume. Nothing is sent.
