@@ -251,7 +251,7 @@ impl Simulator {
 }
 
 fn absolute(path: String) -> Result<PathBuf, Reply> {
-    if path.starts_with('/') && !path.contains('\0') {
+    if Path::new(&path).is_absolute() && !path.contains('\0') {
         return Ok(path.into());
     }
     Err(malformed(&format!(
