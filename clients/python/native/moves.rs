@@ -9,7 +9,7 @@ use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
 /// Checks paths of `n_moves` moves for `n_robots` robots. Others than plain arrays of usual integers, and wrong ones,
-/// go to `emberwatch/arguments.py`, which says what is wrong.
+/// go to `emberwatch/common/arguments.py`, which says what is wrong.
 pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyResult<Vec<u8>> {
     let expected = (n_robots, n_moves);
     let fast = read::<i64>(given, expected, |value| {
@@ -19,7 +19,7 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyRes
     if let Some(moves) = fast.filter(|moves| check_moves(moves).is_ok()) {
         return Ok(moves);
     }
-    let module = given.py().import("emberwatch.arguments")?;
+    let module = given.py().import("emberwatch.common.arguments")?;
     let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
     Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
 }

@@ -1,4 +1,4 @@
-//! What servers and agents publish, as the fields of `Frame`, `Truth` and `Outlook` in `emberwatch/observer.py`.
+//! What servers and agents publish, as the fields of `Frame`, `Truth` and `Outlook` in `emberwatch/client/observer.py`.
 
 use emberwatch_messages::agent_belief::AgentBelief;
 use emberwatch_messages::message::{

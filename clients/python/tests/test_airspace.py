@@ -30,10 +30,10 @@ from gymnasium.utils.env_checker import check_env
 from processes import server
 
 import emberwatch
-from emberwatch._native import Flights
+from emberwatch._native import Flights, built_in
 from emberwatch.belief import Filter, Transition
 from emberwatch.belief.prior import simulated_prior
-from emberwatch.model import Description, Model, built_in
+from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
 from emberwatch.model.moves import fly
 from emberwatch.planning import beam_search
@@ -237,7 +237,7 @@ def test_a_wrong_radius_is_named(wrong: dict[str, Any], message: str) -> None:
 def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
     with refuses("sensor_radius"):
         gymnasium.make(WILDFIRE, task="small", sensor_radius=1)
-    small = built_in("tasks")["small"].read_text()
+    small = built_in("tasks")["small"]
     far, near = tmp_path / "far.toml", tmp_path / "near.toml"
     far.write_text(small.replace('"small"', '"far"') + "sensor_radius = 2\n")
     near.write_text(small.replace('"small"', '"far"') + "sensor_radius = 1\n")

@@ -198,7 +198,7 @@ def test_a_lease_flies_no_robots_of_others() -> None:
     lease = started.connect().acquire(1, 2)
     for first, n_robots in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
         with refuses("step: expected robots of worlds 1..3"):
-            lease._native.step(np.zeros((n_robots, 6), np.uint8), first, n_robots, 0, 5.0)
+            lease.native.step(np.zeros((n_robots, 6), np.uint8), first, n_robots, 0, 5.0)
     assert lease.step([[3] * 6] * 2).result().world.step == 1
     with pytest.raises(errors.EmberwatchError):
         lease.step([3] * 6, robots=range(0, 1))

@@ -140,7 +140,7 @@ def test_a_refused_step_changes_no_state(env: Any, n_times: int) -> None:
 
 
 def test_a_lone_robot_is_never_late(env: Any) -> None:
-    env._session.lease._native.note(0, 0)  # as if steps had passed unseen
+    env._session.lease.native.note(0, 0)  # as if steps had passed unseen
     assert step(env) == "late"
     assert step(env) == "interrupted"
     assert [resume(env), step(env)] == [2, 3]

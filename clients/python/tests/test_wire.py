@@ -159,7 +159,7 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
     numbers = struct.unpack_from(reply.format, message)
     told = [(it.name, number) for it, number in zip(reply.fields, numbers, strict=True)]
     payload = np.frombuffer(message, np.uint8, offset=reply.size)
-    answer = wire.StepAnswer(SHAPE, 0, 2, 0, dict(told)["simulation_nanos"], payload)
+    answer = presented(0, 2, 0, dict(told)["simulation_nanos"], payload)
     (world, first), (same, second) = answer.result(0), answer.result(1)
     assert world == same and answer.simulation_nanos == dict(told)["simulation_nanos"]
     for result in (world, first, second):
@@ -174,12 +174,17 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
         assert (tuple(each["world"]), tuple(each["robot"])) == (world, result)
 
 
+def presented(first: int, n_robots: int, flags: int, nanos: int, payload: Any) -> wire.StepAnswer:
+    """An answer with this payload."""
+    return wire.StepAnswer(_native.Answer(*SHAPE, first, n_robots, flags, nanos, payload))
+
+
 def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnswer:
     """An answer about worlds of two robots."""
     n_worlds = (n_robots + 1) // 2
     n_frames = n_worlds if flags & wire.TEAM_FRAMES else n_robots
     payload = bytearray(64 * n_worlds + 48 * n_robots) + b"\xff" * 15 * n_frames
-    return wire.StepAnswer(SHAPE, first, n_robots, flags, 0, np.frombuffer(payload, np.uint8))
+    return presented(first, n_robots, flags, 0, np.frombuffer(payload, np.uint8))
 
 
 def test_a_frame_is_your_own_to_write_to() -> None:
