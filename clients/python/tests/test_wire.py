@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from processes import server
 
 import emberwatch.connection
-from emberwatch import errors, wire
+from emberwatch import _native, errors, wire
 from emberwatch.client import Client
 from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
@@ -158,7 +158,7 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
     numbers = struct.unpack_from(reply.format, message)
     told = [(it.name, number) for it, number in zip(reply.fields, numbers, strict=True)]
     payload = np.frombuffer(message, np.uint8, offset=reply.size)
-    answer = wire.StepAnswer(SHAPE, 0, 2, 0, dict(told)["simulation_nanos"], payload)
+    answer = presented(0, 2, 0, dict(told)["simulation_nanos"], payload)
     (world, first), (same, second) = answer.result(0), answer.result(1)
     assert world == same and answer.simulation_nanos == dict(told)["simulation_nanos"]
     for result in (world, first, second):
@@ -178,7 +178,12 @@ def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnsw
     n_worlds = (n_robots + 1) // 2
     n_frames = n_worlds if flags & wire.TEAM_FRAMES else n_robots
     payload = bytearray(64 * n_worlds + 48 * n_robots) + b"\xff" * 15 * n_frames
-    return wire.StepAnswer(SHAPE, first, n_robots, flags, 0, np.frombuffer(payload, np.uint8))
+    return presented(first, n_robots, flags, 0, np.frombuffer(payload, np.uint8))
+
+
+def presented(*answer: Any) -> wire.StepAnswer:
+    """An answer from worlds of two robots on 3 x 5 cells."""
+    return wire.StepAnswer(_native.Answer(2, 3, 5, *answer))
 
 
 def test_a_frame_is_your_own_to_write_to() -> None:
@@ -315,9 +320,6 @@ def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
     messages |= {WorldStatus: replies("status")[0]["worlds"][0]}
     names = {field.name for field in dataclasses.fields(kind)}
     assert names == set(messages[kind]) - {"reply"}
-
-
-SHAPE = wire.Shape(n_robots=2, height=3, width=5)
 
 
 def garbled_control(reply: object) -> None:
