@@ -41,7 +41,7 @@ WORLD: dict[str, Any] = {
     "burn_in": 3000,
 }
 #: The same worlds, as flags of a server.
-FLAGS = [f"--{name.replace('n_', '').replace('_', '-')}={value}" for name, value in WORLD.items()]
+FLAGS = "--model=wildfire-small --height=16 --width=16 --moves=16 --burn-in=3000".split()
 SEEN = {"observation": "local", "max_episode_steps": 96}
 
 

@@ -37,7 +37,7 @@ impl Lease {
         }
     }
 
-    /// Flies a path with each robot.
+    /// Flies a path with each robot; `None` if the paths must be converted first, see `moves::paths`.
     fn step(
         &self,
         py: Python<'_>,
@@ -46,16 +46,18 @@ impl Lease {
         n_robots: u32,
         flags: u32,
         seconds: f64,
-    ) -> PyResult<Answer> {
-        let moves = self.moves(paths, first_robot, n_robots)?;
+    ) -> PyResult<Option<Answer>> {
+        let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
+            return Ok(None);
+        };
         let request = self.step_request(first_robot, n_robots, flags);
         let answer = self.ask(py, request, &moves, duration(seconds))?;
-        self.server.get().answered(py, answer, seconds)
+        self.server.get().answered(py, answer, seconds).map(Some)
     }
 
     /// Flies a path with each robot, and sends it again until the worlds have moved. Returns how the worlds stand, and
-    /// how many of their steps passed unseen before that. `accepts_late`: where a world moved on without these paths,
-    /// that is no error.
+    /// how many of their steps passed unseen before that; `None` as of `step`. `accepts_late`: where a world moved on
+    /// without these paths, that is no error.
     fn fly(
         &self,
         py: Python<'_>,
@@ -64,9 +66,11 @@ impl Lease {
         n_robots: u32,
         accepts_late: bool,
         seconds: f64,
-    ) -> PyResult<(Answer, u64)> {
+    ) -> PyResult<Option<(Answer, u64)>> {
         let server = self.server.get();
-        let moves = self.moves(paths, first_robot, n_robots)?;
+        let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
+            return Ok(None);
+        };
         let request = self.step_request(first_robot, n_robots, 0);
         let first_world = worlds_of(first_robot, 1, server.team).start;
         let before = self.step_of(first_world);
@@ -93,10 +97,10 @@ impl Lease {
         };
         let mut lease = self;
         match until_moved(&mut lease, send, look, || false)? {
-            Flown::Answered(answer) => Ok((answer, 0)),
+            Flown::Answered(answer) => Ok(Some((answer, 0))),
             Flown::Observed(seen) => {
                 let n_moved = seen.step() - before;
-                Ok((seen, n_moved - 1))
+                Ok(Some((seen, n_moved - 1)))
             }
             Flown::GivenUp => unreachable!("invariant: it is never given up"),
         }
@@ -161,7 +165,7 @@ impl Lease {
         paths: &Bound<'_, PyAny>,
         first_robot: u32,
         n_robots: u32,
-    ) -> PyResult<Vec<u8>> {
+    ) -> PyResult<Option<Vec<u8>>> {
         let server = self.server.get();
         let worlds = worlds_of(first_robot, n_robots, server.team);
         if worlds.start < self.worlds.start || worlds.end > self.worlds.end {
@@ -169,7 +173,7 @@ impl Lease {
             let got = format!("{n_robots} from {first_robot} on");
             return Err(invalid(paths.py(), "step", expected, got));
         }
-        moves::paths(paths, n_robots as usize, server.n_moves)
+        Ok(moves::paths(paths, n_robots as usize, server.n_moves))
     }
 
     fn ask(

@@ -8,30 +8,29 @@ use numpy::{
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
-/// Checks paths of `n_moves` moves for `n_robots` robots. Others than plain arrays of usual integers, and wrong ones,
-/// go to `emberwatch/common/arguments.py`, which says what is wrong.
-pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyResult<Vec<u8>> {
+/// Paths of `n_moves` moves for `n_robots` robots as bytes; `None` if they are no plain array of usual integers, or wrong:
+/// `emberwatch/common/arguments.py` converts them, or says what is wrong.
+pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Option<Vec<u8>> {
     let expected = (n_robots, n_moves);
     let fast = read::<i64>(given, expected, |value| {
         u8::try_from(value).unwrap_or(u8::MAX)
     });
-    let fast = fast.or_else(|| read::<u8>(given, expected, |value| value));
-    if let Some(moves) = fast.filter(|moves| check_moves(moves).is_ok()) {
-        return Ok(moves);
-    }
-    let module = given.py().import("emberwatch.common.arguments")?;
-    let checked = module.call_method1("as_moves", (given, n_robots, n_moves))?;
-    Ok(read::<u8>(&checked, expected, |value| value).expect("invariant: as_moves returns bytes"))
+    let moves = fast.or_else(|| read::<u8>(given, expected, |value| value))?;
+    check_moves(&moves).is_ok().then_some(moves)
 }
 
-/// Paths as bytes, `[n_robots, n_moves]`, checked.
+/// As [`paths`], an array `[n_robots, n_moves]`.
 #[pyfunction]
 pub fn moves<'py>(
     given: &Bound<'py, PyAny>,
     n_robots: usize,
     n_moves: usize,
-) -> PyResult<Bound<'py, PyArray2<u8>>> {
-    PyArray1::from_vec(given.py(), paths(given, n_robots, n_moves)?).reshape([n_robots, n_moves])
+) -> PyResult<Option<Bound<'py, PyArray2<u8>>>> {
+    let moves = paths(given, n_robots, n_moves).map(|moves| {
+        let moves = PyArray1::from_vec(given.py(), moves);
+        moves.reshape([n_robots, n_moves])
+    });
+    moves.transpose()
 }
 
 /// Integers below `n_choices`, one for each row, as bytes; `None` if they are no plain array of that.

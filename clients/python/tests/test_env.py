@@ -36,7 +36,7 @@ from environments import (
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
-from processes import find, stopped
+from processes import find
 
 import emberwatch
 from emberwatch.envs.parallel import WildfireParallelEnv
@@ -44,7 +44,6 @@ from emberwatch.envs.settings import Settings
 from emberwatch.errors import (
     LeaseLostError,
     NoServerError,
-    RequestTimeoutError,
     ServerGoneError,
 )
 from emberwatch.model import Model
@@ -269,26 +268,6 @@ def test_an_environment_never_seeded_is_random(making: Any) -> None:
         env = making(truth=True)
         truths |= {env.reset()[1]["truth"].tobytes() for _ in range(2)}
     assert len(truths) == 4
-
-
-def test_own_attached_and_vector_worlds_are_the_same() -> None:
-    own = make(truth=True, observation=PARTS)
-    expected = rollout(own, 10, seed=1234)
-    paths = actions(own, 10)
-    with serving(publish_truth=True, worlds=3, seed=99) as instance:
-        attached = make(instance=instance, world=1, truth=True, observation=PARTS)
-        assert_same(rollout(attached, 10, seed=1234), expected)
-        attached.close()
-    vector = make_vec(3, truth=True, observation=PARTS)
-    got = [vector.reset(seed=[3, 1234, 4])]
-    got += [vector.step(np.stack([path[::-1], path, path])) for path in paths]
-    for theirs, ours in zip(got, expected, strict=True):
-        for part in PARTS:
-            assert_same(theirs[0][part][1], ours[0][part])
-        for key, value in ours[-1].items():
-            assert (theirs[-1][key][1] == value).all()
-        if len(ours) == 5:
-            assert [array[1] for array in theirs[1:4]] == list(ours[1:4])
 
 
 def test_rust_and_python_see_the_same_frames() -> None:
@@ -681,20 +660,6 @@ def test_a_reset_waits_for_the_next_server() -> None:
         assert_same(again.result(60), expected)
 
 
-def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
-    started = small_server()
-    env = make(instance=started.instance)
-    env.reset(seed=1)
-    with stopped(started.program.pid), impatient(env), pytest.raises(RequestTimeoutError):
-        env.step([1, 1, 3, 3])
-    with fails("closed", match="timed out"):
-        env.step([1, 1, 3, 3])
-    for _ in range(100):  # the server takes a moment to drop the request that timed out
-        observation, info = env.reset(options={"resume": True})
-        assert observation["robot"].tolist() == ([2, 2] if info["step"] else [0, 0])
-    assert env.step([0, 0, 0, 0])[4]["step"] == info["step"] + 1
-
-
 # Gymnasium's registry, vectorizers and wrappers
 
 
@@ -748,21 +713,6 @@ def test_async_vector_env_simulates_in_each_worker(context: str) -> None:
 
 def _make_small() -> gymnasium.Env[Any, Any]:
     return gymnasium.make(f"emberwatch:{WILDFIRE}", **SMALL)
-
-
-def test_async_vector_env_attaches_its_workers() -> None:
-    with serving(worlds=2, publish_truth=True) as instance:
-        makers = [
-            lambda world=world: gymnasium.make(WILDFIRE, instance=instance, world=world)
-            for world in range(2)
-        ]
-        vector = AsyncVectorEnv(makers, context="fork")
-        try:
-            vector.reset(seed=1)
-            _, _, _, _, infos = vector.step(vector.action_space.sample())
-            assert infos["step"].tolist() == [1, 1]
-        finally:
-            vector.close()
 
 
 def test_videos_and_statistics_are_recorded(tmp_path: Path) -> None:

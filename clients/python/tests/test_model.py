@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from processes import find
 
-import emberwatch
+from emberwatch._native import built_in
 from emberwatch.envs.path_env import WildfireEnv
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Model
@@ -45,10 +45,9 @@ def changed(old: str, new: str) -> str:
 
 
 def test_names_are_those_of_the_programs() -> None:
-    packaged = Path(emberwatch.__file__).parent / "models"
-    names = {file.stem: file.read_bytes() for file in packaged.iterdir()}
-    for name, file in names.items():
-        assert file == (CONFIG / f"{name}.toml").read_bytes()
+    names = built_in("models")
+    for name, text in names.items():
+        assert text == (CONFIG / f"{name}.toml").read_text()
         assert Model.named(name).name == Model.named(Path(name)).name == name
     command = [find("emberwatch-agent"), "run", "--model=no/such"]
     words = subprocess.run(command, capture_output=True, text=True).stderr

@@ -251,34 +251,12 @@ def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
     assert_same(found, seen)
 
 
-def test_another_holder_is_named() -> None:
-    instance = server().instance
-    env = make(instance=instance)
-    env.reset(seed=1000)
-    other = make(instance=instance)
-    with fails("busy", match=f"held by pid {os.getpid()}"):
-        other.reset(seed=1001)
-    taken = make(instance=instance, takeover=True)
-    _, info = taken.reset(options={"resume": True})
-    assert info["step"] == 0
-    with pytest.raises(errors.LeaseLostError):
-        env.step(0)
-
-
 def test_a_copy_plans_by_itself() -> None:
     env = make()
     expected = rollout(env, 3, seed=1000)
     env.close()
     copied = pickle.loads(pickle.dumps(env))
     assert_same(rollout(closed_later(copied), 3, seed=1000), expected)
-
-
-def test_no_thread_starts_before_the_first_reset(checkpoints: Path) -> None:
-    keywords = believing("neural_belief", checkpoints)
-    before = set(os.listdir("/proc/self/task"))
-    envs = make_vec(2, **keywords)
-    assert set(os.listdir("/proc/self/task")) <= before
-    envs.reset(seed=1000)
 
 
 def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:

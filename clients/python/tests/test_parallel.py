@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from environments import (
-    MOVES,
     OBJECTIVE,
     SMALL,
-    WILDFIRE,
     assert_same,
     impatient,
     make,
@@ -22,7 +20,7 @@ from environments import (
     no_warnings,
     serving,
 )
-from failures import fails, refuses
+from failures import refuses
 from pettingzoo.utils.conversions import parallel_to_aec
 from processes import at_once, script
 
@@ -329,23 +327,6 @@ def test_a_robot_is_taken_over_where_it_stands() -> None:
         assert_same(again["robot"], seen["robot"])
         with pytest.raises(emberwatch.errors.LeaseLostError):
             first.step([0, 0, 0, 0])
-
-
-@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
-def test_an_episode_that_is_over_is_for_the_holder_of_all(name: str) -> None:
-    with serving(robots=2, max_steps=1) as instance:
-        one, other = alone(instance, 0), alone(instance, 0, name=name)
-        one.reset()
-        assert one.step([1, 1, 1, 1])[3]
-        one.close()
-        for _ in range(2):
-            with fails("episode_over", match="holds all its robots$"):
-                other.reset()
-            with fails("episode_over", match="holds all its robots$"):
-                other.unwrapped.step(np.zeros(other.action_space.shape, int))
-        other.close()
-        env = team(instance=instance)
-        assert env.reset(seed=1)[1]["robot_0"]["step"] == 0
 
 
 @pytest.mark.parametrize(

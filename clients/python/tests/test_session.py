@@ -132,13 +132,6 @@ def test_an_episode_that_is_over_waits_for_the_holder_of_all(started: Server) ->
     assert [resume(env), step(env)] == [0, 1]
 
 
-@pytest.mark.parametrize("n_times", [1, 2])
-def test_a_refused_step_changes_no_state(env: Any, n_times: int) -> None:
-    for _ in range(n_times):
-        assert outcome(lambda: env.step([4] * 4)) == "invalid_argument"
-    assert step(env) == 3
-
-
 def test_a_lone_robot_is_never_late(env: Any) -> None:
     env._session.lease.native.note(0, 0)  # as if steps had passed unseen
     assert step(env) == "late"

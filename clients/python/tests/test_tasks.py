@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from processes import find
 
 import emberwatch
+from emberwatch._native import built_in
 from emberwatch.benchmark import evaluate, suite
 from emberwatch.model.tasks import Task, built_in_tasks
 
@@ -56,13 +57,12 @@ def by_hand(name: str) -> dict[str, Any]:
 
 
 def test_the_package_has_the_files_of_the_programs() -> None:
-    package = Path(emberwatch.__file__).parent
-    landscape = package / "landscapes/jacksboro.toml"
-    assert landscape.read_bytes() == (CONFIG / "landscapes/jacksboro/jacksboro.toml").read_bytes()
+    states = (CONFIG / "landscapes/jacksboro/jacksboro.toml").read_text()
+    assert built_in("states") == {"jacksboro": states}
     files = {file.stem: file for file in (CONFIG / "tasks").iterdir()}
     assert set(files) == set(PREFIXES) == set(built_in_tasks())
     for name, file in files.items():
-        assert file.read_bytes() == (package / "tasks" / file.name).read_bytes()
+        assert file.read_text() == built_in("tasks")[name]
         assert Task.named(name) == Task.named(file) == built_in_tasks()[name]
     with refuses("task ash: No such file .*expected one, or wildfire, small, "):
         Task.named("ash")

@@ -235,6 +235,12 @@ def test_an_impossible_seed_is_named_and_changes_nothing(seed: int) -> None:
     assert_same(ours.reset(), theirs.reset())
 
 
+def test_the_truth_of_too_many_worlds_of_a_server_is_refused() -> None:
+    words = "truth: expected at most 128 worlds, got 129"
+    with serving(worlds=129, publish_truth=True) as instance, refuses(words):
+        make_vec(129, instance=instance, truth=True)
+
+
 def test_resume_goes_on_where_the_worlds_stand() -> None:
     with serving(worlds=3) as instance:
         first = make_vec(3, instance=instance, observation=PARTS)
@@ -370,7 +376,7 @@ def test_wrong_moves_are_named_and_not_flown(action: Any, message: str) -> None:
         ({"n_worlds": 0}, "num_envs: expected 1 to 1024, got 0"),
         ({"n_worlds": 1025}, "num_envs: .* got 1025"),
         ({"observation": "smoke"}, "observation: .* got 'smoke'"),
-        ({"world": 2}, "world: applies only with instance=..."),
+        ({"world": 2}, "^world: applies only with instance="),
     ],
     ids=str,
 )

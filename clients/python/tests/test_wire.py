@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from processes import server
 
 import emberwatch.client.connection
-from emberwatch import errors
+from emberwatch import _native, errors
 from emberwatch.client import wire
 from emberwatch.client.client import Client
 from emberwatch.client.lease import Lease
@@ -174,17 +174,17 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
         assert (tuple(each["world"]), tuple(each["robot"])) == (world, result)
 
 
-def presented(first: int, n_robots: int, flags: int, nanos: int, payload: Any) -> wire.StepAnswer:
-    """An answer with this payload."""
-    return wire.StepAnswer(_native.Answer(*SHAPE, first, n_robots, flags, nanos, payload))
-
-
 def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnswer:
     """An answer about worlds of two robots."""
     n_worlds = (n_robots + 1) // 2
     n_frames = n_worlds if flags & wire.TEAM_FRAMES else n_robots
     payload = bytearray(64 * n_worlds + 48 * n_robots) + b"\xff" * 15 * n_frames
     return presented(first, n_robots, flags, 0, np.frombuffer(payload, np.uint8))
+
+
+def presented(*answer: Any) -> wire.StepAnswer:
+    """An answer from worlds of two robots on 3 x 5 cells."""
+    return wire.StepAnswer(_native.Answer(2, 3, 5, *answer))
 
 
 def test_a_frame_is_your_own_to_write_to() -> None:
@@ -321,9 +321,6 @@ def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
     messages |= {WorldStatus: replies("status")[0]["worlds"][0]}
     names = {field.name for field in dataclasses.fields(kind)}
     assert names == set(messages[kind]) - {"reply"}
-
-
-SHAPE = wire.Shape(n_robots=2, height=3, width=5)
 
 
 def garbled_control(reply: object) -> None:

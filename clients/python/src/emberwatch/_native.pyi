@@ -136,8 +136,8 @@ def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
     whether any episode is over. `pays`: as of `Answer.numbers`.
     """
 
-def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8]:
-    """Paths as bytes, `(n_robots, n_moves)`, checked as by `arguments.as_moves`."""
+def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
+    """Paths as bytes, `(n_robots, n_moves)`, checked; None as of `Lease.step`."""
 
 class Server:
     """A connection to a server, or worlds in this process. Threads may share it, in turns."""
@@ -292,8 +292,11 @@ class Lease:
     def __init__(self, server: Server, number: int, first_robot: int, n_robots: int) -> None: ...
     def step(
         self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
-    ) -> Answer:
-        """Flies a path with each robot, for the next step of its world."""
+    ) -> Answer | None:
+        """Flies a path with each robot, for the next step of its world.
+
+        None if the paths are no plain array of int64 or uint8, or wrong: `as_moves` converts them.
+        """
 
     def fly(
         self,
@@ -302,7 +305,7 @@ class Lease:
         n_robots: int,
         accepts_late: bool,
         seconds: float,
-    ) -> tuple[Answer, int]:
+    ) -> tuple[Answer, int] | None:
         """As `step`, sent again until the worlds have moved; see `lease.Lease.fly`."""
 
     def observe(self, first_robot: int, n_robots: int, flags: int, seconds: float) -> Answer:

@@ -5,8 +5,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from emberwatch.client import wire
 from emberwatch.client.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
@@ -76,7 +75,12 @@ class Lease:
                 tells to where. With code `"episode_over"`: reset that world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
-        return StepAnswer(self.native.step(self._array(paths, robots), *place, timeout))
+        answer = self.native.step(paths, *place, timeout)
+        if answer is None:
+            moves = as_moves(paths, place[1], self.client.info.n_moves)
+            answer = self.native.step(moves, *place, timeout)
+            assert answer is not None
+        return StepAnswer(answer)
 
     def fly(
         self,
@@ -106,9 +110,18 @@ class Lease:
             EmberwatchError: As `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
-        given = self._array(paths, robots)
-        answer, n_skipped = self.native.fly(given, *place, accepts_late, timeout)
-        return StepAnswer(answer), n_skipped
+        return self.flown(paths, *place, accepts_late, timeout)
+
+    def flown(
+        self, paths: ArrayLike, first: int, n_robots: int, accepts_late: bool, timeout: float
+    ) -> tuple[StepAnswer, int]:
+        """As `fly`, of robots by the number of the first."""
+        flown = self.native.fly(paths, first, n_robots, accepts_late, timeout)
+        if flown is None:
+            moves = as_moves(paths, n_robots, self.client.info.n_moves)
+            flown = self.native.fly(moves, first, n_robots, accepts_late, timeout)
+            assert flown is not None
+        return StepAnswer(flown[0]), flown[1]
 
     def observe(
         self,
@@ -212,16 +225,6 @@ class Lease:
     def _ask(self, operation: str, timeout: float, **keys: Any) -> dict[str, Any]:
         request = {"op": operation, "lease": self.number, **keys}
         return self.client.control(request, timeout=timeout)
-
-    def _array(self, paths: ArrayLike, robots: range | None) -> NDArray[Any]:
-        """Paths as an array; the native module checks arrays quickly.
-
-        Lists are converted here: at the interpreter's end, Python must not end a daemon thread in
-        code that Rust has called.
-        """
-        if type(paths) is np.ndarray:
-            return paths
-        return as_moves(paths, len(robots or self.robots), self.client.info.n_moves)
 
     def _place(self, robots: range | None, flags: int) -> tuple[int, int, int]:
         """The first of some robots or of all, how many, and flags."""

@@ -250,7 +250,9 @@ class WildfireVectorEnv(WorldVectorEnv):
         )
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
-        return moves(actions, self.num_envs, self._spec.n_moves)
+        n_moves = self._spec.n_moves
+        chosen = moves(actions, self.num_envs, n_moves)
+        return as_moves(actions, self.num_envs, n_moves) if chosen is None else chosen
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(actions, flown)

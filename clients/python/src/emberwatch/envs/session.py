@@ -26,7 +26,6 @@ from emberwatch.client.lease import Lease
 from emberwatch.client.observer import Newest, Present, Truth, TruthReader
 from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
-from emberwatch.common.arguments import as_moves
 from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
 from emberwatch.errors import (
     EmberwatchError,
@@ -215,10 +214,8 @@ class Session:
         first, n_robots = self._first, self.n_rows
         if rows is not None:
             first, n_robots = first + rows.start, len(rows)
-        if type(paths) is not np.ndarray:
-            paths = as_moves(paths, n_robots, self.spec.n_moves)
         try:
-            answer, self.n_skipped = lease.native.fly(
+            answer, self.n_skipped = lease.flown(
                 paths, first, n_robots, self._accepts_late, self.settings.timeout
             )
         except LOST as error:
@@ -227,7 +224,7 @@ class Session:
             self._refused(error)
             raise
         self._state = State.MOVED
-        return StepAnswer(answer)
+        return answer
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
