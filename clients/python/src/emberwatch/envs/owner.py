@@ -1,5 +1,6 @@
 """What environments of one world and of many tell of their session."""
 
+from contextlib import AbstractContextManager
 from copy import copy
 from typing import Any
 
@@ -66,6 +67,11 @@ class SessionOwner:
     def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._session.is_open
+
+    @property
+    def turn(self) -> AbstractContextManager[object]:
+        """Lets one thread at a time step or reset; use it in a `with`."""
+        return self._session.turn
 
     def allow_test_worlds(self) -> None:
         """Resets on a task's test seeds are meant, and warn no more."""

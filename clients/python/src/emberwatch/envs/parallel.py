@@ -107,8 +107,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Begins an episode; of the options, only `resume` counts, see `WildfireEnv`."""
         known = {key: value for key, value in as_options(options).items() if key == "resume"}
-        seen, infos = self._worlds.reset(seed=seed, options=known)
-        self.agents = list(self.possible_agents)
+        with self._worlds.turn:
+            seen, infos = self._worlds.reset(seed=seed, options=known)
+            self.agents = list(self.possible_agents)
         return self._by_agent(seen), self._infos(infos)
 
     def step(
@@ -121,6 +122,10 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         dict[str, dict[str, Any]],
     ]:
         """A move or a path of each robot; raises as `WildfireEnv.step` does."""
+        with self._worlds.turn:
+            return self._step(actions)
+
+    def _step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
         given: Any = actions
         if not isinstance(given, dict) or actions.keys() != set(self.agents):
             raise invalid("actions", f"one for each of {self.agents}", told(actions))
