@@ -7,6 +7,7 @@ use emberwatch_messages::message::{
 };
 use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
 use emberwatch_model::Shape;
+use emberwatch_model::grid::MAX_SIDE;
 use numpy::ndarray::arr2;
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
@@ -17,6 +18,11 @@ use std::ops::Range;
 
 /// Bytes of a world's result and of its robot's result.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
+
+/// The most robots of an answer: of as many worlds as a server may have, with the largest teams.
+const MAX_ROBOTS: u32 = 1 << 16;
+
+type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
 
 /// Numbers of one robot's step: reward, whether the episode terminated and was truncated, step, distinct cells visited;
 /// row and column, `[1, 2]`.
@@ -66,8 +72,15 @@ impl Answer {
         simulation_nanos: u64,
         payload: Bound<'_, PyArray1<u8>>,
     ) -> PyResult<Self> {
+        let is_small = height <= MAX_SIDE && width <= MAX_SIDE && n_robots <= MAX_ROBOTS;
+        if !is_small || n_robots == 0 || team == 0 {
+            let expected =
+                format!("at most {MAX_ROBOTS} robots, on at most {MAX_SIDE} rows and columns");
+            let got = format!("{n_robots} robots, {team} in a world, {height} x {width} cells");
+            return Err(invalid(py, "answer", expected, got));
+        }
         let mut answer = Self {
-            team: team.max(1),
+            team,
             first_robot,
             n_robots,
             simulation_nanos,
@@ -80,11 +93,27 @@ impl Answer {
             first: Default::default(),
         };
         let (expected, got) = (answer.n_bytes(), payload.len());
-        if expected != got || n_robots == 0 {
+        if expected != got {
             return Err(invalid(py, "payload", format!("{expected} bytes"), got));
         }
         answer.first = answer.results_of(py, 0)?;
         Ok(answer)
+    }
+
+    /// What copies and pickles are made from.
+    fn __getnewargs__(&self, py: Python<'_>) -> Arguments {
+        let [n_frames, height, width] = self.dim;
+        let shares = n_frames < self.n_robots as usize;
+        (
+            self.team,
+            height,
+            width,
+            self.first_robot,
+            self.n_robots,
+            if shares { FLAG_TEAM_FRAMES } else { 0 },
+            self.simulation_nanos,
+            self.payload.clone_ref(py),
+        )
     }
 
     /// What each robot saw, or each world's team, `(n, H, W)`: a view of the answer's own memory.

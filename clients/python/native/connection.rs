@@ -17,10 +17,11 @@ use emberwatch_sim::embedded::INSTANCE;
 use emberwatch_sim::world::Episode;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Cells and moves that are stepped in less than about 1 ms.
-const BRIEF_CELLS: usize = 1 << 19;
+/// A step that takes less keeps the interpreter: 1 ms.
+const BRIEF_NANOS: u64 = 1_000_000;
 
 /// A connection to a server, or worlds in this process. Threads may share it: they take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -36,6 +37,8 @@ pub struct Server {
     /// How long a step waits for teammates.
     pub deadline: Duration,
     is_embedded: bool,
+    /// How long the last step took, for each robot; 0 before the first.
+    nanos_of_robot: AtomicU64,
 }
 
 #[pymethods]
@@ -132,6 +135,7 @@ impl Server {
             shape: shape_of(py, info.height as usize, info.width as usize)?,
             deadline: Duration::from_millis(info.deadline_millis),
             is_embedded: matches!(backend, Backend::Embedded(_)),
+            nanos_of_robot: AtomicU64::new(0),
             info: serde_json::to_string(&info).expect("invariant: replies serialise"),
             team: info.n_robots.max(1),
             n_moves: info.n_moves,
@@ -150,10 +154,17 @@ impl Server {
         Ok(Answer::of(py, self.team, self.shape, &reply, payload))
     }
 
-    /// Whether a step of so many robots is over so soon that other Python threads need not get the interpreter: to get
-    /// it back from a busy one takes 5 ms.
+    /// Whether a step of this number of robots ends so soon that other Python threads need not get the interpreter: to
+    /// get it back from a busy thread takes 5 ms. Unknown before the first step.
     pub fn is_brief(&self, n_robots: u32) -> bool {
-        self.is_embedded && n_robots as usize * (self.shape.n_cells() + self.n_moves) < BRIEF_CELLS
+        let nanos = self.nanos_of_robot.load(Ordering::Relaxed);
+        self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
+    }
+
+    /// Remembers how long a step of this number of robots took.
+    pub fn took(&self, nanos: u64, n_robots: u32) {
+        let nanos = nanos / u64::from(n_robots.max(1));
+        self.nanos_of_robot.store(nanos.max(1), Ordering::Relaxed);
     }
 }
 

@@ -51,7 +51,7 @@ impl Lease {
             return Ok(None);
         };
         let request = self.step_request(first_robot, n_robots, flags);
-        let answer = self.ask(py, request, &moves, duration(seconds))?;
+        let answer = self.ask(py, request, &moves, &mut Vec::new(), duration(seconds))?;
         self.server.get().answered(py, answer, seconds).map(Some)
     }
 
@@ -73,10 +73,11 @@ impl Lease {
         };
         let request = self.step_request(first_robot, n_robots, 0);
         let first_world = worlds_of(first_robot, 1, server.team).start;
-        let before = self.step_of(first_world);
         // Sooner would take back the path with which the deadline began.
         let timeout = duration(seconds).saturating_add(server.deadline);
-        let send = |it: &mut &Self| match it.ask(py, request, &moves, timeout)? {
+        // The steps of the worlds for which the paths are.
+        let mut steps = Vec::new();
+        let send = |steps: &mut Vec<u64>| match self.ask(py, request, &moves, steps, timeout)? {
             Err(ConnectionError::Timeout { .. }) => Ok(None),
             Err(ConnectionError::Refused { status, .. })
                 if accepts_late && status == Status::Late =>
@@ -85,21 +86,18 @@ impl Lease {
             }
             answer => server.answered(py, answer, seconds).map(Some),
         };
-        let look = |it: &mut &Self| {
-            let request = it.request(Operation::Observe, first_robot, n_robots, 0);
-            let seen = it.ask(py, request, &[], duration(seconds))?;
-            let seen = server.answered(py, seen, seconds)?;
-            if seen.step() > before {
+        let look = |steps: &mut Vec<u64>| {
+            let seen = self.observe(py, first_robot, n_robots, 0, seconds)?;
+            if steps.first().is_some_and(|&before| seen.step() > before) {
                 return Ok(Some(seen));
             }
             warn_of_wait(py, first_world)?;
             Ok(None)
         };
-        let mut lease = self;
-        match until_moved(&mut lease, send, look, || false)? {
+        match until_moved(&mut steps, send, look, || false)? {
             Flown::Answered(answer) => Ok(Some((answer, 0))),
             Flown::Observed(seen) => {
-                let n_moved = seen.step() - before;
+                let n_moved = seen.step() - steps[0];
                 Ok(Some((seen, n_moved - 1)))
             }
             Flown::GivenUp => unreachable!("invariant: it is never given up"),
@@ -116,7 +114,7 @@ impl Lease {
         seconds: f64,
     ) -> PyResult<Answer> {
         let request = self.request(Operation::Observe, first_robot, n_robots, flags);
-        let answer = self.ask(py, request, &[], duration(seconds))?;
+        let answer = self.ask(py, request, &[], &mut Vec::new(), duration(seconds))?;
         self.server.get().answered(py, answer, seconds)
     }
 
@@ -176,24 +174,29 @@ impl Lease {
         Ok(moves::paths(paths, n_robots as usize, server.n_moves))
     }
 
+    /// `steps`: the steps for which paths are; of the worlds as last seen if there are none yet.
     fn ask(
         &self,
         py: Python<'_>,
         request: StepRequest,
         moves: &[u8],
+        steps: &mut Vec<u64>,
         timeout: Duration,
     ) -> PyResult<Result<(StepReply, Vec<u8>), ConnectionError>> {
         let server = self.server.get();
+        let worlds = worlds_of(request.first_robot, request.n_robots, server.team);
+        let n_worlds = worlds.len();
         // Within the connection's turn: each thread's path is for a step of its own.
         let exchange = |backend: &mut Backend| {
-            let worlds = worlds_of(request.first_robot, request.n_robots, server.team);
-            self.exchange(backend, worlds, request, moves, timeout)
+            self.exchange(backend, worlds, request, (moves, steps), timeout)
         };
-        if server.is_brief(request.n_robots) {
-            server.backend.with_briefly(py, exchange)
-        } else {
-            server.backend.with(py, exchange)
+        if !server.is_brief(request.n_robots) {
+            return server.backend.with(py, exchange);
         }
+        if n_worlds > 1 {
+            server.backend.check(py)?;
+        }
+        server.backend.with_briefly(py, exchange)
     }
 
     fn exchange(
@@ -201,15 +204,21 @@ impl Lease {
         backend: &mut Backend,
         worlds: Range<u32>,
         request: StepRequest,
-        moves: &[u8],
+        (moves, steps): (&[u8], &mut Vec<u64>),
         timeout: Duration,
     ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
         let mut body = Vec::new();
         if request.operation == Operation::Step as u32 {
-            let noted = self.noted();
-            write_step_body(&noted[self.indices(&worlds)], moves, &mut body);
+            if steps.is_empty() {
+                steps.extend_from_slice(&self.noted()[self.indices(&worlds)]);
+            }
+            write_step_body(steps, moves, &mut body);
         }
         let (reply, payload) = backend.step_payload(request, &body, timeout)?;
+        if !moves.is_empty() {
+            let server = self.server.get();
+            server.took(reply.simulation_nanos, request.n_robots);
+        }
         // Robots outside the lease may be observed, too.
         let own = worlds.start.max(self.worlds.start)..worlds.end.min(self.worlds.end);
         if !own.is_empty() {
@@ -227,11 +236,6 @@ impl Lease {
     /// Where `steps` has these worlds of the lease.
     fn indices(&self, worlds: &Range<u32>) -> Range<usize> {
         (worlds.start - self.worlds.start) as usize..(worlds.end - self.worlds.start) as usize
-    }
-
-    fn step_of(&self, world: u32) -> u64 {
-        let index = world - self.worlds.start;
-        self.noted()[index as usize]
     }
 
     fn noted(&self) -> MutexGuard<'_, Vec<u64>> {

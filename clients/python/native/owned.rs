@@ -67,6 +67,7 @@ impl<T: Send> Owned<T> {
     }
 
     /// As [`Self::with`], keeping the interpreter for what is over soon, unless another thread uses the value just now.
+    /// Notices forks by Python's hooks alone: call [`Self::check`] before what other threads take part in.
     ///
     /// # Errors
     /// As [`Self::with`].
@@ -75,7 +76,9 @@ impl<T: Send> Owned<T> {
         py: Python<'_>,
         act: impl FnOnce(&mut T) -> R + Send,
     ) -> PyResult<R> {
-        self.check(py)?;
+        if self.pid != known_pid() {
+            self.check(py)?;
+        }
         let taken = match &mut *self.lock() {
             slot @ Slot::Free(_) => match std::mem::replace(slot, Slot::Taken) {
                 Slot::Free(value) => Some(value),
@@ -206,11 +209,16 @@ impl<T: Send> Drop for Owned<T> {
 /// This process's number; 0 until it is asked for.
 static PID: AtomicU32 = AtomicU32::new(0);
 
-/// This process's number, without a system call after the first one.
 fn pid() -> u32 {
+    std::process::id()
+}
+
+/// This process's number, without a system call after the first one. A fork that does not run Python's hooks is not
+/// noticed: for what no thread of the parent takes part in.
+fn known_pid() -> u32 {
     match PID.load(Ordering::Relaxed) {
         0 => {
-            let pid = std::process::id();
+            let pid = pid();
             PID.store(pid, Ordering::Relaxed);
             pid
         }

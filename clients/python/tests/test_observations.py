@@ -107,7 +107,7 @@ def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
 
 @pytest.mark.parametrize("window", [0, 4, -3, 2.5, "5"], ids=repr)
 def test_an_impossible_window_is_named(window: Any) -> None:
-    with refuses("window: expected an odd number from 3 on"):
+    with refuses("window: expected an odd number, 3 to 255"):
         make(MOVES, window=window)
 
 

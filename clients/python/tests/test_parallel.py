@@ -378,3 +378,11 @@ def test_rows_of_a_world_are_reset_together() -> None:
         infos["step"].tolist() == [0, 0, 0, 0, 0, 0]
         and infos["_step"].tolist() == [True] * 3 + [False] * 3
     )
+
+
+def test_what_an_agent_writes_to_its_frame_does_not_change_the_state() -> None:
+    env = team(action="path")
+    seen, _ = env.reset(seed=1)
+    before = env.state()
+    seen["robot_0"]["frame"][:] = 7
+    assert np.array_equal(env.state(), before)

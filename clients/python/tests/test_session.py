@@ -1,14 +1,16 @@
 """States of an environment's session: what a step, a resume and a reset do in each of them."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import gymnasium
 import pytest
-from environments import impatient, make, rollout, small_server
+from environments import closed_later, impatient, make, rollout, small_server
 from processes import Server
 
 from emberwatch.envs.session import State
-from emberwatch.errors import EmberwatchError
+from emberwatch.errors import EmberwatchError, TrainingOnTestWorldsWarning
 
 PATH = [1, 3, 1, 3]
 
@@ -137,3 +139,12 @@ def test_a_lone_robot_is_never_late(env: Any) -> None:
     assert step(env) == "late"
     assert step(env) == "interrupted"
     assert [resume(env), step(env)] == [2, 3]
+
+
+def test_a_warning_that_is_an_error_changes_no_state() -> None:
+    env = closed_later(gymnasium.make("emberwatch/WildfireSmall-v0").unwrapped)
+    env.reset(seed=1000)
+    with warnings.catch_warnings(), pytest.raises(TrainingOnTestWorldsWarning):
+        warnings.simplefilter("error")
+        env.reset(seed=1)
+    assert env.step(env.action_space.sample())[4]["step"] == 1

@@ -99,7 +99,7 @@ SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
     "paths": (lambda: make_vec(3), np.array([[1, 3, 1, 3]] * 3)),
     "moves": (lambda: make_vec(3, MOVES, observation=("belief", "local")), np.array([3, 1, 0])),
     "team": (
-        lambda: closed_later(emberwatch.parallel_env(robots=2, **SMALL)),
+        lambda: closed_later(emberwatch.parallel_env(robots=2, max_episode_steps=None, **SMALL)),
         {"robot_0": 1, "robot_1": 3},
     ),
 }

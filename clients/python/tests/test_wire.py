@@ -1,7 +1,9 @@
 """The wire against PROTOCOL.md: tables, codes, limits, examples; and bytes that make no sense."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import re
 import struct
 from types import SimpleNamespace
@@ -191,6 +193,13 @@ def test_a_frame_is_your_own_to_write_to() -> None:
     answer = answered()
     answer.frames[:] = 7
     assert answer.result().world.step == 0 and (answer.frames == 7).all()
+
+
+def test_an_answer_can_be_copied_and_pickled() -> None:
+    for answer in (answered(), answered(4, flags=wire.TEAM_FRAMES)):
+        for other in (copy.deepcopy(answer), pickle.loads(pickle.dumps(answer))):
+            assert repr(other) == repr(answer) and (other.frames == answer.frames).all()
+            assert other.results.tobytes() == answer.results.tobytes()
 
 
 def test_each_robot_is_in_its_world() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import stat
+import sys
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -236,6 +236,10 @@ class RowFile:
     def _locked(self) -> Generator[int]:
         """Holds the lock on the file, which is made if it is missing; gives its descriptor."""
         deadline = time.monotonic() + _PATIENCE
+        if sys.platform == "win32":
+            raise InvalidArgumentError(
+                "csv: expected a system with flock, such as Linux; got Windows"
+            )
         while True:
             # Without O_NONBLOCK a pipe would block.
             flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
@@ -252,6 +256,8 @@ class RowFile:
     def _lock(self, descriptor: int, deadline: float) -> None:
         while True:
             try:
+                import fcntl  # not on Windows
+
                 return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 if time.monotonic() > deadline:

@@ -11,6 +11,7 @@ from emberwatch._native import Flights, Windows
 from emberwatch.belief import Filters
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
+from emberwatch.common.arguments import as_integer
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
@@ -25,6 +26,9 @@ MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
 
 #: Cells along a side of the parts `local` and `recent`, unless told otherwise.
 WINDOW: Final = 15
+
+#: Maximum of that number.
+MAX_WINDOW: Final = 255
 
 #: Parts that a filter is needed for, those from memory of frames, and those about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
@@ -246,8 +250,8 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
     }
     if window is None:
         return known
-    if not isinstance(window, int | np.integer) or window < 3 or not window & 1:  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise invalid("window", "an odd number from 3 on", repr(window))
+    if as_integer(window) is None or not 3 <= window <= MAX_WINDOW or not window & 1:
+        raise invalid("window", f"an odd number, 3 to {MAX_WINDOW}", repr(window))
 
     def around(n_of_world: int) -> spaces.Box:
         return spaces.Box(0, 255, (window, window, n_of_world + N_OF_PATH), np.uint8)

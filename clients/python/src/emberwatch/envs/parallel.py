@@ -73,6 +73,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             autoreset_mode=AutoresetMode.DISABLED,
             **keywords,
         )
+        self._worlds.keeps_frames = True
         self._observes_masks = "action_mask" in names_of(keywords["observation"])
         self.possible_agents = [f"robot_{row}" for row in range(self._worlds.num_envs)]
         self.agents: list[str] = []

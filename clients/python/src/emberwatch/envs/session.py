@@ -35,7 +35,7 @@ from emberwatch.errors import (
     TrainingOnTestWorldsWarning,
     invalid,
 )
-from emberwatch.model.tasks import FIRST_TRAINING_SEED
+from emberwatch.model.tasks import FIRST_TRAINING_SEED, Task
 
 # Seconds after its last use that a lease on a running server ends: learners may think long, and
 # the server notices a dead holder at once anyway.
@@ -47,11 +47,13 @@ LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 #: Number of forks between the first process and this one.
 _n_forks = 0
+#: Lets one thread of a forked child at a time replace the lock of a session.
+_fork_lock = threading.Lock()
 
 
 def _count_fork() -> None:
-    global _n_forks
-    _n_forks += 1
+    global _n_forks, _fork_lock
+    _n_forks, _fork_lock = _n_forks + 1, threading.Lock()
 
 
 if hasattr(os, "register_at_fork"):
@@ -130,8 +132,10 @@ class Session:
     def turn(self) -> threading.RLock:
         """Lets one thread at a time step or reset; use it in a `with`."""
         if self._made_after != _n_forks:
-            # The thread that held it may not exist in a forked child.
-            self._turn, self._made_after = threading.RLock(), _n_forks
+            with _fork_lock:
+                if self._made_after != _n_forks:
+                    # The thread that held it may not exist in a forked child.
+                    self._turn, self._made_after = threading.RLock(), _n_forks
         return self._turn
 
     @property
@@ -377,6 +381,14 @@ class Session:
             or not any(it in task.test_seeds for it in seeds)
         ):
             return
+        try:
+            self._warn_of_task(task)
+        except Warning:  # made an error: nothing has changed
+            if self._state is State.BEGUN:
+                self._state = State.READY if self.is_open else State.CLOSED
+            raise
+
+    def _warn_of_task(self, task: Task) -> None:
         tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
         # Of this line, wherever the reset is: Python shows it once in a process.
         warnings.warn(

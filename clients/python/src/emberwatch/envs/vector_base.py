@@ -100,6 +100,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
+        #: Whether `seen` shows frames that no learner has written to.
+        self.keeps_frames = False
 
     def reset(
         self,
@@ -358,7 +360,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _shown(self) -> NDArray[np.uint8]:
         """The frames, which the learner may write to: pictures come from others."""
-        return self._frames if self.render_mode is None else self._frames.copy()
+        is_own = self.render_mode is None and not self.keeps_frames
+        return self._frames if is_own else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         """The seed of each world."""
