@@ -184,8 +184,13 @@ def main() -> None:
     if args.busy is None:
         start_up(5)
         with server_row() as at_server:
-            race([emberwatch_row, at_server, async_row, envpool_row], 1, 4000, args.rounds)
-            race([emberwatch_row, at_server, async_row, envpool_row], 64, 200, args.rounds)
+            for n_envs, n_steps in ((1, 4000), (16, 800), (64, 200)):
+                race(
+                    [emberwatch_row, at_server, async_row, envpool_row],
+                    n_envs,
+                    n_steps,
+                    args.rounds,
+                )
     for n in args.busy or [3]:
         print(f"beside {n} busy processes:")
         with busy_processes(n):
