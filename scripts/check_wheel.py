@@ -74,7 +74,7 @@ def check_training() -> None:
 
 
 def check_dashboard() -> None:
-    """The page answers, beside a server."""
+    """The dashboard's page answers while a server runs."""
     instance = f"wheel-{os.getpid()}"
     server = subprocess.Popen([find("emberwatch-server"), f"--instance={instance}"])
     emberwatch.connect(instance, wait=30).close()

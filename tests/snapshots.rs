@@ -94,7 +94,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
             "--worlds 3 --takeover",
             "worlds: expected at least 3, got 2",
         ),
-        ("--first-world 2 --takeover", "the server has robots 0 to 2"),
+        ("--first-world 2 --takeover", "there are robots 0 to 2"),
     ] {
         refused(&server, &restore(flags), words);
     }

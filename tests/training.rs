@@ -382,7 +382,8 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
         let name = server.instance.name();
         place.words("out", &format!("--instance {name} {flags}"))
     };
-    let more = "no such world: the server has worlds 0 to 0; start it with --worlds N for more";
+    let more =
+        "no such world: there are worlds 0 to 0; for more, set worlds (--worlds N of a server)";
     for flags in [
         "--worlds 2",
         "--worlds 1 --world 1",

@@ -1,4 +1,4 @@
-//! What answers requests: a server, or worlds in this process.
+//! The backend of a connection, which answers its requests: a server, or worlds in this process.
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
@@ -55,7 +55,7 @@ impl Backend {
     }
 }
 
-/// Worlds in this process, of these settings of `config/server.toml`, as JSON.
+/// Makes worlds in this process. `settings` is JSON with the names of `config/server.toml`.
 pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
     let checked = checked(py, settings)?;
     if warns {
@@ -72,7 +72,7 @@ pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedde
     })
 }
 
-/// All settings that a server with these would have; JSON from JSON.
+/// Checks settings; returns them with all defaults. JSON from JSON.
 #[pyfunction]
 pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
     let checked = checked(py, settings)?;
@@ -87,8 +87,8 @@ pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
     Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
-/// Reads settings and their files. What is no plain file, such as a pipe, is read on a thread of its own, so that the wait
-/// for it can end.
+/// Reads settings and their files. Pipes, devices and other special files are read on a separate thread, so that the wait
+/// for them can time out or be interrupted.
 fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
     let given: Map<String, Value> =
         serde_json::from_str(settings).map_err(|error| refused(py, &error.to_string()))?;
@@ -136,10 +136,10 @@ fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
             ("snapshot_keep", settings.snapshot_keep.to_string()),
         ]
     };
-    let (given, usual) = (of_servers(settings), of_servers(&ServerConfig::default()));
+    let (given, defaults) = (of_servers(settings), of_servers(&ServerConfig::default()));
     let wrong = given
         .into_iter()
-        .zip(usual)
+        .zip(defaults)
         .find(|(one, other)| one != other);
     wrong.map_or(Ok(()), |((setting, got), _)| {
         let expected = "expected to be left out, as worlds in this process have no server";

@@ -1,7 +1,8 @@
-//! What belongs to the process that made it, and to one thread at a time.
+//! Values that belong to the process that made them, and that one thread at a time uses.
 
 use crate::errors::{error, interrupted, raise_of_channel};
 use emberwatch_messages::errors::ChannelError;
+use emberwatch_sim::embedded::INSTANCE;
 use pyo3::prelude::*;
 use std::mem::ManuallyDrop;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,7 +12,8 @@ use std::time::Duration;
 /// How often a thread that waits for another looks whether it was interrupted.
 const INTERVAL: Duration = Duration::from_millis(5);
 
-/// Something of iceoryx2's, which does not survive a fork: a child neither uses nor drops it.
+/// A value that does not survive a fork: a server's channels, or worlds and their threads. A forked child gets an error
+/// when it uses the value, and never drops it.
 pub struct Owned<T: Send> {
     pid: u32,
     instance: String,
@@ -21,12 +23,12 @@ pub struct Owned<T: Send> {
 
 enum Slot<T> {
     Free(T),
-    /// By a thread that is not done with it yet.
+    /// In use by a thread.
     Taken,
     Closed,
 }
 
-/// Puts back what a thread took, or drops what is left of it.
+/// A value in use by a thread; dropping this frees the value for other threads.
 struct Taken<'a, T: Send> {
     owner: &'a Owned<T>,
     value: Option<T>,
@@ -42,10 +44,10 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Uses it without the interpreter, which other threads have meanwhile.
+    /// Uses the value while the interpreter is released to other threads.
     ///
     /// # Errors
-    /// If it is closed, another process's, or the wait for other threads was interrupted.
+    /// If the value is closed, another process made it, or the wait for other threads was interrupted.
     pub fn with<R: Send>(
         &self,
         py: Python<'_>,
@@ -59,15 +61,15 @@ impl<T: Send> Owned<T> {
         match outcome {
             Some(Some(outcome)) => Ok(outcome),
             Some(None) => {
-                let text = format!("the connection to instance '{}' is closed", self.instance);
+                let text = format!("{} closed", self.subject("is", "are"));
                 Err(error(py, "EmberwatchError", (text, "closed")))
             }
             None => Err(raise_of_channel(py, ChannelError::Interrupted)),
         }
     }
 
-    /// As [`Self::with`], keeping the interpreter for what is over soon, unless another thread uses the value just now.
-    /// Notices forks by Python's hooks alone: call [`Self::check`] before what other threads take part in.
+    /// Like [`Self::with`], for short work: keeps the interpreter, unless another thread is using the value. Notices
+    /// forks by Python's hooks alone: call [`Self::check`] before work that other threads share.
     ///
     /// # Errors
     /// As [`Self::with`].
@@ -97,10 +99,10 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Drops it. In another process it stays as it is; it may be closed again.
+    /// Drops the value. Does nothing in another process, or if it is closed already.
     ///
     /// # Errors
-    /// If the wait for other threads was interrupted: then it is still open.
+    /// If the wait for other threads was interrupted; the value is still open.
     pub fn close(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid != pid() || py.detach(|| self.end(interrupted)) {
             return Ok(());
@@ -108,20 +110,31 @@ impl<T: Send> Owned<T> {
         Err(raise_of_channel(py, ChannelError::Interrupted))
     }
 
-    /// Refuses any other process than that which made it.
+    /// Refuses any process except the one that made the value.
     pub fn check(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid == pid() {
             return Ok(());
         }
-        let text = format!(
-            "the connection to instance '{}' belongs to the process that forked this one; open a new one here (for \
-             environments: make them in the child)",
-            self.instance
-        );
+        let what_to_do = if self.instance == INSTANCE {
+            "close the environment here, or make it in the child"
+        } else {
+            "open a new one here (for environments: make them in the child)"
+        };
+        let subject = self.subject("belongs", "belong");
+        let text = format!("{subject} to the process that forked this one: {what_to_do}");
         Err(error(py, "EmberwatchError", (text, "forked")))
     }
 
-    /// Waits for other threads; `None` if a signal's handler ended that.
+    /// The beginning of an error: what this is, and the verb in the singular or plural.
+    fn subject(&self, singular: &str, plural: &str) -> String {
+        if self.instance == INSTANCE {
+            format!("these worlds {plural}")
+        } else {
+            format!("the connection to instance '{}' {singular}", self.instance)
+        }
+    }
+
+    /// Waits for other threads; `None` if a signal handler raised.
     fn take(&self) -> Option<Taken<'_, T>> {
         let mut slot = self.lock();
         loop {
@@ -150,7 +163,7 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Takes it for good, and waits for a thread that uses it; `false` once `stops` ends the wait.
+    /// Waits for a thread that uses the value, and drops it; `false` if `stops` ended the wait.
     fn end(&self, stops: fn() -> bool) -> bool {
         let mut slot = self.lock();
         loop {

@@ -139,7 +139,7 @@ pub fn truth<'py>(
     })
 }
 
-/// The hidden states of an embedded world.
+/// The hidden states of a world in this process.
 pub fn truth_of<'py>(
     py: Python<'py>,
     world: usize,

@@ -329,10 +329,10 @@ def test_each_refusal_on_control_has_its_exception() -> None:
     assert table.server.status().n_refused == 10
 
 
-def test_more_worlds_than_the_server_has_are_refused_with_the_flag_for_more() -> None:
+def test_more_worlds_than_there_are_are_refused_with_the_setting_for_more() -> None:
     table = Table()
-    more = "start it with --worlds N for more"
-    robots = f"no such robot: the server has robots 0 to 2; {more} worlds, or --robots N"
+    more = "for more, set worlds"
+    robots = f"no such robot: there are robots 0 to 2; {more} or robots (--worlds N or --robots N"
     for ask in (
         lambda: table.client.acquire(0, 8),
         lambda: table.exchange(first_robot=2, n_robots=2, step=1, bytes=12),
@@ -340,7 +340,7 @@ def test_more_worlds_than_the_server_has_are_refused_with_the_flag_for_more() ->
         assert refused(ask, "no_such_robot", 3).startswith(robots)
     with refuses("world: .*got 0 to 7; start the server with --worlds N for more"):
         gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=8, instance=table.server.instance)
-    worlds = f"no such world: the server has worlds 0 to 2; {more}"
+    worlds = f"no such world: there are worlds 0 to 2; {more} (--worlds N of a server)"
     assert refused(lambda: table.lease.reset([1], worlds=[9]), "no_such_world", 3) == worlds
 
 

@@ -480,7 +480,7 @@ def test_an_unknown_render_mode_is_named() -> None:
         ("hight", r" \(did you mean 'height'\?\)"),
         ("num_envs", ""),
         ("renderMode", ".*_mode.*"),
-        ("backend", ""),
+        ("backend", r" \(removed: worlds are .* in this process; instance=.* to a server\)"),
     ],
 )
 def test_an_unknown_keyword_is_named(name: str, keyword: str, hint: str) -> None:

@@ -136,7 +136,7 @@ impl Status {
             }
             Self::Malformed => "malformed control message".into(),
             Self::NoSuchWorld => format!(
-                "no such world: the server has worlds 0 to {}; start it with --worlds N for more",
+                "no such world: there are worlds 0 to {}; for more, set worlds (--worlds N of a server)",
                 detail.saturating_sub(1)
             ),
             Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
@@ -184,8 +184,8 @@ impl Status {
                 in_words(detail)
             ),
             Self::NoSuchRobot => format!(
-                "no such robot: the server has robots 0 to {}; start it with --worlds N for more worlds, or --robots N \
-                 for more in each",
+                "no such robot: there are robots 0 to {}; for more, set worlds or robots (--worlds N or --robots N of a \
+                 server)",
                 detail.saturating_sub(1)
             ),
         }

@@ -7,11 +7,13 @@ from emberwatch._native import VERSION
 
 _COMMANDS: Final = """
 commands, each with --help:
-  emberwatch-server                  simulates worlds
+  python -m emberwatch.render.film   films of recordings
+  python -m emberwatch.landscape     recorded worlds from rasters of fires
+
+programs, which are packages of their own (pip install "emberwatch[programs]"):
+  emberwatch-server                  simulates worlds that several processes share
   emberwatch-agent                   explores, learns, compares
   emberwatch-dashboard               shows an instance or a recording in a browser
-  python -m emberwatch.render.film          films of recordings
-  python -m emberwatch.landscape     recorded worlds from rasters of fires
 """
 
 

@@ -153,7 +153,7 @@ class Server:
         """
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
-        """The hidden states of embedded worlds, as the fields of `Truth`; refused of a server's."""
+        """Hidden states of worlds in this process, as `Truth`; refused of a server's."""
 
     @property
     def info(self) -> str:

@@ -12,8 +12,8 @@ class EmberwatchError(Exception):
     Attributes:
         code: The cause. A refusal has the name of its status (PROTOCOL.md section 5), such as
             `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
-            earlier step or reset did not finish: reset or resume), `"forked"` (neither shared
-            memory nor embedded worlds survive `fork`), `"embedded"` (worlds in this process could
+            earlier step or reset did not finish: reset or resume), `"forked"` (neither channels
+            nor worlds in a process survive `fork`), `"embedded"` (worlds in this process could
             not be made), `"threads"` (the system starts no more), `"channel"` (iceoryx2, or a
             system call that it needs, failed), `"bad_answer"` (client and server
             are not of one release), `"program"` (a prior or a network failed),
@@ -91,7 +91,8 @@ STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
     ("malformed", "malformed control message"),
     (
         "no_such_world",
-        "no such world: the server has worlds 0 to {last}; start it with --worlds N for more",
+        "no such world: there are worlds 0 to {last}; for more, set worlds (--worlds N of a "
+        "server)",
     ),
     ("wrong_length", "wrong payload length: expected {} bytes"),
     ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
@@ -123,8 +124,8 @@ STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
     ),
     (
         "no_such_robot",
-        "no such robot: the server has robots 0 to {last}; start it with --worlds N for more "
-        "worlds, or --robots N for more in each",
+        "no such robot: there are robots 0 to {last}; for more, set worlds or robots (--worlds N "
+        "or --robots N of a server)",
     ),
     ("no_memory", "memory: expected {} bytes for the answer, got less; ask for fewer robots"),
 )

@@ -3,8 +3,8 @@
 use rayon::{Scope, ThreadPool};
 use std::sync::{Mutex, PoisonError};
 
-/// Does all jobs, on the calling thread and on those of a pool. Each thread takes the next job when it is done with one,
-/// so that one that wakes up late delays nobody.
+/// Does all jobs, on the calling thread and on the threads of a pool. Each thread takes the next job when it has finished
+/// one, so a thread that wakes up late delays no job.
 pub(super) fn share<J: Send>(
     threads: &ThreadPool,
     n_jobs: usize,

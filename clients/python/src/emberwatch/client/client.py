@@ -36,7 +36,7 @@ _Connection = TypeVar("_Connection")
 
 _log: Final = logging.getLogger("emberwatch")
 
-#: After which leases of embedded worlds end, milliseconds.
+#: Milliseconds without use after which leases of worlds in this process end.
 _EMBEDDED_LEASE: Final = 86_400_000
 
 #: How long to sleep between two attempts to connect, at first and at most, seconds.
@@ -62,7 +62,7 @@ class Client(ServerConnection):
         """Gets the right to fly consecutive robots, once their worlds are out of their burn-in.
 
         Robot r of world w has number w R + r, with R = `info.n_robots`. To resume what another
-        agent left, go on from `lease.observe()`: it has k, the robot's cell and the last frame.
+        agent left, continue from `lease.observe()`: it has k, the robot's cell and the last frame.
         To start again, `lease.reset()`.
 
         Args:

@@ -63,7 +63,7 @@ class ServerConnection(Connection):
         timeout: float = STEP_TIMEOUT,
         embedded: _native.Server | None = None,
     ) -> None:
-        """Connects; `embedded` are worlds in this process, in the place of a server."""
+        """Connects to a server, or to `embedded`, which are worlds in this process."""
         super().__init__(instance, embedded or _native.Server(instance, CLIENT, timeout))
         self.info: Final = record(ServerInfo, decoded("answer to 'hello'", self._native.info))
         self.shape: Final = self.info.shape
@@ -101,7 +101,7 @@ class ServerConnection(Connection):
         return StepAnswer(answer)
 
     def truths(self, worlds: range) -> list[dict[str, Any]]:
-        """The hidden states of embedded worlds, as the fields of `Truth`."""
+        """The hidden states of worlds in this process, as the fields of `Truth`."""
         return self._native.truths(worlds.start, len(worlds))
 
     def lease(self, number: int, robots: range) -> _native.Lease:

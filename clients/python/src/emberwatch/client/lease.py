@@ -15,7 +15,7 @@ from emberwatch.common.arguments import as_moves, as_seeds
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 
-#: Most bytes of a belief in one message.
+#: Maximum number of bytes of a belief in one message.
 _BELIEF_PART: Final = 1 << 19
 
 
@@ -130,7 +130,10 @@ class Lease:
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """The last results and frames of its robots again, or of some; steps go on from there."""
+        """Returns the last results and frames of its robots again, or of some of them.
+
+        The next `step` is for the observed step.
+        """
         place = self._place(robots, team * wire.TEAM_FRAMES)
         return StepAnswer(self.native.observe(*place, timeout))
 
@@ -163,7 +166,7 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Replaces its worlds with those of a snapshot file, which go on as they would have.
+        """Replaces its worlds with the worlds of a snapshot file, which continue bit for bit.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
@@ -178,7 +181,7 @@ class Lease:
     def fork(
         self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
     ) -> tuple[WorldInfo, ...]:
-        """Puts a copy of any world in the place of one of its own: both have the same future."""
+        """Replaces its world `target` with a copy of any world: both have the same future."""
         reply = self._ask("fork", timeout, **{"from": source, "to": target})
         return self._note(records(WorldInfo, reply))
 
@@ -249,7 +252,7 @@ class Lease:
         try:
             self.release()
         except Exception:
-            if kind is None:  # else the first error says more
+            if kind is None:  # otherwise the first error says more
                 raise
 
 

@@ -220,7 +220,7 @@ class Newest(Generic[_Step]):
 
 
 class Present(Closable):
-    """The hidden states of embedded worlds, as `Newest` has those of a server."""
+    """The hidden states of worlds in this process; `Newest` has the states of a server."""
 
     def __init__(self, read: Callable[[range], list[dict[str, Any]]]) -> None:
         self._read = read

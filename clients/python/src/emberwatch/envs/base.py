@@ -51,7 +51,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path: NDArray[np.intp] | None = None
 
     def render(self) -> Any:
-        """Draws the last frame, path and robot, beside the truth when that is revealed."""
+        """Draws the last frame, path and robot, next to the truth if it is revealed."""
         if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
@@ -63,7 +63,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._answer = None  # which cannot be copied
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
-        """Begins an episode, or goes on from where the world stands."""
+        """Begins an episode, or continues the world's present one."""
         resumes = wants_to_resume(options, seed) or self._robot is not None
         seed = None if seed is None else as_seed(seed)
         super().reset(seed=seed)
@@ -79,7 +79,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return answer
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
-        """Takes in a step, after those that passed unseen."""
+        """Updates the observations with a step, first with an empty frame for each missed step."""
         if self._robot is not None:
             stayed = int(answer.robots["n_moves"][0]) == 0
             self._n_missed = self._session.n_skipped + stayed

@@ -122,7 +122,7 @@ class WildfireMovesEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; with `robot`, goes on from where the shared world stands.
+        """Begins an episode; with `robot`, continues from where the shared world stands.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
@@ -166,7 +166,7 @@ class WildfireMovesEnv(WorldEnv):
         return observation, reward, False, False, info
 
     def _complete(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """The last move of a path, which the server flies."""
+        """Flies the path after its last move, and moves the world."""
         path = self._flights.paths(move)
         answer = self._session.step(path)
         before = float(self._flights.paid[0])

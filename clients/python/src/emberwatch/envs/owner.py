@@ -1,4 +1,4 @@
-"""What environments of one world and of many tell of their session."""
+"""The public attributes that all environments and vectors have."""
 
 from contextlib import AbstractContextManager
 from copy import copy
@@ -14,14 +14,14 @@ from emberwatch.model import Model
 
 
 class SessionOwner:
-    """What environments of one world and of many tell of their session."""
+    """The public attributes of an environment or vector, read from its session."""
 
     _session: Session
     _made_by: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What `gymnasium.make` made it of; its keywords are as JSON has them."""
+        """The specification that `gymnasium.make` used; its keywords can be written as JSON."""
         return self._made_by
 
     @spec.setter
@@ -37,7 +37,7 @@ class SessionOwner:
 
     @property
     def world_spec(self) -> WorldSpec:
-        """What is known of the worlds before the first reset."""
+        """The grid, moves, sensor and model of the worlds, known before the first reset."""
         return self._session.spec
 
     @property
@@ -52,20 +52,24 @@ class SessionOwner:
 
     @property
     def instance(self) -> str:
-        """The server's instance name, once the environment has been reset."""
+        """The instance name of the server that it is attached to, after a reset.
+
+        Raises:
+            InvalidArgumentError: If it was made without `instance`: its worlds are in this process.
+        """
         return self._session.instance
 
     @property
     def lease(self) -> Lease:
-        """Under which it flies, once it has been reset: for snapshots and forks of its worlds.
+        """The lease of its robots, after a reset: for snapshots and forks of its worlds.
 
-        After `lease.restore` or `lease.fork` go on with ``reset(options={"resume": True})``.
+        After `lease.restore` or `lease.fork`, continue with ``reset(options={"resume": True})``.
         """
         return self._session.lease
 
     @property
     def is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
+        """Whether it has been reset since it was made or closed."""
         return self._session.is_open
 
     @property
@@ -74,7 +78,7 @@ class SessionOwner:
         return self._session.turn
 
     def allow_test_worlds(self) -> None:
-        """Resets on a task's test seeds are meant, and warn no more."""
+        """Turns off the warning about resets on a task's test seeds."""
         self._session.allows_test_worlds = True
 
     def __getstate__(self) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class WildfireEnv(WorldEnv):
     others. A step waits for the paths of all robots that somebody holds, but no longer than the
     server's `--deadline-ms`. A path that comes too late is not flown: the answer tells how the
     world stands, and `info["n_missed"]` in how many steps this robot stayed where it was. `reset`
-    begins no episode, as the world is not its own; it goes on from where the world stands, and
+    begins no episode, as the world is not its own; it continues from where the world stands, and
     its `seed` is for `np_random` alone. `emberwatch.parallel_env` flies all robots of a world.
 
     ## Starting State
@@ -83,7 +83,7 @@ class WildfireEnv(WorldEnv):
     The world after `burn_in` steps from the model's initial distribution, a pure function of the
     seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
     reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
-    has been observed. `reset(options={"resume": True})` begins nothing but goes on from
+    has been observed. `reset(options={"resume": True})` begins nothing but continues from
     where the world stands, such as after another agent, or after a step that was interrupted.
 
     ## Episode End
@@ -121,7 +121,7 @@ class WildfireEnv(WorldEnv):
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (0 to 8; None:
       as the model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of
       worlds of its own. With `instance` they may be left out, or must agree with the server.
-    * `states`: recorded states in the place of a model (a `.npz` or `.npy` file or a folder, see
+    * `states`: recorded states instead of a model (a `.npz` or `.npy` file or a folder, see
       `docs/recorded-worlds.md`, or `"jacksboro"`), which decide `height`, `width` and `burn_in`;
       `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
     * `truth`: reveal the hidden states in `info` and pictures (False).
@@ -157,7 +157,7 @@ class WildfireEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; with `robot`, goes on from where the shared world stands.
+        """Begins an episode; with `robot`, continues from where the shared world stands.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """

@@ -38,7 +38,7 @@ FEATURES: Final = tuple(_NAMES[1])
 
 
 class Plans:
-    """What options promise and fly in the worlds of a session, by the beliefs about them."""
+    """The plan of each option in each world of a session, made on the belief about it."""
 
     def __init__(
         self,
@@ -81,10 +81,10 @@ class Plans:
     def begin(
         self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
-        """Episodes of some worlds have begun, or are gone on with from where they stand.
+        """Begins or resumes the episodes of the worlds in `begun`.
 
-        There the belief is the one that was left for the present step, or made of the frames that
-        are kept. Results and frames are those of all worlds.
+        The belief of a resumed world is the one left for its present step, or is computed from the
+        frames that are kept. `results` and `frames` have a row for every world.
         """
         settings = self._session.settings
         watched = None if settings.instance is None else (settings.instance, settings.world)
@@ -94,7 +94,7 @@ class Plans:
             self._watched = watched
         worlds = np.flatnonzero(begun).tolist()
         native.begin(worlds, results["world"]["seed"][begun].tolist())
-        known = [world for world in worlds if self._goes_on(native, world, results[world])]
+        known = [world for world in worlds if self._resumes(native, world, results[world])]
         if known:
             chosen = results[known].view(np.uint8)
             self.features, self._paths = native.plan(known, chosen, None, None)
@@ -113,21 +113,24 @@ class Plans:
         results: NDArray[np.void],
         frames: NDArray[np.uint8],
     ) -> None:
-        """What some worlds show after a step, by the choices that were flown; of all worlds."""
+        """Updates the beliefs of the worlds in `moved` with a step, and plans again there.
+
+        Arrays have a row for every world; `choices` are the options that were flown.
+        """
         self._plan(moved, results, frames, choices)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Nothing: `begin` needs the results, too."""
+        """Does nothing, as `begin` needs the results, too."""
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Nothing: `see` needs the results, too."""
+        """Does nothing, as `see` needs the results, too."""
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
         """The observations of all worlds, stacked."""
         return self.features
 
     def close(self, results: NDArray[np.void] | None) -> None:
-        """Leaves the beliefs to those who fly next in a running server's worlds."""
+        """Leaves the beliefs to the next client of a running server's worlds."""
         native, self._native = self._native, None
         if native is None:
             return
@@ -170,8 +173,8 @@ class Plans:
             None if flown is None else flown.tolist(),
         )
 
-    def _goes_on(self, native: _native.Options, world: int, result: np.void) -> bool:
-        """Gives a belief what is known before the present step; whether that is in it, too."""
+    def _resumes(self, native: _native.Options, world: int, result: np.void) -> bool:
+        """Restores the belief of a world; returns whether it includes the present step."""
         step = int(result["world"]["step"])
         if step == 0:
             return False
@@ -188,7 +191,7 @@ class Plans:
 
 
 class PlansOwner:
-    """What environments of one world and of many tell of their plans."""
+    """The public attributes of environments that choose among plans."""
 
     _plans: Plans
 
@@ -204,5 +207,5 @@ class PlansOwner:
 
     @property
     def estimator(self) -> str:
-        """What keeps the belief."""
+        """Name of the estimator that keeps the belief."""
         return self._plans.estimator

@@ -21,15 +21,20 @@ from emberwatch.model import Description, Model
 from emberwatch.model.airspace import MAX_RADIUS, Airspace, Zones
 from emberwatch.model.tasks import Task, built_in_tasks
 
-#: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
+#: Drawn seeds are below this: every JSON reader represents them exactly (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
 
-#: Keywords whose settings of a server have other names.
+#: Keywords by the name of their setting in `config/server.toml`, where the names differ.
 _KEYWORDS: Final = {
     "moves": "n_moves",
     "worlds": "num_envs",
     "worlds times robots": "num_envs",
     "cells times robots": "height times width times robots",
+}
+
+#: What to do instead, by the removed keyword.
+_REMOVED: Final = {
+    "backend": " (removed: worlds are simulated in this process; instance=... attaches to a server)"
 }
 
 _Init = TypeVar("_Init")
@@ -61,7 +66,7 @@ class WorldArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """The keywords; `WildfireEnv` explains them. None: as the server has it."""
+    """The keywords; `WildfireEnv` explains them. None: the default, or the server's value."""
 
     instance: str | None = None
     world: int = 0
@@ -119,6 +124,7 @@ class Settings:
             if name not in known:
                 alike = get_close_matches(name, known, 1)
                 hint = f" (did you mean {alike[0]!r}?)" if alike else ""
+                hint = _REMOVED.get(name, hint)
                 # In Python's words, by which TorchRL knows what to leave out.
                 raise TypeError(
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
@@ -149,7 +155,7 @@ class Settings:
         return {name: as_setting(name, it) for name, it in given.items() if it is not None}
 
     def check(self, n_worlds: int) -> dict[str, Any]:
-        """All settings of a server with these worlds. A refusal names the keyword."""
+        """All settings of these worlds, with defaults. A refusal names the keyword."""
         try:
             return check_settings(self.of_server(n_worlds))
         except InvalidArgumentError as error:
@@ -159,7 +165,7 @@ class Settings:
 
 
 def shows_keywords(init: _Init) -> _Init:
-    """Puts the keywords and their defaults in the place of ``**world``, for `help` and editors."""
+    """Shows the keywords and their defaults instead of ``**world``, for `help` and editors."""
     plain: Any = init
     own = signature(plain).parameters.values()
     kinds = get_type_hints(Settings)
@@ -178,7 +184,7 @@ def shows_keywords(init: _Init) -> _Init:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldSpec:
-    """What an environment must know of its worlds before they are there."""
+    """What an environment must know of its worlds before they are made."""
 
     #: None if a running server hides it, or the worlds were recorded.
     model: Model | None
@@ -211,7 +217,7 @@ class WorldSpec:
 
 
 def draw_seed(generator: np.random.Generator) -> int:
-    """The world's seed of a reset without one: the environment's own generator goes on."""
+    """Draws the world's seed of a reset without one, from the environment's own generator."""
     return int(generator.integers(SEEDS))
 
 
@@ -330,7 +336,7 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
 
 
 def _described(checked: dict[str, Any]) -> Description:
-    """What states are called and how they are seen, by settings that the server has accepted."""
+    """Names of states and how they are observed, by settings that have been checked."""
     if checked["states"]:
         described: Description = _description(local(checked["states"]))
     else:
@@ -340,7 +346,7 @@ def _described(checked: dict[str, Any]) -> Description:
 
 
 def _description(states: str) -> Description:
-    """That of recorded worlds whose states the server has accepted."""
+    """The description of recorded worlds whose states file has been checked."""
     text = _native.built_in("states").get(states)
     if text is None:
         place = Path(states)

@@ -1,8 +1,8 @@
 """The hidden Markov model on a grid: what a model file says, as arrays.
 
 Paper section II: states with the transition kernel ``w`` and bias ``b`` of eq. 2, and the
-observation matrix ``O`` of eq. 1. Whether a file makes sense is for the server to say; this module
-reads what the server has accepted. `emberwatch.belief` applies the parameters to a belief.
+observation matrix ``O`` of eq. 1. The native module checks files; this module reads
+files that have passed. `emberwatch.belief` applies the parameters to a belief.
 """
 
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
 
 MAX_VALUES = 64
-"""Most states, and most observations, of a model."""
+"""Maximum number of states, and of observations, of a model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,7 +56,7 @@ class Description:
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """Reads the text of a file that a server has accepted."""
+        """Reads the text of a file that has been checked."""
         text = text.removeprefix(BYTE_ORDER_MARK)
         try:
             values = cls._read(text)
@@ -151,7 +151,7 @@ class Model(Description):
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
-        """The built-in model of a name, or that of a file, which the server checks first."""
+        """The built-in model of a name, or the model of a file, which is checked first."""
         settings = {"model": utf8("model", name)}
         try:
             check_settings(settings)
@@ -164,7 +164,7 @@ class Model(Description):
 
     @classmethod
     def checked(cls, name: str | PathLike[str]) -> Self:
-        """The same of a name or file that the server has accepted already."""
+        """Like `named`, for a name or file that has been checked already."""
         text = _native.built_in("models").get(fspath(name))
         if text is not None:
             return cls.from_toml(text)

@@ -16,7 +16,7 @@ FIRST_TRAINING_SEED: Final = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What is known of a task before its worlds are there."""
+    """The parts of a task that are known before its worlds are made."""
 
     name: str
     n_moves: int
@@ -27,14 +27,14 @@ class Task:
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
-        """The built-in task of a name, or that of a file, which the server checks first."""
+        """The built-in task of a name, or the task of a file, which is checked first."""
         check_settings({"task": utf8("task", name)})
         text = _native.built_in("tasks").get(fspath(name))
         return cls.from_toml(Path(name).read_text("utf-8") if text is None else text)
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """Reads the text of a file that a server has accepted."""
+        """Reads the text of a file that has been checked."""
         file = tomllib.loads(text.removeprefix(BYTE_ORDER_MARK))
         return cls(
             name=file["name"],
@@ -46,6 +46,6 @@ class Task:
 
 
 def built_in_tasks() -> dict[str, Task]:
-    """The tasks that the programs know, by name."""
+    """The built-in tasks, by name."""
     files = _native.built_in("tasks").items()
     return {name: Task.from_toml(text) for name, text in files}
