@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.common.arguments import as_count
 from emberwatch.errors import invalid
 from emberwatch.model.airspace import Airspace

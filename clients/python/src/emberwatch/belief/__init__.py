@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 from emberwatch.errors import invalid
 from emberwatch.model import Model

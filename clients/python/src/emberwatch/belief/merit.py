@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 
 #: Steps for which a cell counts as seen after a visit, unless told otherwise.
 RECENT_STEPS: Final = 10

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.belief import initial_prior, uniform_prior
 from emberwatch.common.arguments import as_array, as_count
 from emberwatch.errors import invalid

@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch._native import VERSION
 from emberwatch.belief.merit import RECENT_STEPS
 from emberwatch.benchmark.digest import digest

@@ -13,7 +13,7 @@ from base64 import b64decode
 from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeVar
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.client import wire
 from emberwatch.client.connection import RESET_TIMEOUT, STEP_TIMEOUT, ServerConnection
 from emberwatch.client.lease import Lease

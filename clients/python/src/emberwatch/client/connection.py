@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, Final, Self, cast
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch._native import VERSION
 from emberwatch.client import wire
 from emberwatch.client.replies import ServerInfo, record

@@ -11,7 +11,7 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.client.connection import Closable
 from emberwatch.client.wire import RobotResult, WorldResult
 from emberwatch.errors import EmberwatchError, RequestTimeoutError, invalid

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.client.observer import Frame, Truth, frame_of
 from emberwatch.client.replies import ServerInfo
 from emberwatch.client.replies import record as record_from_reply

@@ -10,7 +10,7 @@ from typing import Any, SupportsIndex, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.common import codes
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid

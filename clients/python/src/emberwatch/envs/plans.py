@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepResult, WorldResult
 from emberwatch.common.arguments import told
 from emberwatch.common.paths import utf8

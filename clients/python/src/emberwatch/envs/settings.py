@@ -10,7 +10,7 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
 
 import numpy as np
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.client.connection import STEP_TIMEOUT
 from emberwatch.client.replies import ServerInfo
 from emberwatch.client.wire import Shape

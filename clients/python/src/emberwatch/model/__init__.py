@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.common.arguments import as_count, check_settings
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
 from emberwatch.errors import InvalidArgumentError, invalid

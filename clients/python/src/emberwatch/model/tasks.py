@@ -6,7 +6,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Final, Self
 
-from emberwatch import _native
+import emberwatch._native as _native
 from emberwatch.common.arguments import check_settings
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
 
