@@ -132,7 +132,7 @@ impl Server {
     fn of(py: Python<'_>, instance: &str, backend: Backend) -> PyResult<Self> {
         let info: ServerInfo = backend.info();
         Ok(Self {
-            shape: shape_of(py, info.height as usize, info.width as usize)?,
+            shape: shape_of(py, info.height, info.width)?,
             deadline: Duration::from_millis(info.deadline_millis),
             is_embedded: matches!(backend, Backend::Embedded(_)),
             nanos_of_robot: AtomicU64::new(0),
