@@ -19,7 +19,7 @@ use std::ops::Range;
 /// Bytes of a world's result and of its robot's result.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
-/// The most robots of an answer: of as many worlds as a server may have, with the largest teams.
+/// Maximum number of robots in an answer: all robots of the largest server, with the largest teams.
 const MAX_ROBOTS: u32 = 1 << 16;
 
 type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
@@ -28,7 +28,7 @@ type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
 /// row and column, `[1, 2]`.
 type Numbers<'py> = (f64, bool, bool, u64, u32, Bound<'py, PyArray2<i64>>);
 
-/// Columns of many robots' steps, see `_native.pyi`.
+/// The numbers of many robots' steps, column by column; `_native.pyi` explains them.
 type Columns<'py> = (
     Bound<'py, PyArray1<f64>>,
     Bound<'py, PyArray1<bool>>,
@@ -47,7 +47,7 @@ pub struct Answer {
     #[pyo3(get)]
     first_robot: u32,
     n_robots: u32,
-    /// How long the server worked on it, nanoseconds.
+    /// Time that the simulation took, nanoseconds.
     #[pyo3(get)]
     simulation_nanos: u64,
     /// Number of frames, height, width.
@@ -100,7 +100,7 @@ impl Answer {
         Ok(answer)
     }
 
-    /// What copies and pickles are made from.
+    /// Returns the constructor's arguments, for copies and pickles.
     fn __getnewargs__(&self, py: Python<'_>) -> Arguments {
         let [n_frames, height, width] = self.dim;
         let shares = n_frames < self.n_robots as usize;

@@ -20,7 +20,7 @@ use pyo3::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// A step that takes less keeps the interpreter: 1 ms.
+/// Maximum duration of a step that keeps the interpreter, nanoseconds: 1 ms.
 const BRIEF_NANOS: u64 = 1_000_000;
 
 /// A connection to a server, or worlds in this process. Threads may share it: they take turns.
@@ -37,7 +37,7 @@ pub struct Server {
     /// How long a step waits for teammates.
     pub deadline: Duration,
     is_embedded: bool,
-    /// How long the last step took, for each robot; 0 before the first.
+    /// Duration of the last step divided by its number of robots, nanoseconds; 0 before the first step.
     nanos_of_robot: AtomicU64,
 }
 
@@ -143,7 +143,7 @@ impl Server {
         })
     }
 
-    /// What Python gets of an answer.
+    /// Presents an answer to Python, or raises its error.
     pub fn answered(
         &self,
         py: Python<'_>,

@@ -1,5 +1,5 @@
-//! What a fork of this process needs: it waits for turns in which channels are made, and the child forgets its parent's
-//! number.
+//! Hooks for forks of this process. A fork waits until no thread creates or removes a channel; the child forgets the
+//! process id of its parent.
 
 use crate::owned::forget_pid;
 #[cfg(target_os = "linux")]

@@ -75,7 +75,7 @@ impl Lease {
         let first_world = worlds_of(first_robot, 1, server.team).start;
         // Sooner would take back the path with which the deadline began.
         let timeout = duration(seconds).saturating_add(server.deadline);
-        // The steps of the worlds for which the paths are.
+        // Each world's step for which the paths are meant, known once they are sent.
         let mut steps = Vec::new();
         let send = |steps: &mut Vec<u64>| match self.ask(py, request, &moves, steps, timeout)? {
             Err(ConnectionError::Timeout { .. }) => Ok(None),
@@ -174,7 +174,8 @@ impl Lease {
         Ok(moves::paths(paths, n_robots as usize, server.n_moves))
     }
 
-    /// `steps`: the steps for which paths are; of the worlds as last seen if there are none yet.
+    /// Sends a request. `steps`: the step of each world for which the paths are meant; if empty, it is filled with the
+    /// steps at which the worlds were last seen.
     fn ask(
         &self,
         py: Python<'_>,
@@ -233,7 +234,7 @@ impl Lease {
         Ok((reply, payload))
     }
 
-    /// Where `steps` has these worlds of the lease.
+    /// The positions of these worlds in `steps`.
     fn indices(&self, worlds: &Range<u32>) -> Range<usize> {
         (worlds.start - self.worlds.start) as usize..(worlds.end - self.worlds.start) as usize
     }

@@ -6,7 +6,7 @@ use emberwatch_model::grid::{Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Most states of a published belief.
+/// Maximum number of states of a published belief.
 pub const MAX_STATES: u32 = 256;
 
 /// Longest [`Intent`] in JSON, bytes.

@@ -41,7 +41,7 @@ pub fn until_moved<S, A, E>(
 mod tests {
     use super::*;
 
-    /// Counts sends and looks; the worlds have moved after so many looks.
+    /// Counts sends and looks; the worlds have moved after `moves_at` looks.
     fn run(answers_at: usize, moves_at: usize, patience: usize) -> (Flown<()>, usize, usize) {
         let (mut n, mut left) = ((0, 0), patience);
         let flown = until_moved(

@@ -76,7 +76,7 @@ _Columns = tuple[
 class Answer:
     """The answer to a step or an observation, of consecutive robots.
 
-    Its memory is its own. Bytes of results are those of PROTOCOL.md.
+    No other object shares its memory. Results are bytes as PROTOCOL.md lays them out.
     """
 
     def __new__(

@@ -110,12 +110,12 @@ class Lease:
             EmberwatchError: As `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
-        return self.flown(paths, *place, accepts_late, timeout)
+        return self.fly_from(paths, *place, accepts_late, timeout)
 
-    def flown(
+    def fly_from(
         self, paths: ArrayLike, first: int, n_robots: int, accepts_late: bool, timeout: float
     ) -> tuple[StepAnswer, int]:
-        """As `fly`, of robots by the number of the first."""
+        """Like `fly`, for `n_robots` consecutive robots from number `first`, all of the lease."""
         flown = self.native.fly(paths, first, n_robots, accepts_late, timeout)
         if flown is None:
             moves = as_moves(paths, n_robots, self.client.info.n_moves)

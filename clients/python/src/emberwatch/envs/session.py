@@ -219,7 +219,7 @@ class Session:
         if rows is not None:
             first, n_robots = first + rows.start, len(rows)
         try:
-            answer, self.n_skipped = lease.flown(
+            answer, self.n_skipped = lease.fly_from(
                 paths, first, n_robots, self._accepts_late, self.settings.timeout
             )
         except LOST as error:
