@@ -30,7 +30,7 @@ fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief
 fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
     let observer = Observer::agents(&server.instance).expect("observe");
-    let mut agent = Program::agent(&server.instance, "--steps 2000 --policy beam_explore");
+    let mut agent = Program::agent(&server.instance, "--steps 2000 --policy known/beam/explore");
     let mut shown = Vec::new();
     let has_ended = eventually(4 * PATIENCE, || {
         shown.extend(next(&observer, Duration::ZERO));
@@ -52,7 +52,7 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
         assert_eq!(belief.dim(), (3, 16, 24));
         let sums = belief.sum_axis(ndarray::Axis(0));
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
-        assert_eq!(intent.policy, "beam_explore");
+        assert_eq!(intent.policy, "known/beam/explore");
         assert_eq!(intent.states, ["normal", "latent", "fire"]);
         assert!(
             header.step == 0 || intent.objective == "entropy",
@@ -137,7 +137,7 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
         assert_eq!(belief.dim(), (3, 16, 24));
         let sums = belief.sum_axis(ndarray::Axis(0));
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
-        assert_eq!(intent.policy, "train learned_filter");
+        assert_eq!(intent.policy, "train filter");
         assert_eq!(intent.belief_from, "learned_filter");
         assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
         assert_eq!(intent.objective, "random moves");

@@ -3,7 +3,7 @@
 use crate::commands::{agent, check};
 use crate::trainings::Place;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::learners::network::{KIND, SavedNetwork};
+use emberwatch_learning::learners::network::SavedNetwork;
 use emberwatch_protocol::Move;
 use std::path::Path;
 use tests::harness::{AGENT, Server, fly};
@@ -41,7 +41,7 @@ fn place(settings: &str) -> Place {
 
 /// What a checkpoint holds, but for its settings.
 fn contents(path: &Path) -> Contents {
-    let (_, mut contents) = checkpoint::read(path, &[KIND]).expect("a checkpoint");
+    let (_, mut contents) = checkpoint::read(path).expect("a checkpoint");
     contents.settings.clear();
     contents
 }
@@ -252,7 +252,7 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
         let place = place(SETTINGS);
         place.learn("out", &format!("{WORLD} --steps 10"));
         let path = place.checkpoint("out");
-        let (_, mut broken) = checkpoint::read(&path, &[KIND]).expect("a checkpoint");
+        let (_, mut broken) = checkpoint::read(&path).expect("a checkpoint");
         let numbers = broken.tensors.iter_mut();
         for (name, stored) in numbers {
             if name.starts_with(tensor) {
@@ -260,7 +260,7 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
                 stored.numbers.fill(3e38);
             }
         }
-        checkpoint::write(&path, KIND, &broken).expect("written");
+        checkpoint::write(&path, "autoencoder", &broken).expect("written");
         let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
         let words = "world steps: update  | expected finite numbers | is in";
         check(AGENT, &resume, words);
@@ -280,23 +280,28 @@ fn a_checkpoint_enters_the_ladder() {
     let worlds = format!("--seeds 3..5 --steps 5 {WORLD} --beam-width 4 --shooting-samples 16");
     let compared = agent(&format!("compare --checkpoint {checkpoint} {worlds}"));
     let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
-    for policy in ["exploit", "explore", "policy", "beam"] {
-        let policy = format!("autoencoder_{policy} ");
-        compared.check_prints(&policy);
-        evaluated.check_prints(&policy);
+    for policy in [
+        "autoencoder_exploit",
+        "autoencoder/shooting/explore",
+        "autoencoder_policy",
+        "autoencoder/beam/exploit",
+    ] {
+        compared.check_prints(policy);
+        evaluated.check_prints(policy);
     }
     evaluated.check_prints("autoencoder - known_model");
     let server = Server::start(WORLD);
     let name = server.instance.name();
     let run = format!("run --instance {name} --steps 5 --policy autoencoder_policy");
     agent(&format!("{run} --checkpoint {checkpoint}"));
-    let words = "autoencoder_policy | --checkpoint FILE of an autoencoder";
+    let words = "autoencoder_policy | needs --checkpoint FILE: expected a checkpoint of `train --learner autoencoder`";
     check(AGENT, &run, words);
     let twice = format!("compare --checkpoint {checkpoint} --checkpoint {checkpoint} {worlds}");
     let words = "expected one checkpoint of autoencoder, got two";
     check(AGENT, &twice, words);
     let other = worlds.replace("--height 6", "--height 7");
-    let other = format!("compare --policies autoencoder_beam --checkpoint {checkpoint} {other}");
+    let other =
+        format!("compare --policies autoencoder/beam/exploit --checkpoint {checkpoint} {other}");
     let words = "expected a network for 7 x 9 cells | got one for 6 x 9";
     check(AGENT, &other, words);
 }

@@ -136,6 +136,15 @@ fn without_hidden_states_what_needs_them_is_empty() {
 }
 
 #[test]
+fn a_policy_by_its_parts_is_the_one_of_its_name() {
+    let worlds = "--seeds 3..5 --steps 3 --height 6 --width 9 --moves 5 --burn-in 60";
+    let policies = "--policies coverage,known/beam/exploit --baseline known/beam/exploit";
+    let compared = agent(&format!("compare {worlds} {policies}"));
+    compared.check_prints("differences are paired by world, to beam_exploit");
+    agent("compare --policies help").check_prints("learned+spatial");
+}
+
+#[test]
 fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
     let folder = TempDir::new().expect("a folder");
     let path = |name: &str| folder.path().join(name);
@@ -214,7 +223,7 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(info.n_observations, 3);
     assert_eq!(info.observations, ["dark", "shiny", "white"]);
     for flags in [
-        "--steps 30 --beam-width 5 --policy beam_ice",
+        "--steps 30 --beam-width 5 --policy known/beam/ice",
         "--steps 10 --shooting-samples 9 --policy shooting_gritted",
     ] {
         Program::agent(&server.instance, flags).ends(0);

@@ -1,6 +1,7 @@
 //! Settings and model files: wrong ones are refused by path and entry, right ones run.
 
 use crate::commands::{TINY, check};
+use emberwatch_protocol::Model;
 use tempfile::TempDir;
 use tests::harness::{AGENT, SERVER, SMALL, Server, repository, run};
 
@@ -123,21 +124,12 @@ fn worlds_in_which_nothing_burns_are_warned_of_once() {
 
 #[test]
 fn the_documented_files_are_accepted() {
-    for file in [
-        "config/server.toml",
-        "config/models/wildfire.toml",
-        "config/models/road-ice.toml",
-        "config/models/wildfire-sparse.toml",
-        "config/models/wildfire-latent.toml",
-        "config/models/wildfire-small.toml",
-        "config/models/wildfire-burnout.toml",
-    ] {
-        let path = repository().join(file);
-        let flag = if file.contains("models") {
-            "--model"
-        } else {
-            "--config"
-        };
+    let check = |flag: &str, file: &str| {
+        let path = repository().join("config").join(file);
         run(SERVER, &format!("--check {flag} {}", path.display())).check(0);
+    };
+    check("--config", "server.toml");
+    for name in Model::built_in_names() {
+        check("--model", &format!("models/{name}.toml"));
     }
 }

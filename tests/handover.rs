@@ -46,8 +46,8 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         "beam_exploit",
         "shooting_explore",
         "spatial_beam",
-        "known_coverage",
-        "known_rule",
+        "known/options/coverage",
+        "known/options/rule",
     ] {
         let policy = format!("--policy {policy}");
         let server = Server::start(&format!("{FLAGS} {ALL}"));
@@ -224,10 +224,13 @@ fn an_agent_told_to_stop_leaves_its_belief() {
 fn an_agent_that_lacks_something_takes_no_robot() {
     let server = Server::start(SMALL);
     let mut holder = server.acquire(0..1);
-    for policy in ["learned_beam", "oracle_beam"] {
+    for (policy, words) in [
+        ("learned_beam", "needs --checkpoint FILE"),
+        ("oracle_beam", "needs the truth channel"),
+    ] {
         let flags = format!("--policy {policy} --takeover --steps 1");
         let ended = run(&server, &flags).ends(1);
-        assert!(ended.stderr.contains("needs"), "{}", ended.stderr);
+        assert!(ended.stderr.contains(words), "{}", ended.stderr);
         fly(&mut holder, Paths::new(1).next(6));
     }
 }

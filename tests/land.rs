@@ -10,7 +10,7 @@ use emberwatch_protocol::{Cell, Model, Move, UNOBSERVED};
 use std::collections::BTreeMap;
 use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::{AGENT, PATIENCE, Paths, SERVER, Server, reset, run};
+use tests::harness::{PATIENCE, Paths, SERVER, Server, reset, run};
 
 const N_MOVES: usize = 6;
 
@@ -300,60 +300,4 @@ fn the_share_of_cells_that_no_fly_cells_close_off_is_logged() {
     );
     let server = Server::start(&format!("{flags} --start random"));
     server.program.wait_for_words(share);
-}
-
-#[test]
-fn a_filter_learned_on_zones_is_of_their_map_alone() {
-    let folder = TempDir::new().expect("a folder");
-    let model = write_model(folder.path(), "visited");
-    let text = std::fs::read_to_string(&model).expect("the model");
-    let (map, rest) = text.split_once("]\nno_fly").expect("a map");
-    let (other, hidden) = (
-        folder.path().join("other.toml"),
-        folder.path().join("hidden.toml"),
-    );
-    // The zone of one cell is another.
-    let cells = map.strip_suffix("2],").expect("the last cell");
-    std::fs::write(&other, format!("{cells}0],]\nno_fly{rest}")).expect("a file");
-    std::fs::write(&hidden, format!("zones_public = false\n{text}")).expect("a file");
-    let out = folder.path().join("out").display().to_string();
-    let settings = folder.path().join("agent.toml");
-    let small = "[learning]\nwindow = 4\nblock_windows = 1\nstreams = 2\nexplore_steps = 8\n";
-    std::fs::write(&settings, small).expect("a file");
-    let world =
-        |model: &str| format!("--model {model} --height 7 --width 9 --moves 6 --burn-in 50");
-    let train = |model: &str| {
-        let settings = settings.display();
-        format!(
-            "train --out {out} --worlds 2 --config {settings} --seed 1000 {}",
-            world(model)
-        )
-    };
-    agent(&format!("{} --steps 40", train(&model)));
-    let checkpoint = format!("{out}/checkpoint.safetensors");
-    let compare = |model: &str| {
-        format!(
-            "compare --seeds 0..2 --steps 3 --policies learned_beam --checkpoint {checkpoint} {}",
-            world(model)
-        )
-    };
-    // Those who are given the model know the zones, if learners do not.
-    for model in [&model, &hidden.display().to_string()] {
-        agent(&compare(model));
-    }
-    let refuses = |arguments: &str, words: &str| check(AGENT, arguments, words);
-    let other = other.display().to_string();
-    let another_map = "zones: expected 3 on 7 x 9 cells, got another map";
-    refuses(&compare(&other), another_map);
-    refuses(
-        &format!("{} --steps 60 --resume", train(&other)),
-        another_map,
-    );
-    let hidden = hidden.display().to_string();
-    let told = "zones: expected none, got 3 on 7 x 9 cells";
-    refuses(&format!("{} --steps 60 --resume", train(&hidden)), told);
-    let plain = "--model wildfire-small --height 7 --width 9 --moves 6 --burn-in 50";
-    let compare = compare(&model).replace(&world(&model), plain);
-    refuses(&compare, "expected 3 observations as the world's, got 6");
-    agent(&format!("{} --steps 60 --resume", train(&model)));
 }

@@ -357,7 +357,7 @@ STATES --states-offset 2 => states_offset: expected 0 to 1
 --states no/such.npz => states file no/such.npz: No such file";
     check_table(SERVER, &table.replace("STATES", &states));
     for (command, flag) in [("compare", "--height"), ("train --out x", "--burn-in")] {
-        let words = format!("--states <FILE|FOLDER> | cannot be used with | {flag}");
+        let words = format!("--states <NAME|FILE|FOLDER> | cannot be used with | {flag}");
         check(AGENT, &format!("{command} {states} {flag} 3"), &words);
     }
 }

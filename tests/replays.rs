@@ -5,6 +5,7 @@ use crate::recording::{
     frames, new_file, read, read_whole, start_recorder, start_replay, stop, take, truths,
     write_recording,
 };
+use emberwatch_protocol::backend::Backend;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{Reply, Request};
 use emberwatch_protocol::message::{FrameHeader, Status};

@@ -151,7 +151,7 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
         };
         let Err(ConnectionError::Refused {
             status, message, ..
-        }) = client.connection_mut().control(&request, PATIENCE)
+        }) = client.backend().control(&request, PATIENCE)
         else {
             panic!("expected a refusal of {words:?}");
         };

@@ -368,13 +368,13 @@ fn all_names_are_checked_before_anything_runs() {
         task.display().to_string(),
     ] {
         let suite = format!(
-            "suite --tasks {tasks} --out {} --policies coverage,beam_xyz",
+            "suite --tasks {tasks} --out {} --policies coverage,known/beam/xyz",
             out.display()
         );
         check(
             AGENT,
             &suite,
-            "task tiny: policy: expected one of | got \"beam_xyz\"",
+            "task tiny: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"",
         );
         assert!(!out.exists(), "nothing ran");
     }

@@ -3,7 +3,8 @@
 use crate::commands::{agent, check};
 use crate::trainings::Place;
 use emberwatch_learning::checkpoint;
-use emberwatch_learning::learners::decisions::{KIND, SavedDecisions};
+use emberwatch_learning::config::{AgentConfig, KernelKind};
+use emberwatch_learning::learners::decisions::SavedDecisions;
 use tests::harness::{AGENT, SMALL, Server, repository};
 
 /// A private server with small worlds.
@@ -37,8 +38,13 @@ fn last(place: &Place, out: &str) -> (String, f64) {
     (row[1].clone(), row[6].parse().expect("a loss"))
 }
 
+fn settings(place: &Place, out: &str) -> AgentConfig {
+    let (_, contents) = checkpoint::read(&place.checkpoint(out)).expect("a checkpoint");
+    contents.settings().expect("its settings")
+}
+
 fn saved(place: &Place, out: &str) -> SavedDecisions {
-    let (_, contents) = checkpoint::read(&place.checkpoint(out), &[KIND]).expect("a checkpoint");
+    let (_, contents) = checkpoint::read(&place.checkpoint(out)).expect("a checkpoint");
     contents.state().expect("its state")
 }
 
@@ -64,17 +70,21 @@ fn decisions_are_learned_and_enter_the_ladder() {
     let compared = agent(&format!("{options} --checkpoint {}", checkpoint.display()));
     for words in [
         "random_walk",
-        "learned_exploit_ahead_3",
-        "learned_rule",
+        "learned/options/exploit_ahead_3",
+        "learned/options/rule",
         "learned_policy",
-        "differences are paired by world, to learned_exploit;",
+        "differences are paired by world, to learned/options/exploit;",
     ] {
         compared.check_prints(words.trim_end_matches(';'));
     }
     check(AGENT, &options, "options | --checkpoint FILE");
-    let one = compare("--policies known_policy --baseline coverage");
+    let one = compare("--policies known/options/learned --baseline coverage");
     let one = format!("{one} --checkpoint {}", checkpoint.display());
-    check(AGENT, &one, "known_policy | known_model");
+    check(
+        AGENT,
+        &one,
+        "known/options/learned | expected decisions on the belief known, got some on learned",
+    );
 }
 
 #[test]
@@ -100,7 +110,7 @@ fn decisions_and_their_filter_are_given_in_either_order() {
 #[test]
 fn a_training_that_ends_before_its_filter_is_learned_goes_on_with_it() {
     let place = place();
-    let first = format!("{WORLDS} --estimator learned_spatial_filter");
+    let first = format!("{WORLDS} --estimator learned_spatial_filter --kernels own");
     let cut = place.words("out", &format!("{first} --time-limit 0"));
     let words = "the belief is not learned yet: continue with --resume";
     check(AGENT, &cut, words);
@@ -117,10 +127,8 @@ fn a_training_that_ends_before_its_filter_is_learned_goes_on_with_it() {
     let other = "--estimator: expected learned_spatial_filter as in the checkpoint, got";
     refused("--estimator known_model", other);
     place.train("out", &format!("{resume} --time-limit 1e19"));
-    assert_eq!(
-        saved(&place, "out").estimator.label(),
-        "learned_spatial_filter"
-    );
+    assert_eq!(saved(&place, "out").estimator, "learned_spatial_filter");
+    assert_eq!(settings(&place, "out").kernels, KernelKind::Own);
     // From here on there are decisions to go on from.
     refused("--estimator learned_filter", other);
     let filter = place.checkpoint("out/belief");
@@ -154,7 +162,7 @@ fn decisions_on_a_known_model_go_on_with_it() {
     );
     place.train("out", &format!("{WORLDS} --resume --steps 10"));
     assert_eq!(last(&place, "out").0, "30");
-    assert_eq!(saved(&place, "out").estimator.label(), "known_model");
+    assert_eq!(saved(&place, "out").estimator, "known_model");
     let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
     let flags = format!("--instance {} --worlds 2 --steps 4", server.instance.name());
     let words = |flags: &str| place.words("hidden", flags);
@@ -193,7 +201,7 @@ fn episodes_no_longer_than_the_returns_teach() {
 #[test]
 fn a_filter_that_was_given_is_the_estimator_s() {
     let place = place();
-    place.train("own", &format!("{WORLDS} --learner own_filter --steps 40"));
+    place.train("own", &format!("{WORLDS} --kernels own --steps 40"));
     let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
     let flags = format!(
         "--instance {} --worlds 2 --steps 4 --checkpoint {}",
@@ -201,7 +209,6 @@ fn a_filter_that_was_given_is_the_estimator_s() {
         place.checkpoint("own").display()
     );
     for (more, words) in [
-        ("", "--checkpoint | what learned_filter acts on"),
         ("--estimator known_model", "--checkpoint | known_model"),
         (
             "--learner filter",
@@ -217,7 +224,27 @@ fn a_filter_that_was_given_is_the_estimator_s() {
     }
     place.train(
         "given",
-        &format!("{flags} --estimator learned_own_spatial_filter"),
+        &format!("{flags} --estimator learned_spatial_filter"),
     );
     assert!(!place.path("given/belief").exists());
+}
+
+#[test]
+fn decisions_of_an_earlier_release_go_on_with_kernels_of_the_cell_s_own_state() {
+    let place = place();
+    place.train("out", &format!("{WORLDS} --kernels own --steps 20"));
+    let path = place.checkpoint("out");
+    let (kind, mut contents) = checkpoint::read(&path).expect("a checkpoint");
+    let mut decisions: SavedDecisions = contents.state().expect("its state");
+    decisions.estimator = "learned_own_filter".into();
+    contents.set_state(&decisions);
+    let new = "kernels = \"own\"\n";
+    assert!(contents.settings.contains(new), "{}", contents.settings);
+    let without = contents.settings.replace(new, "");
+    contents.settings = without.replace("learned_filter", "learned_own_filter");
+    checkpoint::write(&path, &kind, &contents).expect("written");
+    agent(&compare(&format!("--checkpoint {}", path.display()))).check_prints("learned_policy");
+    place.train("out", &format!("{WORLDS} --resume --steps 4"));
+    assert_eq!(settings(&place, "out").kernels, KernelKind::Own);
+    assert_eq!(saved(&place, "out").estimator, "learned_filter");
 }

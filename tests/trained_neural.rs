@@ -45,8 +45,8 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
     let checkpoint = format!("--checkpoint {}", checkpoint.display());
     let worlds =
         "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 --beam-width 4";
-    let policies = "--policies neural_beam,neural_rule --baseline neural_beam";
-    agent(&format!("compare {policies} {worlds} {checkpoint}")).check_prints("neural_rule");
+    let policies = "--policies neural_beam,neural/options/rule --baseline neural_beam";
+    agent(&format!("compare {policies} {worlds} {checkpoint}")).check_prints("neural/options/rule");
     let evaluated = agent(&format!("evaluate {worlds} {checkpoint}"));
     evaluated.check_prints("neural_belief - known_model");
     // The same network on another grid.
@@ -59,7 +59,7 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
     check(
         AGENT,
         &flags,
-        "neural_beam | --checkpoint FILE of a neural belief (--learner neural)",
+        "neural_beam | needs --checkpoint FILE: expected a checkpoint of `train --learner neural`",
     );
 }
 

@@ -5,7 +5,6 @@ use crate::trainings::Place;
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::learners::filter::SavedFilter;
 use emberwatch_learning::learners::filter::fit::FilterFit;
-use emberwatch_learning::learners::filter::fit::KIND;
 use emberwatch_protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
@@ -32,7 +31,7 @@ fn place() -> Place {
 }
 
 fn read(checkpoint: &Path) -> Contents {
-    let (_, contents) = checkpoint::read(checkpoint, &[KIND]).expect("a checkpoint");
+    let (_, contents) = checkpoint::read(checkpoint).expect("a checkpoint");
     contents
 }
 
@@ -191,7 +190,7 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
         let tensor = contents.tensors.get_mut(&format!("likelihood.{name}"));
         tensor.expect("a moment").numbers[4] = number;
     }
-    checkpoint::write(&checkpoint, KIND, &contents).expect("written");
+    checkpoint::write(&checkpoint, "learned_filter", &contents).expect("written");
     let n_rows = place.rows("out").len();
     let next = learner(&contents).n_updates() + 1;
     let words = place.words("out", &format!("{WORLDS} --steps 80 --resume"));
@@ -271,47 +270,60 @@ fn episodes_that_end_are_begun_again() {
 fn a_checkpoint_is_compared_and_evaluated() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    place.train("own", &format!("{WORLDS} --steps 80 --learner own_filter"));
+    place.train("own", &format!("{WORLDS} --steps 80 --kernels own"));
     let [checkpoint, own] = ["out", "own"].map(|out| place.checkpoint(out));
     let (checkpoint, own) = (checkpoint.display(), own.display());
-    let both = format!("--checkpoint {checkpoint} --checkpoint {own}");
     let worlds = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
                   --beam-width 4 --shooting-samples 16";
-    let compared = agent(&format!("compare {both} {worlds}"));
-    let evaluated = agent(&format!("evaluate {both} {worlds}"));
-    for policy in [
-        "learned_shooting",
-        "learned_beam",
-        "learned_own_shooting",
-        "learned_own_beam",
-        "learned_own_spatial_beam",
-    ] {
-        compared.check_prints(policy);
-        evaluated.check_prints(policy);
+    for checkpoint in [&checkpoint, &own] {
+        let compared = agent(&format!("compare --checkpoint {checkpoint} {worlds}"));
+        let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
+        for policy in [
+            "learned/shooting/exploit",
+            "learned_beam",
+            "learned_spatial_beam",
+        ] {
+            compared.check_prints(policy);
+            evaluated.check_prints(policy);
+        }
+        for row in [
+            "class frequencies",
+            "known_model",
+            "learned_filter - known_model",
+        ] {
+            evaluated.check_prints(row);
+        }
     }
-    for row in [
-        "class frequencies",
-        "known_model",
-        "learned_filter - known_model",
-        "learned_own_filter - known_model",
-    ] {
-        evaluated.check_prints(row);
-    }
+    let both = format!("compare --checkpoint {checkpoint} --checkpoint {own} {worlds}");
+    check(
+        AGENT,
+        &both,
+        "expected one checkpoint of learned_filter, got two",
+    );
     let server = Server::start(SMALL);
     let name = server.instance.name();
-    let flags = format!("--instance {name} --steps 5 --policy learned_beam");
-    agent(&format!("run {flags} --checkpoint {checkpoint}"));
-    let words = "learned_beam | --checkpoint FILE";
-    check(AGENT, &format!("run {flags}"), words);
-    let flags = format!("--instance {name} --steps 5 --policy learned_own_spatial_beam");
+    let flags = format!("--instance {name} --steps 5 --policy learned+spatial/beam/exploit");
     agent(&format!("run {flags} --checkpoint {own}"));
-    let other = format!("run {flags} --checkpoint {checkpoint}");
-    let words = "learned_own_spatial_beam | --checkpoint FILE of a filter by own state";
-    check(AGENT, &other, words);
+    let words = "learned_spatial_beam | needs --checkpoint FILE: expected a checkpoint of `train --learner filter`";
+    check(AGENT, &format!("run {flags}"), words);
     let resume = format!("{WORLDS} --steps 8 --resume");
-    let words = "expected a checkpoint of learned_filter, got one of learned_own_filter";
-    check(AGENT, &place.words("own", &resume), words);
-    place.train("own", &format!("{resume} --learner own_filter"));
+    let other = place.words("own", &format!("{resume} --kernels neighbours"));
+    check(
+        AGENT,
+        &other,
+        "--kernels: expected own as in the checkpoint, got neighbours",
+    );
+    place.train("own", &resume);
+    for flags in [
+        "--learner neural",
+        "--learner decisions --estimator known_model",
+        "--learner decisions --estimator neural_belief",
+        "--learner decisions --resume",
+    ] {
+        let ignored = place.words("new", &format!("{WORLDS} {flags} --kernels own"));
+        let words = "--kernels: expected a filter that is learned";
+        check(AGENT, &ignored, words);
+    }
 }
 
 #[test]
@@ -360,8 +372,7 @@ train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: N
 evaluate => --checkpoint
 evaluate --checkpoint no/such => checkpoint no/such: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
-compare --policies learned_beam => \"learned_beam\" needs what `train` learned: expected --checkpoint FILE of a filter
-compare --policies learned_own_beam => \"learned_own_beam\" needs | expected --checkpoint FILE of a filter by own state
+compare --policies learned_beam => \"learned_beam\" needs --checkpoint FILE: expected a checkpoint of `train --learner filter`, got none
 ";
 
 #[test]
@@ -399,4 +410,14 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
     check(AGENT, &words, kernel);
     place.set("[learning]\nrate = 2.0\n");
     check(AGENT, &words, "learning.rate: expected 0 to 1, got 2");
+    place.set("learner = \"filtre\"\n");
+    check(
+        AGENT,
+        &words,
+        "learner: expected one of filter, neural, | \"filtre\"",
+    );
+    place.set("[decisions]\nestimator = \"filter\"\n");
+    let estimator =
+        "decisions.estimator: expected one of known_model, spatial_filter, | \"filter\"";
+    check(AGENT, &words, estimator);
 }

@@ -1,6 +1,7 @@
 //! Acting on one world of a running server.
 
-pub mod handover;
+mod handover;
+mod link;
 pub mod mission;
-pub mod pilot;
+mod pilot;
 pub mod run;

@@ -1,7 +1,7 @@
 //! Policies on the same worlds, scored against the hidden states.
 
-pub mod arena;
-pub mod compare;
-pub mod evaluate;
+pub(crate) mod arena;
+pub(crate) mod compare;
+pub(crate) mod evaluate;
 pub mod report;
-pub mod team;
+pub(crate) mod team;

@@ -1,8 +1,8 @@
 //! The agent's ends of the wire: connections, hidden states for scores, beliefs for observers.
 
-pub mod errors;
-pub mod info;
-pub mod launch;
+pub(crate) mod errors;
+pub(crate) mod info;
+pub(crate) mod launch;
 pub mod left_belief;
 pub mod truth;
-pub mod view;
+pub(crate) mod view;

@@ -18,23 +18,12 @@ pub use run::RunCommand;
 pub use suite::SuiteCommand;
 pub use train::TrainCommand;
 
-use emberwatch_agent::client::errors::refusal;
-use emberwatch_learning::policy;
-use emberwatch_protocol::Model;
+use crate::client::errors::refusal;
 use emberwatch_protocol::message::Status;
 use std::process::ExitCode;
 
 /// Exit code of a run whose lease was lost.
 const LEASE_LOST: u8 = 3;
-
-/// What the policies of the built-in wildfire are, for `--help`.
-pub fn policies() -> String {
-    let list = policy::list(&Model::wildfire());
-    format!(
-        "Policies, for the states of the wildfire; where no belief is named they plan on the known \
-         model's filter's:\n{list}"
-    )
-}
 
 /// Where results go wrong for a reason that callers may want to tell apart, a code of its own.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {

@@ -4,6 +4,8 @@ use anyhow::{Context, Result, bail};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_learning::learners;
+use emberwatch_learning::learners::decisions::belief_of;
 use emberwatch_protocol::program::read_text;
 use std::path::{Path, PathBuf};
 
@@ -51,6 +53,14 @@ pub fn one_of<T: Copy + Send + Sync + 'static>(
     })
 }
 
+/// As [`one_of`], of names alone.
+pub fn one_of_names(
+    all: impl Iterator<Item = (&'static str, &'static str)>,
+) -> PossibleValuesParser {
+    let names = all.map(|(name, help)| PossibleValue::new(name).help(help));
+    PossibleValuesParser::new(names)
+}
+
 impl AgentFlags {
     pub fn effective(&self) -> Result<AgentConfig> {
         let mut config = match (&self.config, self.preset) {
@@ -67,6 +77,8 @@ impl AgentFlags {
         config.prior = self.prior.unwrap_or(config.prior);
         config.seed = self.agent_seed.unwrap_or(config.seed);
         config.check()?;
+        learners::named(&config.learner).map_err(anyhow::Error::msg)?;
+        belief_of(&config.decisions.estimator)?;
         Ok(config)
     }
 }

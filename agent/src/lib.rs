@@ -2,12 +2,12 @@
 //!
 //! Rooms, each using only those below it:
 //!
-//! - `commands` (of the program): flags in, words out
+//! - [`cli`] and `commands` -- flags in, words out
 //! - [`benchmark`] -- policies on the same worlds, scored
 //! - [`acting`] -- one world of a running server
 //! - [`training`] -- the loop that learns while acting, its metrics and events
 //! - [`client`] -- the ends of the wire
-//! - [`flags`] -- settings as flags
+//! - `flags` -- settings as flags
 //! - [`process`] -- the allocator and candle's threads
 //!
 //! Policies, estimators, learners and checkpoints are in the crate `emberwatch-learning`.
@@ -16,7 +16,9 @@
 
 pub mod acting;
 pub mod benchmark;
+pub mod cli;
 pub mod client;
-pub mod flags;
+mod commands;
+mod flags;
 pub mod process;
-pub mod training;
+mod training;

@@ -1,27 +1,27 @@
-//! Learns while acting: attach, fly, correct, learn, predict, save.
+//! Learns while acting: attach, then a step of all robots, updates, now and then a checkpoint.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the model that a server
 //! may reveal is read only for decisions on the belief of a known model. One message steps all robots.
 //! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
 
+mod acting;
 mod events;
-mod learners;
 pub mod metrics;
 mod spec;
 pub mod tensorboard;
 
 pub use self::spec::{CHECKPOINT, TrainingSpec};
 
+use self::acting::Acting;
 use self::events::Events;
-use self::learners::learner;
 use crate::client::info::connect;
-use crate::client::view::view;
-use crate::training::metrics::{FROZEN, METRICS, Metrics};
-use anyhow::{Result, bail};
+use crate::training::metrics::{FROZEN, METRICS, Metrics, Tick};
+use anyhow::{Context, Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::learners::Learner;
-use emberwatch_learning::update::{ModelUpdate, Tick};
+use emberwatch_learning::learners::{Beginning, Learner, LearnerKind, ModelUpdate, Worlds};
+use emberwatch_learning::rollout;
+use emberwatch_learning::served::Served;
 use emberwatch_protocol::Client;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
@@ -49,7 +49,9 @@ pub struct TrainSummary {
     /// Updates made, with those before a resume.
     pub updates: u64,
     pub reward: f64,
-    pub times: Vec<(&'static str, Duration)>,
+    /// Time spent on planning paths and on updates.
+    pub planning: Duration,
+    pub learning: Duration,
 }
 
 /// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
@@ -63,7 +65,6 @@ pub fn train(
     let mut training_loop = TrainingLoop::attach(instance, spec, contents)?;
     let outcome = training_loop.act(spec, stop);
     let saved = training_loop.save(spec);
-    training_loop.summary.times = training_loop.learner.times();
     match (outcome, saved) {
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
@@ -73,27 +74,26 @@ pub fn train(
     }
     training_loop.warn_of_no_update(spec);
     training_loop.client.release()?;
-    if let Some(feed) = training_loop.feed {
-        feed.end();
-    }
+    training_loop.feed.end();
     Ok(training_loop.summary)
 }
 
 struct TrainingLoop {
     client: Client,
+    kind: &'static LearnerKind,
     learner: Box<dyn Learner>,
     metrics: Metrics,
     events: Events,
-    feed: Option<Feed>,
+    feed: Feed,
     summary: TrainSummary,
     /// Updates before this run, of the runs that it resumes.
     n_before: u64,
     saved: Instant,
-    told: Told,
+    reported: Reported,
 }
 
-/// What was told last, and what to tell next.
-struct Told {
+/// What was reported last, and what to report next.
+struct Reported {
     at: Instant,
     steps: u64,
     reward: f64,
@@ -106,7 +106,6 @@ impl TrainingLoop {
         spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
-        let place = spec.out.join(CHECKPOINT);
         if let Some(contents) = &contents {
             warn_of_other_settings(spec, contents)?;
         }
@@ -117,8 +116,9 @@ impl TrainingLoop {
             time_to_live: Some(LEASE),
         };
         let mut client = Client::acquire(connection, &claim)?;
-        let mut learner = learner(spec, &client, contents.as_ref(), &place)?;
-        let metrics = metrics(spec, &*learner)?;
+        let kind = spec.learner()?;
+        let mut learner = begin(spec, kind, &client, contents.as_ref())?;
+        let metrics = metrics(spec, kind, &*learner)?;
         let events = events(spec, &*learner)?;
         if spec.freeze {
             learner.freeze();
@@ -133,11 +133,12 @@ impl TrainingLoop {
                 "not where the checkpoint left them: beliefs begin again"
             );
         }
-        let belief = learner.belief();
-        let feed = belief.map(|(belief, _)| Feed::open(instance, belief.probabilities()));
+        let belief = learner.rollout(0).agent.belief();
+        let feed = Feed::open(instance, belief.probabilities());
         let now = Instant::now();
         Ok(Self {
             client,
+            kind,
             n_before: learner.n_updates(),
             learner,
             metrics,
@@ -145,7 +146,7 @@ impl TrainingLoop {
             feed,
             summary: TrainSummary::default(),
             saved: now,
-            told: Told::at(now, &TrainSummary::default()),
+            reported: Reported::at(now, &TrainSummary::default()),
         })
     }
 
@@ -155,19 +156,22 @@ impl TrainingLoop {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
+            let start = Instant::now();
             let updates = if spec.freeze {
                 Ok(Vec::new())
             } else {
                 self.learner.learn()
             };
+            self.summary.learning += start.elapsed();
             let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             self.summary.updates = self.learner.n_updates();
             if updates.is_empty() {
-                let n_more = self.learner.columns().len();
+                let n_more = self.kind.columns.len();
                 updates.push(ModelUpdate::nothing(self.summary.updates, n_more));
             }
             self.metrics.add(&tick, &updates)?;
-            self.events.add(&tick, &updates, &*self.learner)?;
+            self.events
+                .add(&tick, &updates, self.kind.columns, &*self.learner)?;
             self.report(&tick, spec.steps);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(spec)?;
@@ -178,39 +182,22 @@ impl TrainingLoop {
 
     /// One step of each robot; worlds at the end of their episodes begin again.
     fn step(&mut self) -> Result<Tick> {
-        let start = Instant::now();
-        let paths = self.learner.plan();
-        let planning = start.elapsed() / paths.len().max(1) as u32;
+        let shows_all = self.learner.wants_full_frames();
+        let learner = &mut *self.learner;
+        let mut acting = Acting::new(learner, self.kind, &mut self.feed, &self.client);
+        let mut served = Served::new(&mut self.client, shows_all);
+        let records = rollout::step(&mut acting, &mut served)?.unwrap_or_default();
+        self.summary.planning += acting.planning;
+        let tick = Tick::of(&records, self.learner.world_steps());
         let robots = self.client.robots();
-        let observations = if self.learner.wants_full_frames() {
-            self.client.step_full(robots, &paths)?
-        } else {
-            self.client.step(robots, &paths)?
-        };
-        let over = ended(&self.client, &observations);
-        let tick = self.learner.see(observations)?;
-        self.show(planning);
-        self.learner.predict();
+        let present = (0..robots.len()).map(|index| self.learner.rollout(index).observation());
+        let over = ended(&self.client, present);
         for (robot, observation) in reset(&mut self.client, &over)? {
             self.learner.begin(robot, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(tick)
-    }
-
-    /// Shows the posteriors of the robots whose turn it is; `planning`: time that a plan took.
-    fn show(&mut self, planning: Duration) {
-        let (robots, team) = (self.client.robots(), self.client.info().n_robots);
-        let Some(feed) = &mut self.feed else {
-            return;
-        };
-        for index in feed.turn(robots.len()) {
-            let (number, rollout) = (robots.start + index as u32, self.learner.rollout(index));
-            let mut view = view(rollout, number / team, number..number + 1, planning);
-            view.intent.policy = format!("train {}", self.learner.kind());
-            feed.show(&view);
-        }
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.
@@ -221,7 +208,7 @@ impl TrainingLoop {
             let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
             contents.settings = toml::to_string(&spec.config)?;
             let place = spec.out.join(CHECKPOINT);
-            checkpoint::write(&place, self.learner.kind(), &contents)?;
+            checkpoint::write(&place, self.kind.checkpoints[0], &contents)?;
         }
         self.metrics.flush()?;
         self.events.flush()
@@ -237,33 +224,65 @@ impl TrainingLoop {
     }
 
     fn report(&mut self, tick: &Tick, all_steps: u64) {
-        let told = &mut self.told;
-        told.score += tick.score;
-        if told.at.elapsed() < REPORT_INTERVAL {
+        let last = &mut self.reported;
+        last.score += tick.score;
+        if last.at.elapsed() < REPORT_INTERVAL {
             return;
         }
-        let steps = self.summary.steps - told.steps;
+        let steps = self.summary.steps - last.steps;
         let before = tick.world_steps - self.summary.steps;
         let of = (all_steps > 0).then_some(before + all_steps);
         tracing::info!(
             world_steps = tick.world_steps,
             of = of,
             updates = self.learner.n_updates(),
-            log_likelihood = told.score.mean(),
-            mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
+            log_likelihood = last.score.mean(),
+            mean_reward = (self.summary.reward - last.reward) / steps.max(1) as f64,
             "training"
         );
-        *told = Told::at(Instant::now(), &self.summary);
+        *last = Reported::at(Instant::now(), &self.summary);
     }
 }
 
-impl Told {
+impl Reported {
     fn at(at: Instant, summary: &TrainSummary) -> Self {
         Self {
             at,
             steps: summary.steps,
             reward: summary.reward,
             score: Score::default(),
+        }
+    }
+}
+
+/// A learner of the client's robots, going on from a checkpoint's contents if there are any.
+fn begin(
+    spec: &TrainingSpec,
+    kind: &LearnerKind,
+    client: &Client,
+    contents: Option<&Contents>,
+) -> Result<Box<dyn Learner>> {
+    let info = client.info();
+    let worlds = Worlds {
+        airspace: info.airspace().map_err(anyhow::Error::msg)?,
+        n_observations: info.n_observations,
+        n_moves: info.n_moves,
+        numbers: client.robots(),
+    };
+    let learner = (kind.begin)(Beginning {
+        worlds,
+        info,
+        config: &spec.config,
+        contents,
+        learned: &spec.learned,
+        device: &spec.device,
+        is_frozen: spec.freeze,
+    });
+    match contents {
+        None => learner,
+        Some(_) => {
+            let place = spec.out.join(CHECKPOINT);
+            learner.with_context(|| format!("resume {}", place.display()))
         }
     }
 }
@@ -280,7 +299,7 @@ fn warn_of_other_settings(spec: &TrainingSpec, contents: &Contents) -> Result<()
 /// What the client's robots show, in new episodes where the last ones have ended.
 fn running(client: &mut Client) -> Result<Vec<Observation>, ConnectionError> {
     let mut observations = client.observe(client.robots())?;
-    let over = ended(client, &observations);
+    let over = ended(client, observations.iter());
     for (robot, seen) in reset(client, &over)? {
         observations[(robot - client.robots().start) as usize] = seen;
     }
@@ -292,7 +311,7 @@ fn is_over(seen: &Observation) -> bool {
 }
 
 /// The worlds whose episodes have ended, by what the client's robots show.
-fn ended(client: &Client, observations: &[Observation]) -> Vec<u32> {
+fn ended<'a>(client: &Client, observations: impl Iterator<Item = &'a Observation>) -> Vec<u32> {
     let robots = client.robots().zip(observations);
     let over = robots.filter(|(_, seen)| is_over(seen));
     let mut worlds: Vec<u32> = over
@@ -318,8 +337,8 @@ fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>,
 }
 
 /// The file of metrics: a run without learning has one of its own.
-fn metrics(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Metrics> {
-    let (columns, world_steps) = (learner.columns(), learner.world_steps());
+fn metrics(spec: &TrainingSpec, kind: &LearnerKind, learner: &dyn Learner) -> Result<Metrics> {
+    let (columns, world_steps) = (kind.columns, learner.world_steps());
     match (spec.freeze, spec.resume) {
         (true, _) => Metrics::begin(&spec.out.join(FROZEN), columns),
         (false, true) => Metrics::go_on(&spec.out.join(METRICS), columns, world_steps),

@@ -1,7 +1,10 @@
 //! The server's settings as flags.
 
-use clap::{Args, ValueEnum};
-use emberwatch_protocol::task::Start;
+use clap::{Args, ValueEnum, value_parser};
+use emberwatch_protocol::Model;
+use emberwatch_protocol::built_in::{listed, state_names};
+use emberwatch_protocol::model::MAX_RADIUS;
+use emberwatch_protocol::task::{Start, Task};
 use emberwatch_sim::config::{ConfigError, ServerConfig};
 use emberwatch_sim::given::start_of;
 use serde::Serialize;
@@ -29,21 +32,19 @@ pub struct ServerFlags {
     #[arg(long, value_name = "MILLIS")]
     #[serde(rename = "deadline_millis")]
     pub deadline_ms: Option<u64>,
-    /// Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes:
-    /// `wildfire`, `small`, `sparse`, `latent`, `burnout`, `terrain`, `road-ice`, `team`, `jacksboro` or the path of a
-    /// task file
-    #[arg(long, value_name = "NAME|FILE")]
+    #[arg(long, value_name = "NAME|FILE", help = format!(
+        "Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes: \
+         {} or the path of a task file", listed(Task::built_in_names())))]
     pub task: Option<String>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `wildfire-terrain`,
-    /// `road-ice` or the path of a model file [default: wildfire]
-    #[arg(long)]
+    #[arg(long, value_name = "NAME|FILE", help = format!(
+        "The model of the worlds: {} or the path of a model file [default: wildfire]", listed(Model::built_in_names())))]
     pub model: Option<String>,
-    /// Rows and columns that robots see beyond each cell of their path, 0 to 8 [default: as the model says]
-    #[arg(long, value_parser = clap::value_parser!(u8).range(0..=8))]
+    #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64), help = format!(
+        "Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS} [default: as the model says]"))]
     pub sensor_radius: Option<u8>,
-    /// Worlds show the recorded states of this .npz or .npy file or folder, or `jacksboro`, which decide model, grid and
-    /// burn-in
-    #[arg(long, value_name = "FILE|FOLDER")]
+    #[arg(long, value_name = "NAME|FILE|FOLDER", help = format!(
+        "Worlds show recorded states, which decide model, grid and burn-in: {} or a .npz or .npy file or folder",
+        listed(state_names())))]
     pub states: Option<String>,
     /// Seeds choose among the symmetries of the grid, too
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]

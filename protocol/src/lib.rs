@@ -9,22 +9,27 @@
 //! state of one grid; a *step* `k` flies one path with each robot and moves the world once; a *frame* holds the
 //! observations of a step; a *lease* is the right to fly robots.
 
+#[cfg(feature = "program")]
 pub mod program;
 pub mod throttle;
 mod wire;
 
-pub use emberwatch_messages::{control, interrupt, limits, message, payload, recording};
+pub use emberwatch_messages::{
+    backend, client, control, interrupt, lease, limits, message, payload, recording,
+};
 pub use emberwatch_model as model;
 pub use emberwatch_model::{
     Airspace, Cell, Coverage, Dynamics, Frame, Grid, Model, Move, Probabilities, Shape, Transition,
-    UNOBSERVED, dynamics, frame, grid, path, randomness, task, transition, vectors,
+    UNOBSERVED, built_in, dynamics, frame, grid, path, randomness, task, transition, vectors,
 };
-pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, failed_connections, feed, observer, responder, shared_memory,
     turn, wait,
 };
+
+/// A client of a server.
+pub type Client = client::Client<Connection>;
 
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]

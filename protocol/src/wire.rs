@@ -1,7 +1,7 @@
 //! The wire: how messages travel between processes.
 //!
-//! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`; [`connection`] and
-//! [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
+//! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`; [`connection`] is a client's
+//! side, [`responder`] the answering side, [`observer`] a reader's side.
 //! [`node`], [`turn`] and [`cleanup`] create and remove channels, [`shared_memory`] gives them memory; [`wait`] is the
 //! bounded wait.
 
@@ -9,7 +9,6 @@ pub mod agent_belief;
 mod channel_files;
 pub mod channels;
 pub mod cleanup;
-pub mod client;
 pub mod connection;
 mod directory;
 mod exchange;

@@ -151,6 +151,7 @@ fn every_test_file_is_in_its_program() {
         "agent/belief",
         "agent/learning",
         "clients/dashboard",
+        "env-server/sim",
         "protocol",
         "protocol/messages",
         "protocol/model",

@@ -5,8 +5,8 @@ mod document;
 use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
 use emberwatch_protocol::channels::{
     AGENT_BUFFER, Channel, FRAME_BUFFER, Instance, MAX_AGENT_READERS, MAX_CLIENTS, MAX_NODES,
-    MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, TRUTH_BUFFER,
-    WireHeader, service_name,
+    MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, MAX_WORLDS,
+    TRUTH_BUFFER, WireHeader, service_name,
 };
 use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
 use emberwatch_protocol::grid::MAX_SIDE;
@@ -249,6 +249,7 @@ fn every_limit_is_documented() {
         ("MAX_CONTROL_BYTES", MAX_CONTROL_BYTES),
         ("MAX_MOVES", MAX_MOVES),
         ("MAX_SIDE", MAX_SIDE),
+        ("MAX_WORLDS", MAX_WORLDS),
         ("MAX_ROBOTS", MAX_ROBOTS),
         ("MAX_ROBOT_NUMBERS", MAX_ROBOT_NUMBERS),
         ("MAX_TEAM_CELLS", MAX_TEAM_CELLS),

@@ -34,14 +34,14 @@ impl Flight {
         let start = Instant::now();
         let answer = self.stepper.step(&self.paths);
         let total = start.elapsed().as_nanos() as u64;
-        (total, answer.reply.simulation_nanos.min(total))
+        (total, answer.0.simulation_nanos.min(total))
     }
 
     fn report(&mut self, what: &str, n_steps: usize) {
         (0..n_steps / 10).for_each(|_| _ = self.step());
         let start = Instant::now();
         let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
-        let n_worlds = self.stepper.steps.len();
+        let n_worlds = self.stepper.lease.worlds().len();
         let per_second = (n_steps * n_worlds) as f64 / start.elapsed().as_secs_f64();
         let wire = spread(times.iter().map(|(total, simulation)| total - simulation));
         let simulation = spread(times.iter().map(|(_, simulation)| *simulation));

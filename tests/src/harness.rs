@@ -1,6 +1,7 @@
 //! Servers as children, on names of their own, and what tests do with them.
 
 use crate::wire::observe_header;
+use emberwatch_protocol::backend::Backend;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::connection::ConnectionError;
@@ -8,7 +9,7 @@ use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus, Wor
 use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::path_from_bytes;
-use emberwatch_protocol::payload::{RobotSample, split_frame_payload};
+use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
 use emberwatch_protocol::{Client, Connection, Move};
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::snapshot::{SnapshotWorld, WorldSpec, encode};
@@ -125,11 +126,10 @@ impl Server {
     /// What a robot shows, and its world's last result, over a connection that holds nothing.
     pub fn observe(&self, robot: u32) -> Seen {
         let request = observe_header(robot..robot + 1);
-        let answer = self
-            .connect()
-            .step(request, &[], PATIENCE)
-            .expect("observe");
-        (answer.worlds[0], answer.robots[0], answer.frames)
+        let answer = self.connect().step(request, &[], PATIENCE);
+        let (reply, payload) = answer.expect("observe");
+        let parts = split_step_payload(&reply, &payload).expect("a payload as checked");
+        (parts.worlds[0], parts.robots[0], parts.frames.to_vec())
     }
 
     /// The step k that the world of a robot is at.

@@ -10,6 +10,7 @@ use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::{path_from_bytes, path_to_bytes};
 use emberwatch_protocol::{Client, Coverage, Move};
 use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::results::{robot_result, world_result};
 use emberwatch_sim::snapshot::WorldSpec;
 use emberwatch_sim::world::{Episode, Flown, Robot, Rules};
 use std::time::{Duration, Instant};
@@ -47,7 +48,7 @@ impl Mirror {
     /// # Panics
     /// If a step is missing, or the sample shows anything else than these paths give.
     pub fn follow(&mut self, sample: &Sample<FrameHeader>) -> bool {
-        let (world, k) = (sample.header.result, self.episode.result().step);
+        let (world, k) = (sample.header.result, self.episode.outcome().step);
         let robots = robots_of(sample);
         let is_new = world.step != k;
         if is_new {
@@ -56,9 +57,13 @@ impl Mirror {
             let flown = robots.iter().map(|robot| (path(robot.path), robot.result));
             step_again(&mut self.episode, &self.rules, &world, flown);
         }
-        assert_eq!(*self.episode.result(), world);
+        assert_eq!(world_result(self.episode.outcome()), world);
         for (index, (robot, shown)) in self.episode.robots().iter().zip(&robots).enumerate() {
-            assert_eq!(*robot.result(), shown.result, "robot {index}, step {k}");
+            assert_eq!(
+                robot_result(robot.outcome()),
+                shown.result,
+                "robot {index}, step {k}"
+            );
             let expected = (shown.frame, shown.path.to_vec());
             assert_eq!(seen(robot), expected, "robot {index}, step {k}");
         }

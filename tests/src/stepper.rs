@@ -1,55 +1,47 @@
-//! Steps as fast as the wire allows: a connection and one request, again and again.
+//! Steps as fast as the wire allows: a lease on a connection, and answers as bytes.
 
 use crate::programs::PATIENCE;
-use crate::wire::step_header;
 use emberwatch_protocol::Connection;
-use emberwatch_protocol::connection::StepAnswer;
+use emberwatch_protocol::backend::StepAnswer;
 use emberwatch_protocol::control::{Reply, Request};
-use emberwatch_protocol::message::StepRequest;
-use emberwatch_protocol::payload::write_step_body;
+use emberwatch_protocol::lease::{Call, Lease};
+use emberwatch_protocol::message::Operation;
 use std::ops::Range;
 
-/// A connection that holds robots, and the request of their step.
+/// A connection that holds robots.
 pub struct Stepper {
     pub connection: Connection,
-    pub steps: Vec<u64>,
-    request: StepRequest,
-    body: Vec<u8>,
+    pub lease: Lease,
+    robots: Range<u32>,
 }
 
 impl Stepper {
     /// Takes robots from their holders.
     pub fn new(mut connection: Connection, robots: Range<u32>) -> Self {
-        let (first_robot, n_robots) = (robots.start, robots.len() as u32);
         let acquire = Request::Acquire {
-            first_robot,
-            n_robots,
+            first_robot: robots.start,
+            n_robots: robots.len() as u32,
             takeover: true,
             ttl_millis: None,
         };
-        let lease = match connection.control(&acquire, PATIENCE) {
-            Ok(Reply::Lease(lease)) => lease,
+        let given = match connection.control(&acquire, PATIENCE) {
+            Ok(Reply::Lease(given)) => given,
             other => panic!("acquire: {other:?}"),
         };
-        let n_moves = connection.info().n_moves as u32;
+        let lease = Lease::new(connection.info(), given.lease, &robots);
+        lease.note_all(&given.worlds);
         Self {
             connection,
-            steps: lease.worlds.iter().map(|world| world.step).collect(),
-            request: StepRequest {
-                first_robot,
-                n_robots,
-                ..step_header(lease.lease, n_moves)
-            },
-            body: Vec::new(),
+            lease,
+            robots,
         }
     }
 
     /// Flies paths, one robot's after the other's.
     pub fn step(&mut self, paths: &[u8]) -> StepAnswer {
-        self.body.clear();
-        write_step_body(&self.steps, paths, &mut self.body);
-        let answer = self.connection.step(self.request, &self.body, PATIENCE);
-        self.steps.iter_mut().for_each(|step| *step += 1);
+        let request = self.lease.request(Operation::Step, &self.robots, 0);
+        let mut call = Call::new(request, paths, PATIENCE);
+        let answer = self.lease.send(&mut self.connection, &mut call);
         answer.expect("a step")
     }
 }

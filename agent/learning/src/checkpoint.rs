@@ -7,7 +7,7 @@
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
-use anyhow::{Context, Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::Shape;
@@ -185,15 +185,15 @@ impl Part<'_> {
 ///
 /// # Errors
 /// Where the system refuses; the file is then as it was.
-pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<()> {
+pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let of_file = || format!("checkpoint {}", path.display());
     let bytes = encode(kind, contents).with_context(of_file)?;
     // It holds beliefs about worlds, which are their owner's.
     replace_file(path, &bytes, Readers::Owner).with_context(of_file)
 }
 
-/// Reads a checkpoint of one of some kinds, and tells which.
-pub fn read(path: &Path, kinds: &[&'static str]) -> Result<(&'static str, Contents)> {
+/// Reads a checkpoint, and tells of which kind it is.
+pub fn read(path: &Path) -> Result<(String, Contents)> {
     let bytes = || {
         let found = std::fs::metadata(path)?;
         ensure!(
@@ -205,12 +205,12 @@ pub fn read(path: &Path, kinds: &[&'static str]) -> Result<(&'static str, Conten
         File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
         Ok(bytes)
     };
-    let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
+    let contents = bytes().and_then(|bytes| decode(&bytes));
     contents.with_context(|| format!("checkpoint {}", path.display()))
 }
 
 /// A checkpoint of a kind of learner as bytes.
-pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>> {
+pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     let tensors = contents.tensors.iter();
     let tensor = |(name, tensor): (&String, &Tensor)| {
         let bytes = little_endian(&tensor.numbers);
@@ -256,20 +256,21 @@ fn sort_header(file: &mut [u8]) {
     header[..sorted.len()].copy_from_slice(&sorted);
 }
 
-/// The checkpoint of one of some kinds that bytes are, and which.
-pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents)> {
+/// The checkpoint that bytes are, and its kind.
+pub fn decode(bytes: &[u8]) -> Result<(String, Contents)> {
     let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let mut texts = metadata.metadata().clone().unwrap_or_default();
-    let got = texts
+    let kind = texts
         .remove(KIND)
-        .unwrap_or_else(|| "something else".into());
-    let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
-        let kinds = kinds.join(" or ");
-        bail!("expected a checkpoint of {kinds}, got one of {got}");
-    };
-    let got = texts.remove(FORMAT).unwrap_or_else(|| "none".into());
-    check(got == version(kind), FORMAT, version(kind), got)?;
+        .with_context(|| format!("{KIND}: expected a learner, got none"))?;
+    let (expected, got) = (version(&kind), texts.remove(FORMAT));
+    check(
+        got.as_deref() == Some(expected),
+        FORMAT,
+        expected,
+        got.as_deref().unwrap_or("none"),
+    )?;
     let mut contents = Contents::new([], &());
     contents.settings = texts.remove(SETTINGS).unwrap_or_default();
     for (name, view) in file.iter() {
@@ -367,8 +368,8 @@ mod tests {
         std::fs::write(&path, "open to everybody").expect("written");
         write(&path, "tests", &contents()).expect("written");
         write(&path, "tests", &contents()).expect("written over");
-        let (kind, read) = read(&path, &["others", "tests"]).expect("read");
-        assert_eq!((kind, &read), ("tests", &contents()));
+        let (kind, read) = read(&path).expect("read");
+        assert_eq!((&*kind, &read), ("tests", &contents()));
         assert_eq!(read.state::<State>().expect("its state"), state());
         assert_eq!(read.settings().expect("settings").seed, 3);
         #[cfg(unix)]
@@ -391,7 +392,7 @@ mod tests {
         other.tensors.insert("kernel".into(), kernel);
         for contents in [contents(), other] {
             let first = encode("tests", &contents).expect("small");
-            let (_, read) = decode(&["tests"], &first).expect("whole");
+            let (_, read) = decode(&first).expect("whole");
             assert_eq!(read, contents);
             // Each map has its own order: of 24, ten in a row would hardly be the same.
             for _ in 0..10 {
@@ -407,7 +408,7 @@ mod tests {
         let whole = std::fs::read(&path).expect("readable");
         let read = |bytes: &[u8]| {
             std::fs::write(&path, bytes).expect("written");
-            let read = read(&path, &["tests"]).map(|(_, contents)| contents);
+            let read = read(&path).map(|(_, contents)| contents);
             read.map_err(|error| format!("{error:#}"))
         };
         let check = |bytes: &[u8], what: String| match read(bytes) {
@@ -429,19 +430,19 @@ mod tests {
     #[test]
     fn another_kind_format_tensor_or_state_is_named() {
         let whole = encode("tests", &contents()).expect("small");
-        let refused = |kind, from: &str, to: &str| {
+        let refused = |from: &str, to: &str| {
             let at = whole
                 .windows(from.len())
                 .position(|word| word == from.as_bytes());
             let (mut bytes, at) = (whole.clone(), at.expect("in the file"));
             bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
-            decode(&[kind], &bytes).expect_err(to).to_string()
+            decode(&bytes).expect_err(to).to_string()
         };
-        let words = "expected a checkpoint of others, got one of tests";
-        assert_eq!(refused("others", "kernel", "kernel"), words);
+        let words = "emberwatch.kind: expected a learner, got none";
+        assert_eq!(refused("emberwatch.kind", "emberwatch.kinb"), words);
         for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"4""#, "none")] {
             let words = format!("emberwatch.format: expected 4, got {got}");
-            assert_eq!(refused("tests", r#"format":"4""#, to), words);
+            assert_eq!(refused(r#"format":"4""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
@@ -461,9 +462,9 @@ mod tests {
             error.starts_with("state: expected that of its learner"),
             "{error}"
         );
-        let endless = read(Path::new("/dev/zero"), &["tests"]).expect_err("no file");
+        let endless = read(Path::new("/dev/zero")).expect_err("no file");
         assert!(format!("{endless:#}").contains("expected a regular file"));
-        let missing = read(Path::new("no/such"), &["tests"]).expect_err("none");
+        let missing = read(Path::new("no/such")).expect_err("none");
         assert!(format!("{missing:#}").starts_with("checkpoint no/such: No such file"));
     }
 }

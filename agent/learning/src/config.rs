@@ -3,17 +3,14 @@
 mod sections;
 
 pub use sections::{
-    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig,
+    AutoencoderConfig, DecisionsConfig, KernelKind, LearningConfig, NetworkDqnConfig, NeuralConfig,
     ObjectiveConfig, StepSize,
 };
 
 use self::sections::check;
-use crate::policy::{PlannerKind, Policy};
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::Prior;
-use emberwatch_belief::planning::{
-    Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
-};
+use emberwatch_belief::planning::Integration;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
@@ -39,24 +36,15 @@ pub struct AgentConfig {
     pub prior: PriorKind,
     pub prior_worlds: usize,
     pub seed: u64,
-    pub learner: LearnerKind,
+    /// The name of what `train` learns with.
+    pub learner: String,
+    pub kernels: KernelKind,
     pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
     pub neural: NeuralConfig,
     pub autoencoder: AutoencoderConfig,
     pub dqn: NetworkDqnConfig,
     pub decisions: DecisionsConfig,
-}
-
-/// What `train` learns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LearnerKind {
-    Filter,
-    OwnFilter,
-    Neural,
-    Autoencoder,
-    Decisions,
 }
 
 /// The known-model filter's first belief.
@@ -66,37 +54,6 @@ pub enum PriorKind {
     Simulated,
     Initial,
     Uniform,
-}
-
-impl LearnerKind {
-    /// Each kind with its name and what it learns.
-    pub const ALL: [(Self, &str, &str); 5] = [
-        (
-            Self::Filter,
-            "filter",
-            "A Bayes filter of the paper's form, with unknown parameters",
-        ),
-        (
-            Self::OwnFilter,
-            "own_filter",
-            "The same with a kernel for each state that a cell itself can be in",
-        ),
-        (
-            Self::Neural,
-            "neural",
-            "A network that keeps space, from what was seen to what will be seen",
-        ),
-        (
-            Self::Autoencoder,
-            "autoencoder",
-            "The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives",
-        ),
-        (
-            Self::Decisions,
-            "decisions",
-            "A DQN that chooses among options on an estimator's belief, which is learned first, unless it is given",
-        ),
-    ];
 }
 
 impl PriorKind {
@@ -167,40 +124,9 @@ impl AgentConfig {
         }
     }
 
-    /// What a policy maximises under these settings. A policy without a bonus, such as
-    /// `shooting_exploit_only`, and coverage, which is nothing but the bonus, keep theirs.
-    pub fn objective(&self, policy: &Policy) -> Objective {
-        let own = policy.objective;
-        let settings = &self.objective;
-        let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
-        let coverage_bonus = match policy.planner {
-            _ if keeps => own.coverage_bonus,
-            PlannerKind::Beam | PlannerKind::BeamAhead => settings.beam_bonus,
-            PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
-        };
-        Objective {
-            target: own.target,
-            coverage_bonus,
-            entropy: settings.entropy,
-            revisits: settings.revisits,
-        }
-    }
-
     /// Seed of a planner: its world's, told apart by the agent's own.
     pub fn planner_seed(&self, world_seed: u64) -> u64 {
         world_seed ^ self.seed.rotate_left(32)
-    }
-
-    pub fn planner(&self, policy: &Policy) -> Box<dyn Planner + Send> {
-        match policy.planner {
-            PlannerKind::RandomWalk => Box::new(RandomWalk),
-            PlannerKind::Shooting => Box::new(Shooting::new(
-                self.shooting_samples,
-                self.shooting_integration,
-            )),
-            PlannerKind::Beam => Box::new(BeamSearch::new(self.beam_width)),
-            PlannerKind::BeamAhead => Box::new(Ahead::new(self.beam_width)),
-        }
     }
 }
 
@@ -234,40 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_of_the_objective_reach_the_policies() {
-        let model = emberwatch_model::Model::wildfire();
-        let policy = |name| Policy::named(name, &model).expect("a known name");
-        let mut config = AgentConfig::default();
-        for policy in Policy::ladder(&model) {
-            assert_eq!(
-                config.objective(&policy).coverage_bonus,
-                policy.objective.coverage_bonus
-            );
-        }
-        config.objective.shooting_bonus = 3.0;
-        config.objective.revisits = true;
-        assert_eq!(
-            config.objective(&policy("shooting_explore")).coverage_bonus,
-            3.0
-        );
-        assert!(config.objective(&policy("beam_exploit")).revisits);
-        assert_eq!(
-            config
-                .objective(&policy("shooting_exploit_only"))
-                .coverage_bonus,
-            0.0
-        );
-        assert_eq!(config.objective(&policy("coverage")).coverage_bonus, 1.0);
-        config.objective.beam_bonus = f32::NAN;
-        let error = config.check().expect_err("no number").to_string();
-        assert_eq!(error, "objective.beam_bonus: expected 0 to 1000, got NaN");
-    }
-
-    #[test]
     fn kinds_are_named_as_in_files() {
-        for (kind, name, _) in LearnerKind::ALL {
-            assert_eq!(serde_json::to_value(kind).expect("a name"), name);
-        }
         for (kind, name, _) in PriorKind::ALL {
             assert_eq!(serde_json::to_value(kind).expect("a name"), name);
         }
@@ -281,14 +174,18 @@ mod tests {
         };
         let error = config.check().expect_err("no beam").to_string();
         assert_eq!(error, "beam_width: expected 1 to 10000, got 0");
+        let mut config = AgentConfig::default();
+        config.objective.beam_bonus = f32::NAN;
+        let error = config.check().expect_err("no number").to_string();
+        assert_eq!(error, "objective.beam_bonus: expected 0 to 1000, got NaN");
         for (text, words) in [
             (
                 "[objective]\nbelief = \"prior\"",
                 "unknown variant `prior`, expected `predictor` or `estimate`",
             ),
             (
-                "[decisions]\nestimator = \"filter\"",
-                "expected one of known_model, spatial_filter, learned_filter",
+                "kernels = \"cell\"",
+                "unknown variant `cell`, expected `neighbours` or `own`",
             ),
         ] {
             let error = AgentConfig::from_toml(text).expect_err("no such name");

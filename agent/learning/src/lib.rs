@@ -5,14 +5,14 @@
 //! Modules, each using only those below it:
 //!
 //! - [`options`] -- beliefs about worlds and the plan of every option, for a learner outside
-//! - [`registry`] -- a policy's agent: estimator, planner, and what decides
-//! - [`learned`] -- what a checkpoint holds
-//! - [`learners`] -- what learns while it acts: filter, networks of Algorithm 1, neural belief, decisions
+//! - [`served`] -- the worlds of a client, as an environment
+//! - [`learners`] -- what learns while it acts: filter, Algorithm 1, neural belief, decisions; reading checkpoints
 //! - [`rollout`] -- an agent at its world, and the step that all commands take
-//! - [`belief`], [`checkpoint`], [`filter`], [`replay`], [`reward`], [`update`] -- the parts of learners
+//! - [`policy`] -- belief, planner and goal; names and parts of policies
+//! - [`beliefs`] -- kinds of belief: constructors and facts, what was learned for them
+//! - [`learned`] -- the contents of checkpoints, by type
+//! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the parts of learners
 //! - [`config`] -- settings
-//! - [`policy`] -- policies by name
-//! - [`estimation`] -- estimators that need networks; the others are in the crate `emberwatch-belief`
 //! - [`mod@file`] -- files written whole or not at all
 
 #![allow(
@@ -20,18 +20,16 @@
     reason = "the agent's inside: what names say is not said again"
 )]
 
-pub mod belief;
+pub mod beliefs;
 pub mod checkpoint;
 pub mod config;
-pub mod estimation;
 pub mod file;
-pub mod filter;
+pub mod gradient;
 pub mod learned;
 pub mod learners;
 pub mod options;
 pub mod policy;
-pub mod registry;
 pub mod replay;
 pub mod reward;
 pub mod rollout;
-pub mod update;
+pub mod served;

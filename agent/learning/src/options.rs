@@ -1,14 +1,16 @@
 //! Beliefs about worlds of one robot each, and the plan of every option, for a learner that chooses among the options.
 //! Pure: the caller flies the paths.
 
+use crate::beliefs::autoencoder::AutoencoderModel;
+use crate::beliefs::{self, BELIEFS, BeliefKind, Conditions, KNOWN, WorldForm};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
-use crate::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::registry::{self, Task};
+use crate::policy::{BY_OPTIONS, Goal, LearnedDecisions, Policy};
 use crate::rollout::agent::Agent;
+use crate::rollout::building;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::planning::{Proposal, Target};
+use emberwatch_belief::planning::Proposal;
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
@@ -46,27 +48,28 @@ impl Crew {
     /// # Errors
     /// If the checkpoint lacks the estimator, or comes from worlds of another form. The message begins with `checkpoint`.
     pub fn new(
-        estimator: Option<EstimatorKind>,
+        estimator: Option<&'static BeliefKind>,
         learned: Learned,
         model: Model,
         shape: Shape,
         n_moves: usize,
     ) -> Result<Self> {
-        let kind = estimator.unwrap_or_else(|| learned.estimator());
-        let label = kind.label();
+        let kind = estimator.unwrap_or_else(|| usual(&learned));
         ensure!(
-            learned.network.is_none(),
-            "checkpoint: expected one of a belief that options are planned on, such as {label}, got an autoencoder's"
+            learned.get::<AutoencoderModel>().is_none(),
+            "checkpoint: expected one of a belief that options are planned on, such as {}, got an autoencoder's",
+            kind.label
         );
-        if kind.is_learned() {
-            let belief = learned.belief(kind);
-            belief
-                .with_context(|| format!("checkpoint: expected one of a {label}, got none"))?
-                .check_world(&registry::world_form(&model))?;
-        }
-        let target = Target::State(model.target_state());
+        kind.learned(&learned).context("checkpoint")?;
+        kind.check(&learned, &WorldForm::of(&model, shape))?;
         Ok(Self {
-            policy: Policy::new("options", kind, PlannerKind::Beam, target),
+            policy: Policy {
+                name: "options".into(),
+                belief: kind,
+                planner: &BY_OPTIONS,
+                // The learner outside chooses.
+                goal: Goal::Rule,
+            },
             model,
             shape,
             n_moves,
@@ -75,8 +78,8 @@ impl Crew {
         })
     }
 
-    pub fn estimator(&self) -> EstimatorKind {
-        self.policy.estimator
+    pub fn estimator(&self) -> &'static BeliefKind {
+        self.policy.belief
     }
 
     pub fn model(&self) -> &Model {
@@ -94,20 +97,36 @@ impl Crew {
 
     /// Creates a belief before the first frame. `prior`: the first belief of filters that know the model.
     pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<Planned> {
-        let task = Task {
-            model: &self.model,
+        let conditions = Conditions {
             shape: self.shape,
-            n_moves: self.n_moves,
-            prior,
-            seed: self.config.planner_seed(world_seed),
+            model: Some(&self.model),
+            prior: Some(prior),
             learned: &self.learned,
         };
+        let (policy, config) = (&self.policy, &self.config);
+        let seed = config.planner_seed(world_seed);
         Ok(Planned {
-            agent: registry::agent(&self.policy, &self.config, task)?,
+            agent: building::agent(policy, config, &conditions, self.n_moves, seed)?,
             proposals: Vec::new(),
             planning: Duration::ZERO,
         })
     }
+}
+
+/// What options are planned on unless it is said: what decisions were learned on, or else the belief that was learned;
+/// without one the known model's.
+pub fn usual(learned: &Learned) -> &'static BeliefKind {
+    let decided = learned
+        .get::<LearnedDecisions>()
+        .map(|decisions| decisions.belief);
+    let mut kinds = BELIEFS.iter().copied();
+    let serves = |kind: &&BeliefKind| {
+        kind.learned_by.is_some()
+            && beliefs::of_options(kind.label).is_ok()
+            && kind.learned(learned).is_ok()
+    };
+    let found = kinds.find(serves);
+    decided.or(found).unwrap_or(&KNOWN)
 }
 
 impl Planned {

@@ -1,8 +1,15 @@
-//! Policies by name: which belief, which planner, which objective (the ladder of the benchmark).
+//! A policy is a belief, a planner and a goal, such as `learned+spatial/beam/exploit`.
 
-mod kinds;
-mod list;
-mod named;
+mod decisions;
+mod help;
+mod ladder;
+mod names;
+mod parts;
+mod planners;
 
-pub use kinds::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};
-pub use list::list;
+pub use self::decisions::LearnedDecisions;
+pub use self::help::help;
+pub use self::ladder::{ladder, of_learned, options_table};
+pub use self::names::{belief_of, check_name, planner_of};
+pub use self::parts::{Goal, Policy, network_choices};
+pub use self::planners::{AHEAD, BEAM, BY_OPTIONS, PLANNERS, PlannerKind, RANDOM, SHOOTING};

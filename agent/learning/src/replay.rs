@@ -1,4 +1,4 @@
-//! Recent frames of one or more worlds, in blocks that learners run through.
+//! Recent frames of one or more robots, in blocks that learners run through.
 //!
 //! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
 //! length, the last of which may be shorter; a block keeps the belief before its first frame, which the learner that
@@ -29,16 +29,16 @@ pub struct Block {
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Replay {
+pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
     full: BTreeMap<u64, Block>,
-    /// The block that each world's frames go into, by world.
+    /// The block that each robot's frames go into, by robot.
     open: BTreeMap<u32, (u64, Block)>,
     n_opened: u64,
 }
 
-impl Replay {
+impl BlockReplay {
     /// Room for `max_frames` frames, in blocks of at most `block_length`; for one block at least.
     pub fn new(block_length: usize, max_frames: usize) -> Self {
         Self {
@@ -50,31 +50,31 @@ impl Replay {
         }
     }
 
-    /// Begins a new track of a world; the last block of the one before ends here.
-    pub fn begin(&mut self, world: u32) {
+    /// Begins a new track of a robot; the last block of the one before ends here.
+    pub fn begin(&mut self, robot: u32) {
         let block = self.new_block(None);
-        if let Some((number, last)) = self.open.insert(world, block)
+        if let Some((number, last)) = self.open.insert(robot, block)
             && !last.frames.is_empty()
         {
             self.keep(number, last);
         }
     }
 
-    pub fn has_track(&self, world: u32) -> bool {
-        self.open.contains_key(&world)
+    pub fn has_track(&self, robot: u32) -> bool {
+        self.open.contains_key(&robot)
     }
 
-    /// Adds the next frame of a world's track, and the belief before it where there is one.
+    /// Adds the next frame of a robot's track, and the belief before it where there is one.
     ///
     /// # Panics
-    /// If the world's track was not begun.
-    pub fn push(&mut self, world: u32, frame: &Frame, before: Option<&Belief>) {
+    /// If the robot's track was not begun.
+    pub fn push(&mut self, robot: u32, frame: &Frame, before: Option<&Belief>) {
         let sighting = |(cell, value)| Sighting {
             cell: cell as u32,
             value,
         };
         let sightings = frame.observed().map(sighting).collect();
-        let (_, block) = self.open.get_mut(&world).expect("a track that was begun");
+        let (_, block) = self.open.get_mut(&robot).expect("a track that was begun");
         if block.frames.is_empty() && block.start.is_some() {
             block.start = before.map(|belief| belief.as_slice().to_vec());
         }
@@ -83,7 +83,7 @@ impl Replay {
             // An empty belief stands for one that is still to be given.
             let following = self.new_block(Some(Vec::new()));
             let next = following.0;
-            if let Some((id, mut block)) = self.open.insert(world, following) {
+            if let Some((id, mut block)) = self.open.insert(robot, following) {
                 block.next = next;
                 self.keep(id, block);
             }
@@ -219,17 +219,17 @@ mod tests {
     }
 
     /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
-    fn replay(n_frames: u8) -> Replay {
-        let mut replay = Replay::new(2, 7);
+    fn replay(n_frames: u8) -> BlockReplay {
+        let mut replay = BlockReplay::new(2, 7);
         replay.begin(0);
         replay.begin(5);
         (0..n_frames).for_each(|value| see(&mut replay, value));
         replay
     }
 
-    fn see(replay: &mut Replay, value: u8) {
-        for world in [0, 5] {
-            replay.push(world, &frame(value), Some(&belief(value)));
+    fn see(replay: &mut BlockReplay, value: u8) {
+        for robot in [0, 5] {
+            replay.push(robot, &frame(value), Some(&belief(value)));
         }
     }
 
@@ -248,7 +248,7 @@ mod tests {
     fn old_blocks_go_when_there_is_no_room() {
         let replay = replay(6);
         assert_eq!(replay.blocks().collect::<Vec<_>>(), [3, 4, 5]);
-        let mut short = Replay::new(2, 7);
+        let mut short = BlockReplay::new(2, 7);
         for _ in 0..9 {
             short.begin(0);
             short.push(0, &frame(1), None);
@@ -259,7 +259,8 @@ mod tests {
     #[test]
     fn beliefs_are_handed_on_along_a_track() {
         let mut replay = replay(4);
-        let start = |replay: &Replay, number| replay.block(number).and_then(|it| it.start.clone());
+        let start =
+            |replay: &BlockReplay, number| replay.block(number).and_then(|it| it.start.clone());
         let given = Some(belief(2).as_slice().to_vec());
         assert_eq!(start(&replay, 2), given);
         replay.hand_on(1, &[9.0]);
@@ -293,8 +294,8 @@ mod tests {
         assert_eq!(resumed(replay.clone()).expect("whole"), replay);
     }
 
-    fn resumed(other: Replay) -> Result<Replay> {
-        let mut replay = Replay::new(2, 7);
+    fn resumed(other: BlockReplay) -> Result<BlockReplay> {
+        let mut replay = BlockReplay::new(2, 7);
         let shape = Shape::new(1, 3).expect("test shape");
         replay.resume(other, shape, 2, 9).map(|()| replay)
     }
@@ -320,12 +321,12 @@ mod tests {
 
     #[test]
     fn what_no_replay_holds_is_named() {
-        let check = |change: fn(&mut Replay), words: &str| {
+        let check = |change: fn(&mut BlockReplay), words: &str| {
             let mut other = replay(5);
             change(&mut other);
             assert_eq!(resumed(other).expect_err(words).to_string(), words);
         };
-        fn full(replay: &mut Replay) -> &mut Block {
+        fn full(replay: &mut BlockReplay) -> &mut Block {
             replay.full.get_mut(&2).expect("kept")
         }
         check(

@@ -1,6 +1,7 @@
-//! An agent at its world, and the step that every command takes: plan, fly, see, predict. Pure: the caller flies.
+//! An agent at its world, and the step that every command takes: plan, fly, see, predict. Pure: an environment flies.
 
 pub mod agent;
+pub mod building;
 
 use self::agent::Agent;
 use anyhow::Result;
@@ -10,6 +11,47 @@ use emberwatch_messages::message::RobotResult;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::{Cell, Grid, Move};
 use rayon::prelude::*;
+
+/// One step of the worlds of an environment; `None` if it was stopped before they moved.
+///
+/// # Errors
+/// If paths are not flown, or a frame is impossible under a belief.
+pub fn step(
+    actor: &mut (impl Actor + ?Sized),
+    environment: &mut impl Environment,
+) -> Result<Option<Vec<StepRecord>>> {
+    let paths = actor.plan();
+    let Some(seen) = environment.fly(&paths)? else {
+        return Ok(None);
+    };
+    let records = actor.see(seen)?;
+    actor.predict();
+    Ok(Some(records))
+}
+
+/// What acts on worlds: an agent, several, or what learns while it acts.
+pub trait Actor {
+    /// The path of each robot for step k -> k + 1.
+    fn plan(&mut self) -> Vec<Vec<Move>>;
+
+    /// Takes in what each agent sees after the step; the beliefs are then posteriors, about X_{k+1}.
+    ///
+    /// # Errors
+    /// If a frame is impossible under a belief.
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>>;
+
+    /// Moves all beliefs to the next step.
+    fn predict(&mut self);
+}
+
+/// Where it acts: a server's worlds, or worlds in this process.
+pub trait Environment {
+    /// Flies a path with each robot; returns what each agent sees then, or `None` if it was stopped before that.
+    ///
+    /// # Errors
+    /// If the paths are not flown.
+    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>>;
+}
 
 /// An agent and what its world shows it: it plans for one robot there, or for several on one belief.
 pub struct Rollout {
@@ -29,9 +71,12 @@ pub struct Seen {
 }
 
 /// What a step changed for an agent.
-pub struct Turn {
+#[derive(Debug)]
+pub struct StepRecord {
     /// What the world showed before.
     pub before: Observation,
+    /// What the step gave its first robot.
+    pub reward: f64,
     /// How well the prediction before the frame fits it, where the estimator predicts frames.
     pub score: Option<Score>,
 }
@@ -70,12 +115,13 @@ impl Rollout {
     }
 
     /// Takes in what the world shows after a step; the belief is then the posterior.
-    pub fn see(&mut self, seen: Seen) -> Result<Turn> {
+    pub fn see(&mut self, seen: Seen) -> Result<StepRecord> {
         let score = self.agent.score(&seen.observation.frame);
         let before = std::mem::replace(&mut self.seen, seen);
         self.correct()?;
-        Ok(Turn {
+        Ok(StepRecord {
             before: before.observation,
+            reward: self.observation().robot.reward,
             score,
         })
     }
@@ -118,25 +164,35 @@ impl Rollout {
     }
 }
 
-/// The plans of each agent, one for each of its robots.
-pub fn plan_all<'a>(rollouts: impl IntoIterator<Item = &'a mut Rollout>) -> Vec<Vec<Plan>> {
-    in_parallel(rollouts, Rollout::plan)
+/// Agents, each on its own belief.
+impl Actor for Vec<Rollout> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        paths_of(in_parallel(self, Rollout::plan))
+    }
+
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        see_all(self, seen)
+    }
+
+    fn predict(&mut self) {
+        predict_all(self);
+    }
 }
 
 /// The paths of all agents' plans, in order.
-pub fn paths_of(plans: &[Vec<Plan>]) -> Vec<Vec<Move>> {
-    let plans = plans.iter().flatten();
-    plans.map(|plan| plan.moves.clone()).collect()
+pub fn paths_of(plans: impl IntoIterator<Item = Vec<Plan>>) -> Vec<Vec<Move>> {
+    let plans = plans.into_iter().flatten();
+    plans.map(|plan| plan.moves).collect()
 }
 
 /// Gives each agent what it sees after the step; the beliefs are then posteriors.
 pub fn see_all<'a>(
     rollouts: impl IntoIterator<Item = &'a mut Rollout>,
     seen: Vec<Seen>,
-) -> Result<Vec<Turn>> {
+) -> Result<Vec<StepRecord>> {
     let pairs = rollouts.into_iter().zip(seen);
-    let turns = in_parallel(pairs, |(rollout, seen)| rollout.see(seen));
-    turns.into_iter().collect()
+    let records = in_parallel(pairs, |(rollout, seen)| rollout.see(seen));
+    records.into_iter().collect()
 }
 
 /// Moves all beliefs to the next step.

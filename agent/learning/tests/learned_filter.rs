@@ -4,11 +4,10 @@ use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::config::{AgentConfig, LearningConfig};
-use emberwatch_learning::filter::{Optimiser, Recursion, Update};
-use emberwatch_learning::replay::{Replay, Sighting};
+use emberwatch_learning::gradient::{Optimiser, Recursion, Update};
+use emberwatch_learning::replay::{BlockReplay, Sighting};
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Frame, Grid, Model, Probabilities, Shape};
-use std::sync::Arc;
+use emberwatch_model::{Cell, Frame, Model, Probabilities, Shape};
 
 /// What a few cells of a made-up world show: no two frames see the same cells.
 fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
@@ -57,16 +56,11 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
         Model::wildfire(),
         Model::from_toml(road_ice).expect("valid"),
         burnout(),
-        Model::built_in("wildfire-terrain").expect("a built-in model"),
     ];
     for model in models {
         let shapes = [(1, 1), (5, 9), (20, 33), (64, 64)];
         let shapes = shapes.map(|(height, width)| Shape::new(height, width).expect("test shape"));
-        // A map of zones is of one grid.
-        for shape in shapes
-            .into_iter()
-            .filter(|shape| model.check_on(*shape).is_ok())
-        {
+        for shape in shapes {
             let prior = Belief::uniform(model.n_states(), shape);
             let mut known = BayesFilter::known(&model, prior.clone()).expect("valid model");
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
@@ -121,13 +115,6 @@ fn loss(
     loss
 }
 
-/// The zone of each cell, scattered, if the dimensions have zones.
-fn zones(dimensions: Dimensions, shape: Shape) -> Option<Arc<Grid<u8>>> {
-    let n_zones = dimensions.n_zones;
-    let zone = |(row, col)| ((7 * row + 3 * col + row * col) % n_zones) as u8;
-    (n_zones > 0).then(|| Arc::new(Grid::from_shape_fn(shape.dim(), zone)))
-}
-
 /// Eqs. 2 and 3 by the definition.
 fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
     let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
@@ -137,10 +124,8 @@ fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64
         (0..n_cells).flat_map(|cell| (0..dimensions.n_own()).map(move |own| (cell, own)))
     {
         let Cell { row, col } = shape.cell(cell);
-        let zone = zones(dimensions, shape).map_or(0, |zones| zones[[row, col]]);
-        let first = usize::from(zone) * dimensions.n_own() + own;
         let mut weights = vec![0.0; n_states];
-        for (at, weight) in kernel[first * n_states * n_states * rows * cols..]
+        for (at, weight) in kernel[own * n_states * n_states * rows * cols..]
             .iter()
             .enumerate()
         {
@@ -177,8 +162,7 @@ fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64
 
 fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bool) {
     let shape = Shape::new(size.0, size.1).expect("test shape");
-    let parameters = Parameters::first(dimensions, 11);
-    let tables = parameters.on_land(zones(dimensions, shape)).tables();
+    let tables = Parameters::first(dimensions, 11).tables();
     let frames: Vec<_> = (0..5)
         .map(|number| sightings(shape, dimensions.n_observations, number))
         .collect();
@@ -217,23 +201,20 @@ fn every_gradient_agrees_with_finite_differences() {
     for (from_belief, sees_own_state) in
         [(false, false), (true, false), (false, true), (true, true)]
     {
-        let check = |n_zones, n_states, n_observations, kernel, size| {
+        let check = |n_states, n_observations, kernel, size| {
             let dimensions = Dimensions {
                 n_states,
                 n_observations,
                 kernel,
                 sees_own_state,
-                n_zones,
                 n_matrices: 1,
             };
             check_gradients(dimensions, size, from_belief);
         };
-        check(0, 3, 3, (3, 3), (6, 7));
-        check(0, 2, 3, (1, 5), (4, 19));
-        check(0, 4, 2, (5, 3), (if sees_own_state { 2 } else { 9 }, 70));
-        check(0, 7, 4, (3, 1), (3, 2));
-        check(3, 3, 3, (3, 3), (6, 7));
-        check(5, 2, 3, (1, 5), (4, 19));
+        check(3, 3, (3, 3), (6, 7));
+        check(2, 3, (1, 5), (4, 19));
+        check(4, 2, (5, 3), (if sees_own_state { 2 } else { 9 }, 70));
+        check(7, 4, (3, 1), (3, 2));
     }
 }
 
@@ -259,15 +240,6 @@ fn a_window_ends_with_the_filters_prediction() {
         check_window(Parameters::first(dimensions(sees_own_state), 2).tables());
     }
     check_window(Tables::of_model(&burnout()));
-    for sees_own_state in [false, true] {
-        let dimensions = Dimensions {
-            n_zones: 4,
-            ..dimensions(sees_own_state)
-        };
-        let shape = Shape::new(7, 18).expect("test shape");
-        let parameters = Parameters::first(dimensions, 2).on_land(zones(dimensions, shape));
-        check_window(parameters.tables());
-    }
 }
 
 #[test]
@@ -296,8 +268,8 @@ fn config() -> LearningConfig {
 }
 
 /// A replay of two worlds with enough blocks for [`config`].
-fn replay(shape: Shape, n_frames: u64) -> Replay {
-    let mut replay = Replay::new(8, 1000);
+fn replay(shape: Shape, n_frames: u64) -> BlockReplay {
+    let mut replay = BlockReplay::new(8, 1000);
     for world in 0..2 {
         replay.begin(world);
         for number in 0..n_frames {
@@ -314,7 +286,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_zones: 0,
         n_matrices: 1,
     }
 }

@@ -3,8 +3,9 @@
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
+use emberwatch_learning::beliefs::learned::LearnedModel;
 use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learners::filter::fit::{FilterFit, LearnedModel};
+use emberwatch_learning::learners::filter::fit::FilterFit;
 use emberwatch_model::path::fly;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
@@ -23,7 +24,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_zones: 0,
         n_matrices: 1,
     }
 }
@@ -81,7 +81,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     let mut config = AgentConfig::default();
     config.learning.steady_updates = 600;
     config.learning.falling_updates = 400;
-    let mut learner = FilterFit::new(dimensions(sees_own_state), None, shape(), &config);
+    let mut learner = FilterFit::new(dimensions(sees_own_state), shape(), &config);
     let worlds = 0..N_WORLDS;
     let mut worlds: Vec<World> = worlds
         .map(|world| World::new(model, &learner, 1000 + u64::from(world)))
@@ -95,7 +95,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
             world.filter.correct(&frame).expect("possible");
             let states = world.states.as_slice().expect("row-major");
             let burning = visited.iter().filter(|&&cell| states[cell] == 1).count();
-            learner.reward(world.filter.belief(), &visited, burning as f64);
+            learner.earn(world.filter.belief(), &visited, burning as f64);
             world.filter.predict();
         }
         learner.learn().expect("finite");

@@ -1,11 +1,12 @@
 //! The step of agents that plan for one robot or several.
 
 use emberwatch_belief::Belief;
+use emberwatch_learning::beliefs::Conditions;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
-use emberwatch_learning::registry::{Task, agent};
-use emberwatch_learning::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
+use emberwatch_learning::rollout::building::agent;
+use emberwatch_learning::rollout::{Actor, Rollout, Seen};
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::path::fly;
@@ -48,16 +49,15 @@ fn seen(step: u64, flights: &[(Cell, &[Move])]) -> Seen {
 /// An agent at the start of a made-up world, with robots at these cells.
 fn robot(policy: &str, cells: &[Cell]) -> Rollout {
     let model = Model::wildfire();
-    let task = Task {
-        model: &model,
+    let conditions = Conditions {
+        model: Some(&model),
         shape: shape(),
-        n_moves: N_MOVES,
-        prior: &Belief::uniform(3, shape()),
-        seed: 7,
+        prior: Some(&Belief::uniform(3, shape())),
         learned: &Learned::default(),
     };
     let policy = Policy::named(policy, &model).expect("known");
-    let agent = agent(&policy, &AgentConfig::default(), task).expect("an agent");
+    let config = AgentConfig::default();
+    let agent = agent(&policy, &config, &conditions, N_MOVES, 7).expect("an agent");
     let flights: Vec<(Cell, &[Move])> = cells.iter().map(|&cell| (cell, &[][..])).collect();
     Rollout::begun(agent, seen(0, &flights)).expect("possible")
 }
@@ -72,22 +72,19 @@ const CELLS: [Cell; 3] = [
 fn paths_are_flown_by_robot_and_each_agent_sees_its_own() {
     let team = robot("beam_exploit", &CELLS[..2]);
     let single = robot("beam_exploit", &CELLS[2..]);
-    let mut agents = [team, single];
+    let mut agents = vec![team, single];
     for step in 1..5 {
         let cells: Vec<Vec<Cell>> = agents.iter().map(Rollout::cells).collect();
-        let plans = plan_all(&mut agents);
-        let planned: Vec<usize> = plans.iter().map(Vec::len).collect();
-        assert_eq!(planned, [2, 1]);
-        let paths = paths_of(&plans);
+        let paths = agents.plan();
         assert_eq!(paths.len(), 3);
         let flights = |agent: usize, first: usize| -> Vec<(Cell, &[Move])> {
             let own = cells[agent].iter().copied();
             own.zip(paths[first..].iter().map(|path| &**path)).collect()
         };
         let seen = vec![seen(step, &flights(0, 0)), seen(step, &flights(1, 2))];
-        see_all(&mut agents, seen).expect("possible");
+        agents.see(seen).expect("possible");
         assert!(agents.iter().all(|agent| agent.step() == step));
-        predict_all(&mut agents);
+        agents.predict();
         // No two paths of a team meet where there is room for both.
         let n_visited: u32 = agents[0].results().map(|it| it.n_visited).sum();
         assert_eq!(
@@ -103,7 +100,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         "beam_exploit",
         "shooting_exploit",
         "random_walk",
-        "known_exploit_ahead_3",
+        "known/options/exploit_ahead_3",
     ] {
         let mut alone = robot(policy, &CELLS[..1]);
         let mut team = robot(policy, &CELLS);

@@ -48,7 +48,7 @@ pub use model::{Network, Stock};
 pub use neural::{Lesson, NeuralBelief};
 pub use observation_matrix::ObservationMatrix;
 pub use pass::Pass;
-pub use replay::Replay;
+pub use replay::FrameReplay;
 pub use shape::NetworkShape;
 pub use sightings::Sightings;
 pub use tensors::NamedTensor;

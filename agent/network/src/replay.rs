@@ -9,7 +9,7 @@ use std::ops::Range;
 
 /// The last frames of one robot, oldest first, in tracks without gaps.
 #[derive(Debug, Clone)]
-pub struct Replay {
+pub struct FrameReplay {
     capacity: usize,
     frames: VecDeque<Frame>,
     /// Frames that were ever remembered.
@@ -18,7 +18,7 @@ pub struct Replay {
     begins: VecDeque<u64>,
 }
 
-impl Replay {
+impl FrameReplay {
     /// An empty memory of `capacity` frames. (The authors': 5,000.)
     pub fn new(capacity: usize) -> Self {
         Self {
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn windows_are_consecutive_and_reach_every_frame() {
-        let mut replay = Replay::new(8);
+        let mut replay = FrameReplay::new(8);
         for cell in 0..20 {
             assert!(cell > 2 || replay.window(4, 0, 0).is_none());
             let mut frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn no_window_spans_two_tracks() {
-        let mut replay = Replay::new(10);
+        let mut replay = FrameReplay::new(10);
         let frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
         replay.begin();
         for number in 0..30 {

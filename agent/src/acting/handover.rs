@@ -3,6 +3,7 @@
 
 use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
+use emberwatch_learning::beliefs::Input;
 use emberwatch_learning::rollout::{Rollout, Seen};
 use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
@@ -18,7 +19,7 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
         return Ok(true);
     }
     let step = rollout.step();
-    if !rollout.agent.policy().estimator.sees_frames() {
+    if rollout.agent.policy().belief.input != Input::Frames {
         return Ok(false);
     }
     let first = first_kept(client, number, step)?;
@@ -45,7 +46,7 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
 /// Brings an agent that missed steps to what its world shows now; its belief is then the posterior.
 pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
     let missed = rollout.step() + 1..seen.observation.world.step;
-    if rollout.agent.policy().estimator.sees_frames() {
+    if rollout.agent.policy().belief.input == Input::Frames {
         for past in missed {
             if !recall(client, number, rollout, past)? {
                 rollout.agent.predict(); // Nothing is known of what it saw, if anything.

@@ -1,13 +1,14 @@
 //! What an agent is told to do on one world of a running server, and whether that server can be acted on.
 
-use crate::client::errors::refused;
 use crate::client::info::connect;
 use anyhow::{Result, bail, ensure};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::Policy;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Claim;
+use emberwatch_protocol::connection::refused;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::model::{Description, ModelError};
@@ -125,8 +126,7 @@ impl Mission {
 pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
     let info = connect(instance)?.info().clone();
     if worlds.end > info.n_worlds {
-        let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
-        return Err(refused(status, detail, status.explain(detail)).into());
+        return Err(refused(Status::NoSuchWorld, info.n_worlds.into()).into());
     }
     Ok(info)
 }
@@ -138,6 +138,15 @@ pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     let model = description.map(Description::model_of).transpose()?;
     let radius = info.airspace.as_ref().map_or(0, |airspace| airspace.radius);
     model.map(|model| model.with_radius(radius)).transpose()
+}
+
+/// The words for a policy that filters with a model, on recorded worlds.
+pub fn needs_model(policy: &Policy) -> String {
+    format!(
+        "policy {:?} filters with a model, and recorded worlds have none: expected --model FILE, or a policy that \
+         needs none, such as coverage or learned_beam",
+        policy.name
+    )
 }
 
 pub(super) fn model_of(

@@ -1,28 +1,26 @@
 //! An agent that flies robots of one world through a connection: attach, step, catch up.
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
-use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
+use crate::acting::link::Link;
+use crate::acting::mission::{Company, Mission, info_of, model_of, needs_model, recorded_states};
 use crate::client::errors::is_late;
 use crate::client::info::{connect, is_belief_left};
-use crate::client::truth::TruthFeed;
 use crate::client::view::view;
 use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
-use emberwatch_learning::estimation::first_belief::first_belief;
-use emberwatch_learning::policy::{EstimatorKind, Policy};
-use emberwatch_learning::registry::{self, Task, needs_model};
-use emberwatch_learning::rollout::agent::Agent;
-use emberwatch_learning::rollout::{Rollout, Seen};
-use emberwatch_protocol::client::Observation;
+use emberwatch_learning::beliefs::first_belief::first_belief;
+use emberwatch_learning::beliefs::{Conditions, Input, WorldForm};
+use emberwatch_learning::policy::{Goal, Policy};
+use emberwatch_learning::rollout::agent::{Agent, handover_of};
+use emberwatch_learning::rollout::{self, Actor, Rollout, Seen, StepRecord, building};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{ServerInfo, WorldSeed};
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::message::WorldResult;
-use emberwatch_protocol::{Cell, Client, Grid, Model, Move};
+use emberwatch_protocol::{Cell, Client, Model, Move};
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 /// Time between two warnings of steps that went on without the agent.
@@ -30,20 +28,30 @@ const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
 /// An agent at its world.
 pub struct Pilot {
-    client: Client,
-    truth: Option<TruthFeed>,
-    /// Knows all robots that are planned for, those that others fly among them.
-    rollout: Rollout,
-    /// Time that its last plan took.
-    planning: Duration,
+    link: Link,
+    flyer: Flyer,
     model: Model,
     policy: Policy,
     /// The belief before an episode's first frame, once it was needed.
     prior: Option<Belief>,
-    /// The numbers of these.
-    seen: Range<u32>,
-    feed: Feed,
     warned: Option<Instant>,
+}
+
+/// The agent, and what its belief is shown on.
+struct Flyer {
+    /// Plans for its own robots, and for those of others in its team.
+    rollout: Rollout,
+    /// The numbers of all these robots on the server.
+    robots: Range<u32>,
+    /// The numbers of those that it flies itself.
+    own: Range<u32>,
+    /// Robots of each world.
+    team: u32,
+    /// Time that its last plan took.
+    planning: Duration,
+    feed: Feed,
+    /// Whether the next belief is shown in any case.
+    is_last: bool,
 }
 
 impl Pilot {
@@ -57,66 +65,44 @@ impl Pilot {
         let given = || model_of(&mission.instance, &info, mission.model.as_ref());
         let model = recorded.map_or_else(given, Ok)?;
         let policy = Policy::named(&mission.policy, &model)?;
-        ensure!(
-            !is_recorded || !policy.estimator.knows_model(),
-            needs_model(&policy)
-        );
-        ensure!(
-            policy.estimator != EstimatorKind::NextTruth,
-            "policy {:?} needs worlds that run one step ahead: only `compare` has them",
-            policy.name
-        );
-        ensure!(
-            !policy.is_decided() || mission.company != Company::Team,
-            "policy {:?} decides for one robot, not for a team",
-            policy.name
-        );
-        if policy.estimator == EstimatorKind::Truth {
-            check_truth(mission, &info)?;
-        }
-        let any = Belief::from_initial(&model, info.shape()?);
-        let task = Task {
-            model: &model,
-            shape: any.shape(),
-            n_moves: 1,
-            prior: &any,
-            seed: 0,
-            learned: &mission.learned,
-        };
-        // Made first: an agent that lacks something must not take robots from one that flies them.
-        let agent = registry::agent(&policy, &mission.config, task)?;
+        // An agent that lacks something must not take robots from one that flies them.
+        check(mission, &info, (&model, &policy), is_recorded)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
-        if let Some(kind) = agent
-            .handover_kind()
-            .filter(|_| policy.estimator.knows_model())
-            && is_belief_left(&mission.instance, numbers.start, &kind)?
-            && let Some(attached) = Self::go_on(mission, &numbers, &model, &policy, &any)?
+        if let Some(of_belief) = policy.belief.handover
+            && is_belief_left(
+                &mission.instance,
+                numbers.start,
+                &handover_of(&of_belief(&model)),
+            )?
+            && let Some(attached) = Self::go_on(mission, &info, &numbers, (&model, &policy))?
         {
             return Ok(attached);
         }
         let prior = prior(mission, &info, &model, &policy)?;
-        let mut attached = Self::acquire(mission, &numbers, &model, &policy, &prior)?;
+        let mut attached = Self::acquire(mission, &numbers, (&model, &policy, &prior))?;
         attached.prior = Some(prior);
-        if !resume(&mut attached.client, numbers.start, &mut attached.rollout)? {
+        let (client, rollout) = (&mut attached.link.client, &mut attached.flyer.rollout);
+        if !resume(client, numbers.start, rollout)? {
             attached.begin()?;
         }
         Ok(attached)
     }
 
-    /// Acquires the robots and takes over the belief that was left for the first, in the place of `any`.
+    /// Acquires the robots and takes over the belief that was left for the first.
     fn go_on(
         mission: &Mission,
+        info: &ServerInfo,
         numbers: &Range<u32>,
-        model: &Model,
-        policy: &Policy,
-        any: &Belief,
+        (model, policy): (&Model, &Policy),
     ) -> Result<Option<Self>> {
-        let mut attached = Self::acquire(mission, numbers, model, policy, any)?;
-        if take_over_left(&mut attached.client, numbers.start, &mut attached.rollout)? {
+        let any = Belief::from_initial(model, info.shape()?);
+        let mut attached = Self::acquire(mission, numbers, (model, policy, &any))?;
+        let (client, rollout) = (&mut attached.link.client, &mut attached.flyer.rollout);
+        if take_over_left(client, numbers.start, rollout)? {
             return Ok(Some(attached));
         }
         // Another agent acted since.
-        attached.client.release()?;
+        attached.link.client.release()?;
         Ok(None)
     }
 
@@ -124,22 +110,19 @@ impl Pilot {
     fn acquire(
         mission: &Mission,
         numbers: &Range<u32>,
-        model: &Model,
-        policy: &Policy,
-        prior: &Belief,
+        parts @ (model, policy, _): (&Model, &Policy, &Belief),
     ) -> Result<Self> {
         let connection = connect(&mission.instance)?;
         let mut client = Client::acquire(connection, &mission.claim(numbers))?;
         client.share_frames(mission.company != Company::Alone);
         let team = client.info().n_robots;
-        let (robots, first) = match mission.company {
-            Company::Team => (mission.world * team..(mission.world + 1) * team, 0),
-            _ => (numbers.clone(), mission.robots.start),
+        let robots = match mission.company {
+            Company::Team => mission.world * team..(mission.world + 1) * team,
+            _ => numbers.clone(),
         };
-        let is_told = policy.estimator == EstimatorKind::Truth;
-        let truth = is_told.then(|| open_truth(mission, &client)).transpose()?;
-        let mut seen = Seen::new(client.observe(robots.clone())?);
-        seen.truth = truth_of(truth.as_ref(), &client, &seen.observation.world)?;
+        let is_told = policy.belief.input == Input::States;
+        let mut link = Link::new(client, &mission.instance, robots.clone(), is_told)?;
+        let seen = link.observe()?;
         let (seed, step) = (seen.observation.world.seed, seen.observation.world.step);
         tracing::info!(
             world = mission.world,
@@ -149,43 +132,47 @@ impl Pilot {
             policy = policy.name,
             "acting"
         );
-        let parts = (model, policy, prior);
-        let agent = agent(mission, &client, parts, (seed, first))?;
-        Ok(Self {
-            truth,
+        let agent = agent(mission, &link.client, parts, (seed, robots.start % team))?;
+        let flyer = Flyer {
             feed: Feed::open(&mission.instance, agent.belief().probabilities()),
             rollout: Rollout::new(agent, seen),
+            robots,
+            own: link.client.robots(),
+            team,
             planning: Duration::ZERO,
+            is_last: false,
+        };
+        Ok(Self {
+            link,
+            flyer,
             model: model.clone(),
             policy: policy.clone(),
             prior: None,
-            seen: robots,
-            client,
             warned: None,
         })
     }
 
     fn begin(&mut self) -> Result<()> {
-        self.rollout.correct()?;
-        self.show(false);
-        self.rollout.agent.predict();
+        self.flyer.rollout.correct()?;
+        self.flyer.show();
+        self.flyer.rollout.agent.predict();
         Ok(())
     }
 
     fn begin_next(&mut self, mission: &Mission) -> Result<()> {
         let prior = match self.prior.take() {
             Some(prior) => prior,
-            None => prior(mission, self.client.info(), &self.model, &self.policy)?,
+            None => prior(mission, self.link.client.info(), &self.model, &self.policy)?,
         };
         let (world, seed) = (mission.world, None);
-        self.client.reset(&[WorldSeed { world, seed }])?;
-        let seen = self.observe()?;
+        self.link.client.reset(&[WorldSeed { world, seed }])?;
+        let seen = self.link.observe()?;
         let seed = seen.observation.world.seed;
         tracing::info!(world, seed, "the episode was truncated: the next begins");
-        let first = self.seen.start % self.client.info().n_robots;
+        let first = self.flyer.robots.start % self.flyer.team;
         let parts = (&self.model, &self.policy, &prior);
-        let agent = agent(mission, &self.client, parts, (seed, first))?;
-        self.rollout = Rollout::new(agent, seen);
+        let agent = agent(mission, &self.link.client, parts, (seed, first))?;
+        self.flyer.rollout = Rollout::new(agent, seen);
         self.prior = Some(prior);
         self.begin()
     }
@@ -199,24 +186,49 @@ impl Pilot {
         is_last: bool,
         stop: &AtomicBool,
     ) -> Result<Option<f64>> {
-        if self.rollout.observation().world.truncated != 0 {
+        if self.flyer.rollout.observation().world.truncated != 0 {
             self.begin_next(mission)?;
         }
-        let paths = self.plan();
-        let seen = match self.fly(&paths, stop) {
-            Ok(Some(seen)) => seen,
-            Ok(None) => return Ok(None),
-            Err(error) if is_late(&error) => return self.catch_up().map(|()| None),
-            Err(error) => return Err(error),
-        };
-        self.rollout.see(seen)?;
-        self.show(is_last);
-        self.rollout.agent.predict();
-        let own = self.rollout.results().skip(self.own().start);
-        let rewards = own.take(self.own().len()).map(|result| result.reward);
-        Ok(Some(rewards.sum()))
+        self.flyer.is_last = is_last;
+        match rollout::step(&mut self.flyer, &mut self.link.until(stop)) {
+            Ok(flown) => Ok(flown.map(|_| self.flyer.reward())),
+            Err(error) if is_late(&error) => self.catch_up().map(|()| None),
+            Err(error) => Err(error),
+        }
     }
 
+    /// Leaves the belief to the next agent of each robot.
+    pub fn leave(&mut self) -> Result<(), ConnectionError> {
+        let mut numbers = self.flyer.own.clone();
+        numbers.try_for_each(|number| leave(&mut self.link.client, number, &self.flyer.rollout))
+    }
+
+    /// Gives the robots back, and ends when observers have had time to see the last belief.
+    pub fn release(self) -> Result<(), ConnectionError> {
+        let released = self.link.client.release();
+        self.flyer.feed.end();
+        released
+    }
+
+    /// Takes in what the world did meanwhile.
+    fn catch_up(&mut self) -> Result<()> {
+        let before = self.flyer.rollout.step();
+        let seen = self.link.observe()?;
+        let step = seen.observation.world.step;
+        if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
+            self.warned = Some(Instant::now());
+            tracing::warn!("late: the world went on from step {before} to {step}; catching up");
+        }
+        let (client, rollout) = (&mut self.link.client, &mut self.flyer.rollout);
+        catch_up(client, self.flyer.robots.start, rollout, seen)?;
+        self.flyer.is_last = false;
+        self.flyer.show();
+        self.flyer.rollout.agent.predict();
+        Ok(())
+    }
+}
+
+impl Actor for Flyer {
     /// Plans for its own robots and for those of others that flew; returns the paths of its own.
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
@@ -226,99 +238,93 @@ impl Pilot {
         let step = self.rollout.step();
         let plans = self.rollout.agent.plan(&cells, step);
         self.planning = start.elapsed();
-        let own = self.own();
+        let own = self.own_indices();
         let n_before = is_planned[..own.start].iter().filter(|it| **it).count();
         let own = plans.into_iter().skip(n_before).take(own.len());
         own.map(|plan| plan.moves).collect()
     }
 
-    /// Flies the paths; returns what the agent sees then, or `None` if it is time to stop.
-    fn fly(&mut self, paths: &[Vec<Move>], stop: &AtomicBool) -> Result<Option<Seen>> {
-        let is_over = || stop.load(Ordering::Relaxed);
-        let answer = self
-            .client
-            .step_until(self.client.robots(), paths, &is_over)?;
-        let Some(mut observations) = answer else {
-            return Ok(None);
-        };
-        if self.seen.len() > observations.len() {
-            let step = observations[0].world.step;
-            observations = self.client.recall(self.seen.clone(), step)?;
-        }
-        self.with_truth(observations).map(Some)
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        let seen = seen.into_iter().map(|seen| self.rollout.see(seen));
+        let records = seen.collect::<Result<_>>()?;
+        self.show();
+        Ok(records)
     }
 
-    /// What the world shows now.
-    fn observe(&mut self) -> Result<Seen> {
-        let observations = self.client.observe(self.seen.clone())?;
-        self.with_truth(observations)
+    fn predict(&mut self) {
+        self.rollout.agent.predict();
     }
+}
 
-    fn with_truth(&self, observations: Vec<Observation>) -> Result<Seen> {
-        let mut seen = Seen::new(observations);
-        seen.truth = truth_of(self.truth.as_ref(), &self.client, &seen.observation.world)?;
-        Ok(seen)
-    }
-
+impl Flyer {
     /// Shows the posterior to observers, if it is time or in any case.
-    fn show(&mut self, in_any_case: bool) {
-        if self.feed.is_due() || in_any_case {
-            let (robots, team) = (self.client.robots(), self.client.info().n_robots);
-            let world = robots.start / team;
-            let view = view(&self.rollout, world, robots, self.planning);
+    fn show(&mut self) {
+        if self.feed.is_due() || self.is_last {
+            let world = self.own.start / self.team;
+            let view = view(&self.rollout, world, self.own.clone(), self.planning);
             self.feed.show(&view);
         }
     }
 
-    /// Leaves the belief to the next agent of each robot.
-    pub fn leave(&mut self) -> Result<(), ConnectionError> {
-        let mut numbers = self.client.robots();
-        numbers.try_for_each(|number| leave(&mut self.client, number, &self.rollout))
+    /// What the last step gave its own robots.
+    fn reward(&self) -> f64 {
+        let own = self.own_indices();
+        let results = self.rollout.results().skip(own.start).take(own.len());
+        results.map(|result| result.reward).sum()
     }
 
-    /// Gives the robots back, and ends when observers have had time to see the last belief.
-    pub fn release(self) -> Result<(), ConnectionError> {
-        let released = self.client.release();
-        self.feed.end();
-        released
+    /// Which of the robots that it plans for are its own.
+    fn own_indices(&self) -> Range<usize> {
+        let index = |number: u32| (number - self.robots.start) as usize;
+        index(self.own.start)..index(self.own.end)
     }
 
-    /// Takes in what the world did meanwhile.
-    fn catch_up(&mut self) -> Result<()> {
-        let before = self.rollout.step();
-        let seen = self.observe()?;
-        let step = seen.observation.world.step;
-        if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
-            self.warned = Some(Instant::now());
-            tracing::warn!("late: the world went on from step {before} to {step}; catching up");
-        }
-        let number = self.seen.start;
-        catch_up(&mut self.client, number, &mut self.rollout, seen)?;
-        self.show(false);
-        self.rollout.agent.predict();
-        Ok(())
-    }
-
-    /// Which of the robots that it knows are its own.
-    fn own(&self) -> Range<usize> {
-        let own = self.client.robots();
-        let index = |number: u32| (number - self.seen.start) as usize;
-        index(own.start)..index(own.end)
-    }
-
-    /// For which of the robots that it knows it plans: its own, and those of others that flew.
+    /// For which of its robots it plans now: its own, and those of others that flew.
     fn is_planned(&self) -> Vec<bool> {
-        let (own, team) = (self.own(), self.client.info().n_robots);
+        let (own, team) = (self.own_indices(), self.team);
         let hovered = self.rollout.observation().world.hovered;
         let is_planned = |(index, number): (usize, u32)| {
             own.contains(&index) || hovered >> (number % team) & 1 == 0
         };
-        self.seen.clone().enumerate().map(is_planned).collect()
+        self.robots.clone().enumerate().map(is_planned).collect()
     }
 }
 
+/// Refuses a policy that cannot act on a server's world.
+fn check(
+    mission: &Mission,
+    info: &ServerInfo,
+    (model, policy): (&Model, &Policy),
+    is_recorded: bool,
+) -> Result<()> {
+    ensure!(
+        !is_recorded || !policy.belief.knows_model,
+        needs_model(policy)
+    );
+    ensure!(
+        policy.belief.input != Input::NextStates,
+        "policy {:?} needs worlds that run one step ahead: only `compare` has them",
+        policy.name
+    );
+    ensure!(
+        policy.goal != Goal::Learned || mission.company != Company::Team,
+        "policy {:?} decides for one robot, not for a team",
+        policy.name
+    );
+    ensure!(
+        policy.belief.input != Input::States || info.publish_truth,
+        "policy {:?} needs the truth channel: start the server with --publish-truth",
+        mission.policy
+    );
+    building::check(
+        policy,
+        &mission.learned,
+        &WorldForm::of(model, info.shape()?),
+    )
+}
+
 fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -> Result<Belief> {
-    let prior = if policy.estimator.knows_model() {
+    let prior = if policy.belief.knows_model {
         mission.config.prior(info.burn_in)
     } else {
         Prior::Initial
@@ -339,41 +345,12 @@ fn agent(
     (seed, first): (u64, u32),
 ) -> Result<Agent> {
     let config = &mission.config;
-    let task = Task {
-        model,
+    let conditions = Conditions {
+        model: Some(model),
         shape: client.shape(),
-        n_moves: client.info().n_moves,
-        prior,
-        seed: robot_seed(config.planner_seed(seed), first as usize),
+        prior: Some(prior),
         learned: &mission.learned,
     };
-    registry::agent(policy, config, task)
-}
-
-/// The hidden states that a world's robots see part of, for policies that are told them.
-fn truth_of(
-    feed: Option<&TruthFeed>,
-    client: &Client,
-    world: &WorldResult,
-) -> Result<Option<Grid<u8>>> {
-    let Some(feed) = feed else {
-        return Ok(None);
-    };
-    let worlds = client.worlds_of(&client.robots());
-    let states = feed.states(worlds, &[world.seed], world.step)?;
-    Ok(states.into_iter().next())
-}
-
-fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {
-    check_truth(mission, client.info())?;
-    TruthFeed::open(&mission.instance, client.shape())
-}
-
-fn check_truth(mission: &Mission, info: &ServerInfo) -> Result<()> {
-    ensure!(
-        info.publish_truth,
-        "policy {:?} needs the truth channel: start the server with --publish-truth",
-        mission.policy
-    );
-    Ok(())
+    let seed = robot_seed(config.planner_seed(seed), first as usize);
+    building::agent(policy, config, &conditions, client.info().n_moves, seed)
 }

@@ -4,19 +4,19 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
-use crate::acting::mission::recorded_states;
+use crate::acting::mission::{needs_model, recorded_states};
 use crate::benchmark::team::Team;
 use crate::client::info::connect;
 use crate::client::truth::TruthFeed;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_learning::beliefs::Conditions;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
-use emberwatch_learning::registry::{self, Task, needs_model};
-use emberwatch_learning::rollout::Seen;
 use emberwatch_learning::rollout::agent::Agent;
+use emberwatch_learning::rollout::{Environment, Seen, building};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::control::{CoverageRule, ServerInfo, WorldSeed};
@@ -156,12 +156,13 @@ impl Arena {
         Ok(self.seen(observations, &truth))
     }
 
-    /// Flies a path with each robot of the main worlds; returns what their agents see at `step`, world by world.
-    pub fn step(&mut self, seeds: &[u64], paths: &[Vec<Move>], step: u64) -> Result<Vec<Seen>> {
-        let worlds = self.range(&self.main, seeds);
-        let observations = self.client.step(self.robots(&worlds), paths)?;
-        let truth = self.states(worlds, seeds, step)?;
-        Ok(self.seen(observations, &truth))
+    /// The main worlds of these seeds, as an environment whose next step is `step`.
+    pub fn batch<'a>(&'a mut self, seeds: &'a [u64], step: u64) -> Batch<'a> {
+        Batch {
+            arena: self,
+            seeds,
+            step,
+        }
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
@@ -211,19 +212,24 @@ impl Arena {
         (seed, number): (u64, usize),
         learned: &Learned,
     ) -> Result<Agent> {
-        ensure!(
-            !(self.is_recorded() && policy.estimator.knows_model()),
-            needs_model(policy)
-        );
-        let task = Task {
-            model: &self.model,
+        self.check_model(policy)?;
+        let conditions = Conditions {
+            model: Some(&self.model),
             shape: self.shape(),
-            n_moves: self.info().n_moves,
-            prior,
-            seed: robot_seed(config.planner_seed(seed), number),
+            prior: Some(prior),
             learned,
         };
-        registry::agent(policy, config, task)
+        let seed = robot_seed(config.planner_seed(seed), number);
+        building::agent(policy, config, &conditions, self.info().n_moves, seed)
+    }
+
+    /// Refuses a policy that filters with a model on worlds that have none.
+    pub fn check_model(&self, policy: &Policy) -> Result<()> {
+        ensure!(
+            !(self.is_recorded() && policy.belief.knows_model),
+            needs_model(policy)
+        );
+        Ok(())
     }
 
     /// The hidden states of worlds at a step, where they are published.
@@ -261,5 +267,22 @@ impl Arena {
             ..Seen::new(observations.by_ref().take(self.crew))
         });
         seen.collect()
+    }
+}
+
+/// Main worlds of an arena. Its agents see what they show world by world.
+pub struct Batch<'a> {
+    arena: &'a mut Arena,
+    seeds: &'a [u64],
+    step: u64,
+}
+
+impl Environment for Batch<'_> {
+    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
+        let arena = &mut *self.arena;
+        let worlds = arena.range(&arena.main, self.seeds);
+        let observations = arena.client.step(arena.robots(&worlds), paths)?;
+        let truth = arena.states(worlds, self.seeds, self.step)?;
+        Ok(Some(arena.seen(observations, &truth)))
     }
 }

@@ -10,17 +10,20 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
+use emberwatch_learning::beliefs::first_belief::first_belief;
+use emberwatch_learning::beliefs::{Input, WorldForm};
 use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::estimation::first_belief::first_belief;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::{EstimatorKind, Policy};
+use emberwatch_learning::policy::{Goal, Policy};
 use emberwatch_learning::rollout::agent::Agent;
-use emberwatch_learning::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all};
-use emberwatch_protocol::Model;
+use emberwatch_learning::rollout::{
+    self, Actor, Rollout, Seen, StepRecord, building, in_parallel, predict_all, see_all,
+};
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::path::Flight;
+use emberwatch_protocol::{Grid, Model, Move};
 use sha2::{Digest, Sha256};
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -60,13 +63,8 @@ struct Contestant {
     team: Team,
 }
 
-struct Runs {
-    /// The agents of each world, world by world.
-    rollouts: Vec<Rollout>,
-    worlds: Vec<World>,
-}
-
-struct World {
+/// What is measured of one world.
+struct WorldRun {
     seed: u64,
     tally: Tally,
     /// This step's, until all robots have flown.
@@ -182,7 +180,7 @@ impl Comparison {
 }
 
 impl Results {
-    fn add_fire(&mut self, share: f32, worlds: &[World]) {
+    fn add_fire(&mut self, share: f32, worlds: &[WorldRun]) {
         for cells in worlds.iter().map(|world| &world.tally.fire_cells) {
             self.fire_cells.resize(cells.len(), 0.0);
             let both = self.fire_cells.iter_mut().zip(cells);
@@ -204,19 +202,18 @@ impl Match<'_> {
     fn check(&self, arena: &Arena) -> Result<()> {
         let Contestant { policy, team } = self.contestant;
         ensure!(
-            !(policy.is_decided() && team.is_joint() && arena.n_robots() > 1),
+            !(policy.goal == Goal::Learned && team.is_joint() && arena.n_robots() > 1),
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
         );
-        let is_told = matches!(
-            policy.estimator,
-            EstimatorKind::Truth | EstimatorKind::NextTruth
-        );
+        let is_told = matches!(policy.belief.input, Input::States | Input::NextStates);
         ensure!(
             arena.shows_truth() || !is_told,
             "it needs the truth channel: start the server with --publish-truth"
         );
-        self.agent(arena, (self.seeds[0], 0)).map(drop)
+        arena.check_model(policy)?;
+        let world = WorldForm::of(arena.model(), arena.shape());
+        building::check(policy, &self.comparison.learned, &world)
     }
 
     fn play(
@@ -224,80 +221,44 @@ impl Match<'_> {
         arena: &mut Arena,
         feed: &mut Feed,
         progress: &dyn Fn(&str, u64),
-    ) -> Result<Vec<World>> {
+    ) -> Result<Vec<WorldRun>> {
         arena.fly_as(self.contestant.team);
-        let mut runs = self.start(arena)?;
-        for step in 0..self.comparison.steps {
-            self.step(arena, feed, &mut runs, step)?;
-            progress(&self.contestant.policy.name, runs.worlds.len() as u64);
+        let mut players = self.start(arena, feed)?;
+        for step in 1..=self.comparison.steps {
+            if self.contestant.policy.belief.input == Input::NextStates {
+                players.foresee(&arena.foresee(self.seeds, step)?)?;
+            }
+            players.is_last = step == self.comparison.steps;
+            rollout::step(&mut players, &mut arena.batch(self.seeds, step))?;
+            progress(&self.contestant.policy.name, players.worlds.len() as u64);
         }
-        Ok(runs.worlds)
+        Ok(players.worlds)
     }
 
-    fn start(&self, arena: &mut Arena) -> Result<Runs> {
+    fn start<'a>(&self, arena: &mut Arena, feed: &'a mut Feed) -> Result<Players<'a>> {
         let n_agents = arena.n_agents();
         let agents = self.seeds.iter();
         let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
         let seen = arena.reset(self.seeds)?;
         let rollout = |(agent, seen)| Rollout::begun(self.agent(arena, agent)?, seen);
         let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
-        let world = |&seed: &u64| World {
+        let world = |&seed: &u64| WorldRun {
             seed,
             tally: Tally::default(),
             flights: Vec::new(),
             merit: MeritTally::new(arena.shape(), target as u8, recent_steps),
             snapshot: None,
         };
-        Ok(Runs {
+        Ok(Players {
             rollouts: agents.zip(seen).map(rollout).collect::<Result<_>>()?,
             worlds: self.seeds.iter().map(world).collect(),
+            plans: Vec::new(),
+            target,
+            first_world: arena.worlds().start,
+            n_robots: arena.n_robots(),
+            is_last: false,
+            feed,
         })
-    }
-
-    fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut Runs, step: u64) -> Result<()> {
-        let Runs { rollouts, worlds } = runs;
-        let n_agents = arena.n_agents();
-        if self.contestant.policy.estimator == EstimatorKind::NextTruth {
-            let next = arena.foresee(self.seeds, step + 1)?;
-            for (rollouts, next) in rollouts.chunks_mut(n_agents).zip(&next) {
-                for rollout in rollouts {
-                    rollout.agent.foresee(next)?;
-                }
-            }
-        }
-        let plans = in_parallel(&mut *rollouts, timed_plan);
-        let (plans, times): (Vec<_>, Vec<_>) = plans.into_iter().unzip();
-        let seen = arena.step(self.seeds, &paths_of(&plans), step + 1)?;
-        let turns = see_all(&mut *rollouts, seen)?;
-        let is_last = step + 1 == self.comparison.steps;
-        let target = arena.model().target_state();
-        for (index, turn) in turns.into_iter().enumerate() {
-            let (world, rollout) = (&mut worlds[index / n_agents], &rollouts[index]);
-            let plans = &plans[index];
-            world.tally.planning += times[index];
-            world.fly(rollout, plans, arena.n_robots());
-            if index % n_agents == 0 {
-                world.look(rollout, target, turn.score);
-                if is_last {
-                    world.snapshot = world.snapshot(rollout, turn, plans);
-                }
-            }
-        }
-        self.show(arena, feed, rollouts, &times);
-        predict_all(rollouts);
-        Ok(())
-    }
-
-    /// Shows the posteriors of the worlds whose turn it is.
-    fn show(&self, arena: &Arena, feed: &mut Feed, rollouts: &[Rollout], times: &[Duration]) {
-        let (n_agents, n_robots) = (arena.n_agents(), arena.n_robots() as u32);
-        let (first_world, crew) = (arena.worlds().start, n_robots / n_agents as u32);
-        for index in feed.turn(rollouts.len()) {
-            let world = first_world + (index / n_agents) as u32;
-            let robot = first_world * n_robots + index as u32 * crew;
-            let view = view(&rollouts[index], world, robot..robot + crew, times[index]);
-            feed.show(&view);
-        }
     }
 
     fn agent(&self, arena: &Arena, agent: (u64, usize)) -> Result<Agent> {
@@ -308,9 +269,91 @@ impl Match<'_> {
     }
 }
 
-impl World {
-    /// Takes in what an agent's robots flew; with those of the last agent the step is complete.
-    fn fly(&mut self, rollout: &Rollout, plans: &[Plan], n_robots: usize) {
+/// The agents of a batch of worlds, and what is measured of each world.
+struct Players<'a> {
+    /// World by world.
+    rollouts: Vec<Rollout>,
+    worlds: Vec<WorldRun>,
+    /// The last plans of each agent, and the time that they took.
+    plans: Vec<(Vec<Plan>, Duration)>,
+    /// The state that pays most.
+    target: usize,
+    first_world: u32,
+    /// Robots of each world.
+    n_robots: usize,
+    is_last: bool,
+    feed: &'a mut Feed,
+}
+
+impl Actor for Players<'_> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        self.plans = in_parallel(&mut self.rollouts, timed_plan);
+        let plans = self.plans.iter().flat_map(|(plans, _)| plans);
+        plans.map(|plan| plan.moves.clone()).collect()
+    }
+
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.rollouts, seen)?;
+        self.measure(&records);
+        self.show();
+        Ok(records)
+    }
+
+    fn predict(&mut self) {
+        predict_all(&mut self.rollouts);
+    }
+}
+
+impl Players<'_> {
+    /// Agents of each world.
+    fn n_agents(&self) -> usize {
+        self.rollouts.len() / self.worlds.len()
+    }
+
+    /// Tells clairvoyants the states that their next paths will meet, world by world.
+    fn foresee(&mut self, next: &[Grid<u8>]) -> Result<()> {
+        let n_agents = self.n_agents();
+        for (rollouts, next) in self.rollouts.chunks_mut(n_agents).zip(next) {
+            for rollout in rollouts {
+                rollout.agent.foresee(next)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn measure(&mut self, records: &[StepRecord]) {
+        let n_agents = self.n_agents();
+        for (index, record) in records.iter().enumerate() {
+            let (world, rollout) = (&mut self.worlds[index / n_agents], &self.rollouts[index]);
+            let (plans, time) = &self.plans[index];
+            world.tally.planning += *time;
+            world.count(rollout, plans, self.n_robots);
+            if index % n_agents == 0 {
+                world.score(rollout, self.target, record.score);
+                if self.is_last {
+                    world.snapshot = world.snapshot(rollout, record, plans);
+                }
+            }
+        }
+    }
+
+    /// Shows the posteriors of the worlds whose turn it is.
+    fn show(&mut self) {
+        let (n_agents, n_robots) = (self.n_agents(), self.n_robots as u32);
+        let crew = n_robots / n_agents as u32;
+        for index in self.feed.due(self.rollouts.len()) {
+            let world = self.first_world + (index / n_agents) as u32;
+            let robot = self.first_world * n_robots + index as u32 * crew;
+            let (rollout, (_, time)) = (&self.rollouts[index], &self.plans[index]);
+            let view = view(rollout, world, robot..robot + crew, *time);
+            self.feed.show(&view);
+        }
+    }
+}
+
+impl WorldRun {
+    /// Counts what an agent's robots visited; with those of the last agent the step is complete.
+    fn count(&mut self, rollout: &Rollout, plans: &[Plan], n_robots: usize) {
         let airspace = rollout.agent.airspace();
         let flown = rollout.results().zip(plans);
         let flown = flown.map(|(result, plan)| airspace.fly(result.start(), &plan.moves));
@@ -328,8 +371,8 @@ impl World {
         }
     }
 
-    /// Takes in the posterior of the world's first agent.
-    fn look(&mut self, rollout: &Rollout, target: usize, score: Option<Score>) {
+    /// Scores the posterior of the world's first agent.
+    fn score(&mut self, rollout: &Rollout, target: usize, score: Option<Score>) {
         let agent = &rollout.agent;
         let brier = rollout
             .truth()
@@ -338,10 +381,10 @@ impl World {
         self.tally.score += score.unwrap_or_default();
     }
 
-    fn snapshot(&self, rollout: &Rollout, turn: Turn, plans: &[Plan]) -> Option<Snapshot> {
+    fn snapshot(&self, rollout: &Rollout, record: &StepRecord, plans: &[Plan]) -> Option<Snapshot> {
         let (agent, observation) = (&rollout.agent, rollout.observation());
-        let (airspace, start) = (agent.airspace(), turn.before.robot.cell());
-        let estimator = agent.policy().estimator;
+        let (airspace, start) = (agent.airspace(), record.before.robot.cell());
+        let belief = agent.policy().belief;
         let moves = &plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| airspace.fly(start, &moves[..n]).end));
@@ -351,8 +394,8 @@ impl World {
             truth: rollout.truth()?.clone(),
             frame: observation.frame.clone(),
             path_cells,
-            belief: estimator.sees_frames().then(|| agent.belief().clone()),
-            learned_target: estimator.is_learned().then(|| agent.target()),
+            belief: (belief.input == Input::Frames).then(|| agent.belief().clone()),
+            learned_target: belief.learned_by.is_some().then(|| agent.target()),
         })
     }
 }
@@ -364,17 +407,17 @@ fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
 }
 
 impl Contestant {
-    fn policy_run(&self, world: World, info: &ServerInfo, fingerprint: &str) -> PolicyRun {
+    fn policy_run(&self, world: WorldRun, info: &ServerInfo, fingerprint: &str) -> PolicyRun {
         let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
         let steps = tally.rewards.len() as u64;
         let brier = tally.brier;
-        let brier = brier.filter(|_| policy.estimator != EstimatorKind::None);
+        let brier = brier.filter(|_| policy.belief.input != Input::Nothing);
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         let n_repeated = tally.n_visited_each - tally.n_visited;
         PolicyRun {
             policy: policy.name.clone(),
-            estimator: policy.estimator.label(),
+            estimator: policy.belief.label.into(),
             world_seed: world.seed,
             steps,
             mean_reward: mean(tally.reward),

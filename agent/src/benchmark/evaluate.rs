@@ -7,12 +7,13 @@ use crate::benchmark::arena::Arena;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::scoring::Score;
+use emberwatch_learning::beliefs::first_belief::first_belief;
 use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::estimation::first_belief::first_belief;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::agent::Agent;
-use emberwatch_learning::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
+use emberwatch_learning::rollout::{self, Rollout, Seen};
+use emberwatch_protocol::Frame;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -43,16 +44,21 @@ pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Sc
     let seeds: Vec<u64> = evaluation.seeds.clone().collect();
     let mut scores = Vec::new();
     for batch in seeds.chunks(arena.batch_size()) {
-        let worlds = batch.iter().zip(arena.reset(batch)?);
-        let candidates =
-            |(&seed, seen): (&u64, Seen)| Candidates::new(arena, evaluation, &prior, seed, seen);
-        let mut worlds: Vec<Candidates> = worlds.map(candidates).collect::<Result<_, _>>()?;
+        let (mut guides, mut worlds) = (Vec::new(), Vec::new());
+        let seen = arena.reset(batch)?;
+        for (&seed, seen) in batch.iter().zip(seen) {
+            let (guide, candidates) = candidates(arena, evaluation, &prior, seed, seen)?;
+            guides.push(guide);
+            worlds.push(candidates);
+        }
         for step in 1..=evaluation.steps {
-            let plans = plan_all(guides(&mut worlds));
-            let seen = arena.step(batch, &paths_of(&plans), step)?;
-            see_all(guides(&mut worlds), seen)?;
-            predict_all(guides(&mut worlds));
-            worlds.par_iter_mut().try_for_each(Candidates::look)?;
+            rollout::step(&mut guides, &mut arena.batch(batch, step))?;
+            let frames = guides
+                .iter()
+                .map(|guide: &Rollout| &guide.observation().frame);
+            let frames: Vec<&Frame> = frames.collect();
+            let both = worlds.par_iter_mut().zip(frames);
+            both.try_for_each(|(candidates, frame)| candidates.look(frame))?;
         }
         scores.extend(worlds.into_iter().map(|candidates| candidates.scores));
     }
@@ -75,46 +81,40 @@ pub fn score_of_frequencies(all: &[Scores], counts: &[u64], n_matrices: usize) -
     score
 }
 
-/// Estimators on one world, and who chooses the paths.
+/// Estimators on one world.
 struct Candidates {
-    guide: Rollout,
     estimators: Vec<Agent>,
     scores: Scores,
 }
 
-fn guides(worlds: &mut [Candidates]) -> impl Iterator<Item = &mut Rollout> {
-    worlds.iter_mut().map(|candidates| &mut candidates.guide)
+/// Who chooses the paths on a world, and the estimators there.
+fn candidates(
+    arena: &Arena,
+    evaluation: &Evaluation<'_>,
+    prior: &Belief,
+    seed: u64,
+    seen: Seen,
+) -> Result<(Rollout, Candidates)> {
+    let model = arena.model();
+    let (config, learned) = (evaluation.config, evaluation.learned);
+    let agent = |policy: &Policy| arena.agent(policy, config, prior, (seed, 0), learned);
+    let guide = Rollout::begun(agent(&Policy::named(evaluation.guide, model)?)?, seen)?;
+    let estimators = evaluation.policies.iter().map(agent);
+    let mut candidates = Candidates {
+        estimators: estimators.collect::<Result<_, _>>()?,
+        scores: Scores {
+            seed,
+            scores: vec![Score::default(); evaluation.policies.len()],
+            counts: vec![0; model.n_observations()],
+        },
+    };
+    candidates.filter(&guide.observation().frame)?;
+    Ok((guide, candidates))
 }
 
 impl Candidates {
-    fn new(
-        arena: &Arena,
-        evaluation: &Evaluation<'_>,
-        prior: &Belief,
-        seed: u64,
-        seen: Seen,
-    ) -> Result<Self> {
-        let model = arena.model();
-        let (config, learned) = (evaluation.config, evaluation.learned);
-        let agent = |policy: &Policy| arena.agent(policy, config, prior, (seed, 0), learned);
-        let guide = Policy::named(evaluation.guide, model)?;
-        let estimators = evaluation.policies.iter().map(agent);
-        let mut candidates = Self {
-            guide: Rollout::begun(agent(&guide)?, seen)?,
-            estimators: estimators.collect::<Result<_, _>>()?,
-            scores: Scores {
-                seed,
-                scores: vec![Score::default(); evaluation.policies.len()],
-                counts: vec![0; model.n_observations()],
-            },
-        };
-        candidates.filter()?;
-        Ok(candidates)
-    }
-
-    /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
-    fn look(&mut self) -> Result<()> {
-        let frame = &self.guide.observation().frame;
+    /// Scores each estimator's prediction of a frame, then feeds them with it.
+    fn look(&mut self, frame: &Frame) -> Result<()> {
         let scores = self.scores.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {
             *sum += agent.score(frame).unwrap_or_default();
@@ -122,12 +122,12 @@ impl Candidates {
         for (_, value) in frame.observed() {
             self.scores.counts[usize::from(value)] += 1;
         }
-        self.filter()
+        self.filter(frame)
     }
 
-    fn filter(&mut self) -> Result<()> {
+    fn filter(&mut self, frame: &Frame) -> Result<()> {
         for agent in &mut self.estimators {
-            agent.correct(&self.guide.observation().frame, None)?;
+            agent.correct(frame, None)?;
             agent.predict();
         }
         Ok(())

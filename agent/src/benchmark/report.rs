@@ -5,7 +5,7 @@
 
 mod columns;
 pub mod common_worlds;
-pub mod events;
+pub(crate) mod events;
 pub mod figures;
 pub mod leaderboard;
 mod merit;
@@ -13,9 +13,9 @@ mod number;
 mod policy_run;
 mod rewards;
 pub mod runs_file;
-pub mod statistics;
+pub(crate) mod statistics;
 pub mod suite;
-pub mod table;
+pub(crate) mod table;
 mod teams;
 pub mod training;
 

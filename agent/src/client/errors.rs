@@ -38,15 +38,6 @@ pub fn is_late(error: &anyhow::Error) -> bool {
     refusal(error).is_some_and(|(status, ..)| status == Status::Late)
 }
 
-/// The error of what is refused before a server is asked.
-pub fn refused(status: Status, detail: u64, message: String) -> ConnectionError {
-    ConnectionError::Refused {
-        status,
-        detail,
-        message,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -27,7 +27,7 @@ pub fn leave_belief(
             length: bytes.len() as u64,
             data: BASE64.encode(part),
         });
-        client.connection_mut().control(&request, STEP_TIMEOUT)?;
+        client.backend().control(&request, STEP_TIMEOUT)?;
     }
     Ok(())
 }
@@ -42,7 +42,7 @@ pub fn left_belief(
     loop {
         let offset = bytes.len() as u64;
         let request = Request::Belief { robot, offset };
-        match client.connection_mut().control(&request, STEP_TIMEOUT) {
+        match client.backend().control(&request, STEP_TIMEOUT) {
             Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
                 let part = BASE64.decode(data).map_err(|error| {
                     let (what, problem) = ("belief", error.to_string());

@@ -1,26 +1,27 @@
 //! `compare`: the benchmark.
 
-use super::shared::{lock_csv, make_folder, write};
+use super::shared::{asks_for_help, lock_csv, make_folder, write};
 use super::worlds::WorldFlags;
-use anyhow::{Context, Result, bail, ensure};
-use clap::Args;
-use emberwatch_agent::benchmark::arena::Arena;
-use emberwatch_agent::benchmark::compare::{Comparison, Results, compare};
-use emberwatch_agent::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
-use emberwatch_agent::benchmark::report::runs_file::read_runs;
-use emberwatch_agent::benchmark::report::{
+use crate::benchmark::arena::Arena;
+use crate::benchmark::compare::{Comparison, Results, compare};
+use crate::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
+use crate::benchmark::report::runs_file::read_runs;
+use crate::benchmark::report::{
     PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
     figures::FIRE_CELLS_PER_STEP, render_table, write_events,
 };
-use emberwatch_agent::benchmark::team::Team;
-use emberwatch_agent::client::launch::OwnDashboard;
-use emberwatch_agent::flags::AgentFlags;
+use crate::benchmark::team::Team;
+use crate::client::launch::OwnDashboard;
+use crate::flags::AgentFlags;
+use anyhow::{Context, Result, ensure};
+use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_learning::beliefs::{Input, NONE};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::{Choice, EstimatorKind, Policy};
-use emberwatch_learning::registry::needs_checkpoint;
+use emberwatch_learning::learners;
+use emberwatch_learning::policy::{self, Goal, LearnedDecisions, Policy};
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::MAX_ROBOTS;
@@ -29,7 +30,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-/// Stands for the policies of [`Policy::table_of_options`].
+/// Stands for the policies of [`policy::options_table`].
 const OPTIONS: &str = "options";
 
 /// The policy of teams, unless others are named.
@@ -38,8 +39,9 @@ const OF_TEAMS: &str = "beam_exploit";
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
-    /// The policies, separated by commas; `options`: each option on the belief of the decisions that were learned, the
-    /// rule and the learned choice [default: the ladder; of teams: beam_exploit]
+    /// The policies, separated by commas: names, or BELIEF/PLANNER/GOAL; `help` lists all parts; `options`: each option on
+    /// the belief of the decisions that were learned, the rule and the learned choice [default: the ladder; of teams:
+    /// beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
     /// The policy that others are paired against [default: shooting_exploit; of options: that which exploits; of
@@ -52,9 +54,7 @@ pub struct CompareCommand {
     /// How the robots of a world act together, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
-    /// What `train` learned: a filter adds `learned_*` to the ladder, one by own state `learned_own_*`, an
-    /// autoencoder `autoencoder_*`, decisions `learned_policy` or that on their belief; may be
-    /// given for each
+    /// What `train` learned: adds to the ladder what acts on it; may be given once for each learner
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
     /// Where networks compute: cpu, cuda or metal
@@ -88,11 +88,14 @@ pub struct CompareCommand {
 impl CompareCommand {
     /// Runs the comparison and writes what it gave.
     pub fn run(&self) -> Result<()> {
+        if asks_for_help(&self.policies) {
+            return write(&policy::help());
+        }
         self.check_names()?;
         let config = self.settings.effective()?;
         let csv = self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
-        let learned = Learned::read(checkpoints, &self.device.open()?)?;
+        let learned = learners::read(checkpoints, &self.device.open()?)?;
         let numbers: Vec<Option<u32>> = match self.robots.as_slice() {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
@@ -125,8 +128,8 @@ impl CompareCommand {
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
             }
-            let baseline = self.baseline(arena.is_recorded(), &comparison.policies);
-            baseline.clone_into(&mut report.baseline);
+            let policies = &comparison.policies;
+            report.baseline = self.baseline(arena.model(), arena.is_recorded(), policies)?;
             report.add(axis_label(arena.model()), results);
         }
         self.tell(&report, added, &config, csv)
@@ -206,7 +209,7 @@ impl CompareCommand {
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
         let mut policies = self.policies(arena.model(), learned)?;
         if arena.is_recorded() && self.policies.is_empty() && !self.has_teams() {
-            policies.retain(|policy| !policy.estimator.knows_model());
+            policies.retain(|policy| !policy.belief.knows_model);
         }
         Ok(policies)
     }
@@ -214,9 +217,9 @@ impl CompareCommand {
     /// Refuses what no server can fly before one is waited for.
     fn check_names(&self) -> Result<()> {
         let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
-        policies.try_for_each(|name| Policy::check_name(name))?;
+        policies.try_for_each(|name| policy::check_name(name))?;
         let mut baseline = self.baseline.iter();
-        let checked = baseline.try_for_each(|name| Policy::check_name(name));
+        let checked = baseline.try_for_each(|name| policy::check_name(name));
         checked.context("--baseline")
     }
 
@@ -246,10 +249,10 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        named(&self.baseline(false, &policies).to_owned()).context("--baseline")?;
-        if let Some(policy) = policies.iter().find(|policy| !learned.suits(policy)) {
-            bail!(needs_checkpoint(policy));
-        }
+        self.baseline(model, false, &policies)?;
+        policies
+            .iter()
+            .try_for_each(|policy| policy.check(learned))?;
         Ok(policies)
     }
 
@@ -260,11 +263,14 @@ impl CompareCommand {
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    /// The one that was named; else one of the policies, if these are of teams or of options.
-    fn baseline<'a>(&'a self, is_recorded: bool, policies: &'a [Policy]) -> &'a str {
+    /// The name of the one that was asked for; else of one of the policies, if these are of teams or of options.
+    fn baseline(&self, model: &Model, is_recorded: bool, policies: &[Policy]) -> Result<String> {
+        if let Some(name) = &self.baseline {
+            return Ok(Policy::named(name, model).context("--baseline")?.name);
+        }
         let mut policies = policies.iter();
         let found = if self.policies.iter().any(|name| name == OPTIONS) {
-            policies.find(|policy| matches!(policy.choice, Choice::Option(_)))
+            policies.find(|policy| matches!(policy.goal, Goal::Option(_)))
         } else {
             policies.next().filter(|_| self.has_teams())
         };
@@ -273,12 +279,14 @@ impl CompareCommand {
         } else {
             "shooting_exploit"
         };
-        let named = self.baseline.as_deref();
-        named.unwrap_or(found.map_or(usual, |policy| &policy.name))
+        Ok(found.map_or(usual, |policy| &policy.name).to_owned())
     }
 
     fn needs_scouts(&self) -> bool {
-        let is_clairvoyant = |name: &String| name.starts_with("clairvoyant");
+        let is_clairvoyant = |name: &String| {
+            let belief = policy::belief_of(name);
+            belief.is_some_and(|belief| belief.input == Input::NextStates)
+        };
         match self.policies.as_slice() {
             [] => !self.has_teams(),
             names => names.iter().any(is_clairvoyant),
@@ -324,27 +332,24 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
 
 /// Each option, the rule and the learned choice, on the belief of the decisions that were learned.
 fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
-    let decisions = learned.decisions.as_ref();
+    let decisions = learned.get::<LearnedDecisions>();
     let decisions =
         decisions.context("--policies options: expected --checkpoint FILE of decisions")?;
-    Ok(Policy::table_of_options(model, decisions.estimator))
+    Ok(policy::options_table(decisions.belief, model))
 }
 
 /// The ladder, with the policies on what was learned beside those on the known model, the autoencoder's below them.
 fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
-    let is_on = |kind| move |policy: &Policy| policy.estimator == kind;
-    let mut policies = learned.policies(model);
-    policies.sort_by_key(|policy| !policy.estimator.knows_model());
-    let (network, others) = policies
-        .into_iter()
-        .partition(is_on(EstimatorKind::Autoencoder));
-    let mut ladder = Policy::ladder(model);
+    let of_learned = policy::of_learned(learned, model).into_iter();
+    let (network, others): (Vec<_>, Vec<_>) =
+        of_learned.partition(|policy| policy.belief.decides());
+    let mut ladder = policy::ladder(model);
     let mut insert = |after: &dyn Fn(&Policy) -> bool, policies: Vec<Policy>| {
         let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
         ladder.splice(at..at, policies);
     };
-    insert(&|policy| policy.estimator.knows_model(), others);
-    insert(&is_on(EstimatorKind::None), network);
+    insert(&|policy| policy.belief.knows_model, others);
+    insert(&|policy| *policy.belief == NONE, network);
     ladder
 }
 

@@ -3,19 +3,21 @@
 use super::compare::run_comparison;
 use super::shared::{lock_csv, write};
 use super::worlds::WorldFlags;
+use crate::benchmark::arena::Arena;
+use crate::benchmark::compare::Comparison;
+use crate::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
+use crate::benchmark::report::{RunsFile, render_table, statistics::Estimate};
+use crate::benchmark::team::Team;
+use crate::flags::AgentFlags;
 use anyhow::{Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::arena::Arena;
-use emberwatch_agent::benchmark::compare::Comparison;
-use emberwatch_agent::benchmark::evaluate::{Evaluation, Scores, evaluate, score_of_frequencies};
-use emberwatch_agent::benchmark::report::{RunsFile, render_table, statistics::Estimate};
-use emberwatch_agent::benchmark::team::Team;
-use emberwatch_agent::flags::AgentFlags;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_learning::beliefs::{BELIEFS, BeliefKind, KNOWN, KNOWN_SPATIAL};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::Policy;
+use emberwatch_learning::learners;
+use emberwatch_learning::policy::{self, Policy};
 use emberwatch_network::DeviceKind;
 use std::path::PathBuf;
 
@@ -59,7 +61,7 @@ impl EvaluateCommand {
         let config = self.settings.effective()?;
         let csv = lock_csv(self.csv.as_deref())?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
-        let learned = Learned::read(checkpoints, &self.device.open()?)?;
+        let learned = learners::read(checkpoints, &self.device.open()?)?;
         let n_robots = self.worlds.task().map_or(1, |task| task.robots);
         ensure!(
             n_robots == 1,
@@ -68,9 +70,7 @@ impl EvaluateCommand {
         let mut worlds = self.worlds.open(false, Some(1), |_| Ok(()))?;
         let arena = &mut worlds.arena;
         let steps = self.worlds.steps(arena.info())?;
-        let policies = examined(&learned).into_iter();
-        let policies = policies.map(|name| Policy::named(name, arena.model()));
-        let policies = policies.collect::<Result<Vec<_>>>()?;
+        let policies = examined(&learned);
         for guide in GUIDES {
             let evaluation = Evaluation {
                 guide,
@@ -102,7 +102,7 @@ impl EvaluateCommand {
             .into_iter()
             .map(named)
             .collect::<Result<Vec<_>>>()?;
-        policies.extend(learned.policies(arena.model()));
+        policies.extend(policy::of_learned(&learned, arena.model()));
         let comparison = Comparison {
             policies,
             teams: vec![Team::Alone],
@@ -118,22 +118,12 @@ impl EvaluateCommand {
     }
 }
 
-/// Policies on the known model, and on what was learned.
-fn examined(learned: &Learned) -> Vec<&'static str> {
-    let mut names = vec!["beam_exploit", "spatial_beam"];
-    if learned.filter.is_some() {
-        names.extend(["learned_beam", "learned_spatial_beam"]);
-    }
-    if learned.own_filter.is_some() {
-        names.extend(["learned_own_beam", "learned_own_spatial_beam"]);
-    }
-    if learned.neural.is_some() {
-        names.push("neural_beam");
-    }
-    if learned.network.is_some() {
-        names.push("autoencoder_beam");
-    }
-    names
+/// Policies on the beliefs whose predictions are scored: of the known model, and those that were learned.
+fn examined(learned: &Learned) -> Vec<Policy> {
+    let is_learned = |kind: &&BeliefKind| matches!(kind.learned(learned), Ok(Some(_)));
+    let kinds = BELIEFS.iter().copied().filter(is_learned);
+    let all = [&KNOWN, &KNOWN_SPATIAL].into_iter().chain(kinds);
+    all.map(Policy::exploiting).collect()
 }
 
 /// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
@@ -147,10 +137,10 @@ fn predictions(guide: &str, policies: &[Policy], scores: &[Scores], n_matrices: 
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];
     for (index, policy) in policies.iter().enumerate() {
-        rows.push((policy.estimator.label(), scores(index)));
+        rows.push((policy.belief.label.to_owned(), scores(index)));
     }
     for (index, policy) in policies.iter().enumerate().skip(1) {
-        let name = format!("{} - known_model", policy.estimator.label());
+        let name = format!("{} - known_model", policy.belief.label);
         rows.push((name, difference(&scores(index), &known)));
     }
     let mut text = format!("log-likelihood per visited cell on the paths of {guide}:\n");

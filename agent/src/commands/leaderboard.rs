@@ -1,13 +1,13 @@
 //! `leaderboard`: an entry from the results of `suite`, and the page of all entries.
 
 use super::shared::write;
+use crate::benchmark::report::leaderboard::{
+    About, Entry, check_entries, draw_leaderboard, file_stem, read_entries, render_page,
+};
+use crate::benchmark::report::runs_file::read_runs;
+use crate::benchmark::report::suite::TaskRuns;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::report::leaderboard::{
-    About, Entry, check_entries, draw_leaderboard, read_entries, render_page,
-};
-use emberwatch_agent::benchmark::report::runs_file::read_runs;
-use emberwatch_agent::benchmark::report::suite::TaskRuns;
 use emberwatch_learning::file::{Readers, replace_file};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -97,11 +97,21 @@ impl LeaderboardCommand {
             folder.display(),
             about.policy
         );
-        let path = self.entries.join(format!("{}.csv", about.policy));
+        let path = self
+            .entries
+            .join(format!("{}.csv", file_stem(&about.policy)));
         let entry = Entry { about, tasks };
         entry.check()?;
         let mut entries = read_entries(&self.entries)?;
         entries.retain(|other| other.about.policy != entry.about.policy);
+        let mut others = entries.iter().map(|other| &other.about.policy);
+        let same = others.find(|other| file_stem(other) == file_stem(&entry.about.policy));
+        ensure!(
+            same.is_none(),
+            "--policy {}: expected a name whose file is not that of {}",
+            entry.about.policy,
+            same.unwrap_or(&entry.about.policy)
+        );
         entries.push(entry.clone());
         check_entries(&entries)?;
         entry.write(&path)

@@ -4,9 +4,10 @@ use super::shared::model_named;
 use anyhow::{Result, ensure};
 use clap::Args;
 use emberwatch_belief::estimation::Prior;
-use emberwatch_learning::estimation::first_belief::first_belief;
+use emberwatch_learning::beliefs::first_belief::first_belief;
 use emberwatch_learning::file::{Readers, replace_file};
-use emberwatch_protocol::Shape;
+use emberwatch_protocol::built_in::listed;
+use emberwatch_protocol::{Model, Shape};
 use ndarray_npy::WriteNpyExt;
 use rustix::fs::{Access, access};
 use std::path::{Path, PathBuf};
@@ -14,8 +15,7 @@ use std::path::{Path, PathBuf};
 /// Write a filter's first belief to a file.
 #[derive(Args)]
 pub struct PriorCommand {
-    /// `wildfire` or a model file
-    #[arg(long)]
+    #[arg(long, value_name = "NAME|FILE", help = format!("The model: {} or a model file", listed(Model::built_in_names())))]
     model: String,
     /// Grid height in cells
     #[arg(long)]

@@ -1,15 +1,16 @@
 //! `run`: act on one world of a running server.
 
 use super::shared::{WaitFlag, model_named, model_of, parse_range};
+use crate::acting::mission::{Company, Mission};
+use crate::acting::run::run;
+use crate::flags::AgentFlags;
 use anyhow::{Context, Result};
 use clap::Args;
-use emberwatch_agent::acting::mission::{Company, Mission};
-use emberwatch_agent::acting::run::run;
-use emberwatch_agent::flags::AgentFlags;
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::Policy;
+use emberwatch_learning::learners;
+use emberwatch_learning::policy::{self, Policy};
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
+use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::Task;
@@ -26,8 +27,8 @@ pub struct RunCommand {
     instance: String,
     #[command(flatten)]
     wait: WaitFlag,
-    /// Refuse a server whose worlds are not this task
-    #[arg(long, value_name = "NAME|FILE", value_parser = Task::named)]
+    #[arg(long, value_name = "NAME|FILE", value_parser = Task::named, help = format!(
+        "Refuse a server whose worlds are not this task: {} or a task file", listed(Task::built_in_names())))]
     task: Option<Task>,
     /// The world to act on
     #[arg(long, default_value_t = 0)]
@@ -45,7 +46,7 @@ pub struct RunCommand {
     /// See what all robots of the world see, but plan without regard to the others
     #[arg(long, conflicts_with = "team")]
     share: bool,
-    /// The policy
+    /// The policy, by its name or as BELIEF/PLANNER/GOAL; the parts are listed by --help
     #[arg(long, default_value = "beam_exploit")]
     policy: String,
     /// Steps to act for; 0: until stopped
@@ -57,10 +58,10 @@ pub struct RunCommand {
     /// Take the robot from its holder
     #[arg(long)]
     takeover: bool,
-    /// A built-in model or a model file, where the server does not reveal its model
-    #[arg(long, value_name = "MODEL")]
+    #[arg(long, value_name = "NAME|FILE", help = format!(
+        "The model, where the server does not reveal it: {} or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
-    /// What `train` learned, for policies `learned_*` and `autoencoder_*`, and others that a DQN decides for
+    /// What `train` learned, for policies on a learned belief and those that a DQN decides for
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     /// Where networks compute: cpu, cuda or metal
@@ -76,7 +77,7 @@ impl RunCommand {
         // What no server can fly needs none to be refused.
         match &model {
             Some(model) => Policy::named(&self.policy, model).map(drop),
-            None => Policy::check_name(&self.policy),
+            None => policy::check_name(&self.policy),
         }?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
@@ -99,7 +100,7 @@ impl RunCommand {
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
-            learned: Learned::read(self.checkpoint.as_deref(), &self.device.open()?)?,
+            learned: learners::read(self.checkpoint.as_deref(), &self.device.open()?)?,
         };
         let stop = stop_on_signals().context("handle signals")?;
         if !self

@@ -1,11 +1,12 @@
 //! What several subcommands need: a server that may come, models by name, files and output.
 
+use crate::benchmark::report::RunsFile;
+use crate::client::info::wait_for_server;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::report::RunsFile;
-use emberwatch_agent::client::info::wait_for_server;
 use emberwatch_learning::file::check_replaceable;
 use emberwatch_protocol::Model;
+use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::task::Task;
 use std::io::Write;
@@ -27,6 +28,11 @@ impl WaitFlag {
     pub fn for_server(&self, instance: &Instance, is_over: impl Fn() -> bool) -> Result<bool> {
         Ok(wait_for_server(instance, self.wait, is_over)?)
     }
+}
+
+/// Whether `--policies help` asks what policies there are.
+pub fn asks_for_help(policies: &[String]) -> bool {
+    policies.iter().any(|name| name == "help")
 }
 
 pub fn parse_seconds(text: &str) -> Result<Duration, String> {
@@ -57,7 +63,7 @@ pub fn model_named(name: &str) -> Result<Model> {
     ensure!(
         path.exists(),
         "model file {name}: No such file: expected one, or {}",
-        Model::built_in_names().collect::<Vec<_>>().join(", ")
+        listed(Model::built_in_names())
     );
     read_model(path)
 }

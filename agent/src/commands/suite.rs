@@ -1,24 +1,27 @@
 //! `suite`: policies on the test worlds of all tasks, and one score.
 
 use super::compare::run_comparison;
-use super::shared::{make_folder, write};
+use super::shared::{asks_for_help, make_folder, write};
+use crate::benchmark::arena::{Arena, MAX_BATCH};
+use crate::benchmark::compare::Comparison;
+use crate::benchmark::report::common_worlds::CommonWorlds;
+use crate::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
+use crate::benchmark::report::{PolicyRun, RunsFile};
+use crate::benchmark::team::Team;
+use crate::client::launch::OwnServer;
+use crate::flags::AgentFlags;
+use crate::training::CHECKPOINT;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
-use emberwatch_agent::benchmark::compare::Comparison;
-use emberwatch_agent::benchmark::report::common_worlds::CommonWorlds;
-use emberwatch_agent::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
-use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile};
-use emberwatch_agent::benchmark::team::Team;
-use emberwatch_agent::client::launch::OwnServer;
-use emberwatch_agent::flags::AgentFlags;
-use emberwatch_agent::training::CHECKPOINT;
 use emberwatch_belief::merit::RECENT_STEPS;
+use emberwatch_learning::beliefs::Input;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::Policy;
+use emberwatch_learning::learners;
+use emberwatch_learning::policy::{self, Policy};
 use emberwatch_network::Device;
 use emberwatch_protocol::Model;
+use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::task::Task;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -31,10 +34,11 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Run policies on the test worlds of tasks, and give each one score.
 #[derive(Args)]
 pub struct SuiteCommand {
-    /// The tasks, names or files, separated by commas [default: all that have names]
-    #[arg(long, value_delimiter = ',')]
+    #[arg(long, value_delimiter = ',', help = format!(
+        "Names or files of tasks, separated by commas [default: {}]", listed(Task::built_in_names())))]
     tasks: Vec<String>,
-    /// The policies, separated by commas; `random_walk` and `oracle_ahead`, which are scores 0 and 1, are always run
+    /// The policies, separated by commas; `help` lists their parts; `random_walk` and `oracle_ahead`, which are scores 0 and
+    /// 1, are always run
     #[arg(
         long,
         value_delimiter = ',',
@@ -61,15 +65,17 @@ pub struct SuiteCommand {
 impl SuiteCommand {
     /// Runs what is missing, and tells all scores.
     pub fn run(&self) -> Result<()> {
-        let names = self.policies.iter();
-        names
-            .clone()
-            .try_for_each(|name| Policy::check_name(name))?;
+        if asks_for_help(&self.policies) {
+            return write(&policy::help());
+        }
+        let mut names = self.policies.iter();
+        names.try_for_each(|name| policy::check_name(name))?;
+        let mut beliefs = self
+            .policies
+            .iter()
+            .filter_map(|name| policy::belief_of(name));
         ensure!(
-            !self
-                .policies
-                .iter()
-                .any(|name| name.starts_with("clairvoyant")),
+            beliefs.all(|belief| belief.input != Input::NextStates),
             "--policies: expected none that is told the next states, as these act only in `compare`"
         );
         let config = self.settings.effective()?;
@@ -158,7 +164,7 @@ impl SuiteCommand {
         for name in names.chain(self.policies.iter().map(|name| &**name)) {
             let policy = Policy::named(name, model)?;
             let can_run =
-                learned.suits(&policy) && !(task.is_recorded() && policy.estimator.knows_model());
+                policy.check(learned).is_ok() && !(task.is_recorded() && policy.belief.knows_model);
             if !can_run {
                 let task = &task.name;
                 tracing::warn!("task {task}: {name} is not run: it needs a model or --checkpoints");
@@ -225,7 +231,7 @@ impl SuiteCommand {
             tracing::warn!("no {}: no learned policy for this task", place.display());
             return Ok(Learned::default());
         }
-        Learned::read([&*place], &Device::Cpu)
+        learners::read([&*place], &Device::Cpu)
     }
 
     /// A server with a task's worlds, which stops when it is dropped.

@@ -2,28 +2,27 @@
 
 use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
+use crate::benchmark::report::training::draw_training;
+use crate::client::launch::OwnServer;
+use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
+use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_agent::benchmark::report::training::draw_training;
-use emberwatch_agent::client::launch::OwnServer;
-use emberwatch_agent::flags::{AgentFlags, Preset, one_of};
-use emberwatch_agent::training::{CHECKPOINT, TrainingSpec, train};
+use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
 use emberwatch_learning::checkpoint::Contents;
-use emberwatch_learning::config::{AgentConfig, LearnerKind};
+use emberwatch_learning::config::{AgentConfig, KernelKind};
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners::decisions::SavedDecisions;
-use emberwatch_learning::learners::neural::SavedNeural;
-use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_learning::learners::decisions::{SavedDecisions, belief_of};
+use emberwatch_learning::learners::filter::FILTER;
+use emberwatch_learning::learners::{self, LEARNERS, LearnerKind};
 use emberwatch_network::{Device, DeviceKind};
-use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
 use emberwatch_protocol::program::stop_on_signals;
+use emberwatch_protocol::task::FIRST_TRAINING_SEED;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
-
-/// First seed of the worlds to train on; those below are for tests.
-const TRAINING_SEED: u64 = 1000;
 
 /// Learn a model while acting on a server's worlds.
 #[derive(Args)]
@@ -37,18 +36,21 @@ pub struct TrainCommand {
     #[arg(long, default_value_t = 0)]
     world: u32,
     /// Number of worlds to act on at once [default: 16, or the autoencoder's 1]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MAX_WORLDS as i64))]
     worlds: Option<u32>,
     /// What to learn [default: filter; of preset paper: autoencoder]
-    #[arg(long, value_parser = one_of(&LearnerKind::ALL))]
-    learner: Option<LearnerKind>,
+    #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
+    learner: Option<String>,
+    /// What the kernels of a filter see [default: neighbours]
+    #[arg(long, value_parser = one_of(&KernelKind::ALL))]
+    kernels: Option<KernelKind>,
     /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of neural and decisions: what
     /// is left of those of the settings]
     #[arg(long)]
     steps: Option<u64>,
     /// Whose belief decisions are learned on [default: learned_filter, or the checkpoint's to go on from]
-    #[arg(long, value_name = "NAME")]
-    estimator: Option<EstimatorKind>,
+    #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
+    estimator: Option<&'static BeliefKind>,
     /// That belief, of an earlier training; without it, one is learned first. With --learner neural: a filter, whose
     /// belief the network then corrects
     #[arg(long, value_name = "FILE")]
@@ -75,7 +77,7 @@ pub struct TrainCommand {
     #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
     server: Option<PathBuf>,
     /// First seed of the worlds of the server that is started
-    #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
+    #[arg(long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
     /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
     #[arg(long, conflicts_with_all = ["instance", "states", "task"])]
@@ -97,13 +99,13 @@ impl TrainCommand {
         }
         let end = |limit| Instant::now().checked_add(limit);
         training.deadline = self.time_limit.and_then(end);
-        if contents.is_none() && needs_belief(&training) {
+        if contents.is_none() && needs_belief(&training)? {
             learn_belief(&instance, &training, &stop)?;
             if stop.load(Relaxed) {
                 return Ok(());
             }
             let belief = training.belief_folder().join(CHECKPOINT);
-            training.learned = Learned::read([&*belief], &training.device)?;
+            training.learned = learners::read([&*belief], &training.device)?;
             training.resume = false;
         }
         learn(&instance, &training, contents, &stop).map(drop)
@@ -111,18 +113,22 @@ impl TrainCommand {
 
     fn training(&self) -> Result<TrainingSpec> {
         let mut config = self.settings.effective()?;
-        config.learner = self.learner.unwrap_or(config.learner);
-        let decisions = &mut config.decisions;
-        decisions.estimator = self.estimator.unwrap_or(decisions.estimator);
-        let n_worlds = self.worlds.unwrap_or(match config.learner {
-            LearnerKind::Autoencoder => 1,
-            _ => 16,
-        });
+        if let Some(learner) = &self.learner {
+            config.learner.clone_from(learner);
+        }
+        if let Some(kernels) = self.kernels {
+            config.kernels = kernels;
+        }
+        if let Some(estimator) = self.estimator {
+            config.decisions.estimator = estimator.label.into();
+        }
+        let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
+        let n_worlds = self.worlds.unwrap_or(if kind.is_single { 1 } else { 16 });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
-        let steps = all_steps(&config).unwrap_or(0);
+        let steps = (kind.steps)(&config);
         let device = self.device.open()?;
-        let learned = self.learned(&config, &device)?;
+        let learned = self.learned(kind, &config, &device)?;
         make_folder(&self.out)?;
         Ok(TrainingSpec {
             worlds: self.world..last,
@@ -139,9 +145,13 @@ impl TrainCommand {
     }
 
     /// The belief that was given for decisions, or for a network to correct; refuses what would be ignored.
-    fn learned(&self, config: &AgentConfig, device: &Device) -> Result<Learned> {
-        let is_neural = config.learner == LearnerKind::Neural;
-        let decides = config.learner == LearnerKind::Decisions;
+    fn learned(
+        &self,
+        kind: &LearnerKind,
+        config: &AgentConfig,
+        device: &Device,
+    ) -> Result<Learned> {
+        let (is_neural, decides) = (*kind == learners::neural::NEURAL, decides(kind));
         ensure!(
             self.estimator.is_none() || decides,
             "--estimator: expected none, or --learner decisions"
@@ -150,18 +160,28 @@ impl TrainCommand {
             self.checkpoint.is_none() || decides || is_neural,
             "--checkpoint: expected none, or --learner decisions or neural"
         );
-        let learned = Learned::read(self.checkpoint.as_deref(), device)?;
-        let estimator = if is_neural {
-            EstimatorKind::LEARNED
+        let belief = if is_neural {
+            &LEARNED
         } else {
-            config.decisions.estimator
+            belief_of(&config.decisions.estimator)?
         };
+        let by = belief.learned_by.as_ref();
+        let begins_filter = decides
+            && self.checkpoint.is_none()
+            && !self.resume
+            && by.is_some_and(|by| by.learner == FILTER.name);
+        ensure!(
+            self.kernels.is_none() || *kind == FILTER || begins_filter,
+            "--kernels: expected a filter that is learned: --learner filter, or --learner decisions on one, without \
+             --checkpoint or --resume"
+        );
+        let learned = learners::read(self.checkpoint.as_deref(), device)?;
         if let Some(path) = &self.checkpoint {
             ensure!(
-                learned.belief(estimator).is_some(),
+                matches!(belief.learned(&learned), Ok(Some(_))),
                 "--checkpoint {}: expected what {} acts on, got another",
                 path.display(),
-                estimator.label()
+                belief.label
             );
         }
         Ok(learned)
@@ -170,37 +190,41 @@ impl TrainCommand {
     /// What to go on from, if that is asked for; `None` also if it is a belief, before decisions on it.
     /// Decisions go on with the estimator that they began with.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
-        if training.config.learner != LearnerKind::Decisions || !self.resume {
-            let contents = training.check()?;
-            if training.config.learner == LearnerKind::Neural
-                && let Some(contents) = &contents
-            {
-                self.check_no_checkpoint()?;
-                self.go_on_for(contents.state::<SavedNeural>()?.world_steps, training)?;
-            }
-            return Ok(contents);
-        }
-        if let Some(estimator) = training.estimator_of_belief()? {
+        let kind = training.learner()?;
+        if decides(kind)
+            && self.resume
+            && let Some(belief) = training.go_on_with_belief()?
+        {
             ensure!(
                 !self.freeze,
                 "--freeze: expected a checkpoint of decisions in {}, got one of their belief alone",
                 self.out.display()
             );
-            self.go_on_with(estimator, training)?;
+            self.go_on_with(belief, training)?;
             return Ok(None);
         }
         let contents = training.check()?;
         if let Some(contents) = &contents {
-            let saved: SavedDecisions = contents.state()?;
-            self.go_on_with(saved.estimator, training)?;
-            self.go_on_for(saved.world_steps, training)?;
+            self.check_no_checkpoint()?;
+            (kind.adopt)(contents, &mut training.config);
+            let (expected, got) = (training.config.kernels, self.kernels);
+            ensure!(
+                got.is_none_or(|got| got == expected),
+                "--kernels: expected {expected} as in the checkpoint, got {}",
+                got.unwrap_or(expected)
+            );
+            if decides(kind) {
+                let belief = contents.state::<SavedDecisions>()?.kind()?;
+                self.go_on_with(belief, training)?;
+            }
+            self.go_on_for((kind.done)(contents)?, training)?;
         }
         Ok(contents)
     }
 
     /// Goes on for the steps that are left of those of the settings, unless a flag says otherwise.
     fn go_on_for(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
-        let all = all_steps(&training.config).unwrap_or(0);
+        let all = (training.learner()?.steps)(&training.config);
         if self.steps.is_none() && !self.freeze && all > 0 {
             training.steps = all.saturating_sub(done);
             ensure!(
@@ -211,16 +235,16 @@ impl TrainCommand {
         Ok(())
     }
 
-    fn go_on_with(&self, estimator: EstimatorKind, training: &mut TrainingSpec) -> Result<()> {
-        let (expected, got) = (estimator, self.estimator.unwrap_or(estimator));
+    fn go_on_with(&self, expected: &'static BeliefKind, training: &mut TrainingSpec) -> Result<()> {
+        let got = self.estimator.unwrap_or(expected);
         ensure!(
             got == expected,
             "--estimator: expected {} as in the checkpoint, got {}",
-            expected.label(),
-            got.label()
+            expected.label,
+            got.label
         );
         self.check_no_checkpoint()?;
-        training.config.decisions.estimator = estimator;
+        training.config.decisions.estimator = expected.label.into();
         Ok(())
     }
 
@@ -250,17 +274,12 @@ impl TrainCommand {
         });
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        let (learner, decisions) = (training.config.learner, &training.config.decisions);
-        let decides = learner == LearnerKind::Decisions;
-        // Who learns a model does not look at it, and could not.
-        let reveals = (decides && decisions.estimator.knows_model()).to_string();
+        let (kind, config) = (training.learner()?, &training.config);
+        // What learns a model does not look at it, and could not.
+        let reveals = (decides(kind) && training.belief()?.knows_model).to_string();
         let rest = ["--reveal-model", &reveals, "--coverage", "client"];
         arguments.extend(rest.map(String::from));
-        let episode_steps = match learner {
-            LearnerKind::Decisions => Some(decisions.episode_steps),
-            LearnerKind::Neural => Some(training.config.neural.episode_steps),
-            _ => None,
-        };
+        let episode_steps = (kind.episode_steps)(config);
         // A task has its own.
         let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
         let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
@@ -270,21 +289,13 @@ impl TrainCommand {
     }
 }
 
-/// World steps of a whole training, where the settings say how many.
-fn all_steps(config: &AgentConfig) -> Option<u64> {
-    match config.learner {
-        LearnerKind::Decisions => Some(config.decisions.steps),
-        LearnerKind::Neural => Some(config.neural.steps),
-        _ => None,
-    }
+fn decides(kind: &LearnerKind) -> bool {
+    *kind == learners::decisions::DECISIONS
 }
 
 /// Whether decisions are to be learned on a belief that is yet to be learned.
-fn needs_belief(training: &TrainingSpec) -> bool {
-    let estimator = training.config.decisions.estimator;
-    training.config.learner == LearnerKind::Decisions
-        && estimator.is_learned()
-        && training.learned.belief(estimator).is_none()
+fn needs_belief(training: &TrainingSpec) -> Result<bool> {
+    Ok(decides(training.learner()?) && training.belief()?.learned(&training.learned).is_err())
 }
 
 /// Learns the belief that decisions are to be learned on, unless that is done.
@@ -308,8 +319,8 @@ fn learn(
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<u64> {
-    let kind = training.config.learner;
-    tracing::info!(learner = ?kind, steps = training.steps, out = %training.out.display(), "learning");
+    let learner = &training.config.learner;
+    tracing::info!(learner, steps = training.steps, out = %training.out.display(), "learning");
     let summary = train(instance, training, contents, stop)?;
     let mean_reward = summary.reward / summary.steps.max(1) as f64;
     tracing::info!(
@@ -318,9 +329,9 @@ fn learn(
         mean_reward,
         "done"
     );
-    for (part, time) in summary.times {
-        tracing::info!(part, seconds = time.as_secs_f64(), "time");
-    }
+    let [planning_seconds, learning_seconds] =
+        [summary.planning, summary.learning].map(|time| time.as_secs_f64());
+    tracing::info!(planning_seconds, learning_seconds, "time");
     if summary.steps > 0 && !training.freeze {
         draw_training(&training.out)?;
     }

@@ -1,12 +1,14 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
 use super::shared::{WaitFlag, model_named, model_of, parse_range, with_sensor};
+use crate::benchmark::arena::{Arena, MAX_BATCH};
+use crate::client::launch::OwnServer;
 use anyhow::{Result, ensure};
-use clap::Args;
-use emberwatch_agent::benchmark::arena::{Arena, MAX_BATCH};
-use emberwatch_agent::client::launch::OwnServer;
+use clap::{Args, value_parser};
+use emberwatch_protocol::built_in::{listed, state_names};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::ServerInfo;
+use emberwatch_protocol::model::MAX_RADIUS;
 use emberwatch_protocol::task::{MAX_SEEDS, Task};
 use emberwatch_protocol::{Model, Shape};
 use std::ops::Range;
@@ -30,7 +32,7 @@ pub struct WorldFlags {
     #[arg(long, value_parser = parse_seeds)]
     seeds: Option<Range<u64>>,
     /// Scored steps of each world [default: those of the task, or 1500, or as many as the shortest episode has]
-    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    #[arg(long, value_parser = value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     /// Steps simulated before the first scored one [default: 25000, or the running server's]
     #[arg(long, conflicts_with_all = ["states", "task"])]
@@ -45,18 +47,17 @@ pub struct WorldFlags {
 /// Flags of a server that is started.
 #[derive(Debug, Args)]
 pub struct GridFlags {
-    /// The task whose worlds the server that is started has: `wildfire`, `small`, `sparse`, `latent`, `burnout`,
-    /// `terrain`, `road-ice`, `team`, `jacksboro` or a task file
     #[arg(long, value_name = "NAME|FILE", value_parser = Task::named,
-        conflicts_with_all = ["instance", "model", "height", "width", "moves", "states"])]
+        conflicts_with_all = ["instance", "model", "height", "width", "moves", "states"],
+        help = format!("The task whose worlds the server that is started has: {} or a task file",
+            listed(Task::built_in_names())))]
     pub task: Option<Task>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout`, `wildfire-terrain`,
-    /// `road-ice` or a model file, for the server that is started
-    #[arg(long, default_value = "wildfire", conflicts_with = "instance")]
+    #[arg(long, value_name = "NAME|FILE", default_value = "wildfire", conflicts_with = "instance",
+        help = format!("The model, for the server that is started: {} or a model file", listed(Model::built_in_names())))]
     model: String,
-    /// Rows and columns that robots see beyond each cell of their path, 0 to 8, for the server that is started [default:
-    /// as the model says]
-    #[arg(long, value_parser = clap::value_parser!(u8).range(0..=8), conflicts_with_all = ["instance", "task"])]
+    #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64), conflicts_with_all = ["instance", "task"],
+        help = format!("Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS}, for the \
+            server that is started [default: as the model says]"))]
     sensor_radius: Option<u8>,
     /// Grid height in cells, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
@@ -67,9 +68,9 @@ pub struct GridFlags {
     /// Moves in a path, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
-    /// A .npz or .npy file or folder of recorded states, or `jacksboro`, in the place of a model, for the server that is
-    /// started
-    #[arg(long, value_name = "FILE|FOLDER", conflicts_with_all = ["instance", "model", "height", "width"])]
+    #[arg(long, value_name = "NAME|FILE|FOLDER", conflicts_with_all = ["instance", "model", "height", "width"],
+        help = format!("Recorded states in the place of a model, for the server that is started: {} or a .npz or .npy \
+            file or folder", listed(state_names())))]
     states: Option<String>,
     /// World seeds choose among the symmetries of the grid, too
     #[arg(long, requires = "states")]

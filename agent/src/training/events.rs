@@ -1,12 +1,11 @@
 //! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
 
-use crate::training::metrics::averages;
+use crate::training::metrics::{Tick, averages};
 use crate::training::tensorboard::{EventFile, Value};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_figures::{Heat, heat};
-use emberwatch_learning::learners::Learner;
-use emberwatch_learning::update::{ModelUpdate, Tick};
+use emberwatch_learning::learners::{Learner, ModelUpdate};
 use std::path::Path;
 
 /// Steps of all worlds from one picture to the next.
@@ -29,19 +28,21 @@ impl Events {
         &mut self,
         tick: &Tick,
         updates: &[ModelUpdate],
+        columns: &[&'static str],
         learner: &dyn Learner,
     ) -> Result<()> {
-        let averages = averages(tick, updates, learner.columns());
+        let averages = averages(tick, updates, columns);
         let scalars = averages
             .iter()
             .map(|&(name, value)| (name, Value::Scalar(value)));
         self.file.add(tick.world_steps, scalars)?;
         let is_due = self.n_ticks.is_multiple_of(TICKS_PER_PICTURE);
         self.n_ticks += 1;
-        match learner.belief().filter(|_| is_due) {
-            Some((belief, state)) => self.show(tick.world_steps, belief, state),
-            None => Ok(()),
+        if !is_due {
+            return Ok(());
         }
+        let belief = learner.rollout(0).agent.belief();
+        self.show(tick.world_steps, belief, learner.target())
     }
 
     pub fn flush(&mut self) -> Result<()> {

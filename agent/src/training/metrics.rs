@@ -2,7 +2,9 @@
 
 use anyhow::{Context, Result, ensure};
 use csv::StringRecord;
-use emberwatch_learning::update::{ModelUpdate, Tick};
+use emberwatch_belief::estimation::scoring::Score;
+use emberwatch_learning::learners::ModelUpdate;
+use emberwatch_learning::rollout::StepRecord;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -20,6 +22,35 @@ const HEADER: [&str; 6] = [
     "mean_reward",
     "rate",
 ];
+
+/// What a step of all robots reports.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Tick {
+    /// World steps so far, of all robots together.
+    pub world_steps: u64,
+    /// Robots that flew, each in a world as far as it is told.
+    pub n_worlds: u64,
+    /// Sum of their rewards.
+    pub reward: f64,
+    /// How well their frames were predicted before anything was learned from them.
+    pub score: Score,
+}
+
+impl Tick {
+    /// Of what each robot reports, after so many world steps.
+    pub fn of(records: &[StepRecord], world_steps: u64) -> Self {
+        let mut tick = Self {
+            world_steps,
+            n_worlds: records.len() as u64,
+            ..Self::default()
+        };
+        for record in records {
+            tick.reward += record.reward;
+            tick.score += record.score.unwrap_or_default();
+        }
+        tick
+    }
+}
 
 pub struct Metrics {
     path: PathBuf,
@@ -167,10 +198,6 @@ impl Rows {
         self.rows.len()
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.rows.is_empty()
-    }
-
     /// A column, one entry per row; nothing but `None` where there is no such column.
     pub fn column(&self, name: &str) -> Vec<Option<f64>> {
         let at = self.names.iter().position(|known| known == name);
@@ -182,7 +209,6 @@ impl Rows {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_belief::estimation::scoring::Score;
 
     #[test]
     fn averages_are_over_the_updates_of_a_step() {

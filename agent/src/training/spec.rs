@@ -1,14 +1,12 @@
 //! What to train on, and why that ended early.
 
-use anyhow::{Context, Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
+use emberwatch_learning::beliefs::BeliefKind;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::config::{AgentConfig, LearnerKind};
+use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners::filter::SavedFilter;
-use emberwatch_learning::learners::filter::fit;
-use emberwatch_learning::learners::neural::{self, SavedNeural};
-use emberwatch_learning::learners::{Learner, decisions, network};
-use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_learning::learners::decisions::{belief_of, belief_of_saved};
+use emberwatch_learning::learners::{self, Learner, LearnerKind};
 use emberwatch_network::Device;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::ServerInfo;
@@ -48,62 +46,73 @@ impl TrainingSpec {
             "--out {}: expected --resume or a folder without a checkpoint, got one with it",
             self.out.display()
         );
-        let n_worlds = self.worlds.len();
-        let kind = match self.config.learner {
-            LearnerKind::Filter => fit::KIND,
-            LearnerKind::OwnFilter => fit::OWN_KIND,
-            LearnerKind::Neural => neural::KIND,
-            LearnerKind::Autoencoder if n_worlds != 1 => {
-                bail!(
-                    "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"
-                )
-            }
-            LearnerKind::Autoencoder => network::KIND,
-            LearnerKind::Decisions => decisions::KIND,
-        };
+        let (kind, n_worlds) = (self.learner()?, self.worlds.len());
+        ensure!(
+            n_worlds == 1 || !kind.is_single,
+            "--worlds: expected 1 for the {}, which follows one world, got {n_worlds}",
+            kind.name
+        );
         if !self.resume {
             return Ok(None);
         }
-        let (_, contents) = checkpoint::read(&place, &[kind])?;
+        let (got, contents) = checkpoint::read(&place)?;
+        ensure!(
+            kind.checkpoints.contains(&&*got),
+            "checkpoint {}: expected a checkpoint of {}, got one of {got}",
+            place.display(),
+            kind.checkpoints[0]
+        );
         Ok(Some(contents))
+    }
+
+    /// What the settings say that learns.
+    pub fn learner(&self) -> Result<&'static LearnerKind> {
+        learners::named(&self.config.learner).map_err(anyhow::Error::msg)
+    }
+
+    /// The belief that decisions are learned on.
+    pub fn belief(&self) -> Result<&'static BeliefKind> {
+        belief_of(&self.config.decisions.estimator)
     }
 
     /// The training of the belief that decisions are learned on, in a folder within this one's; `None` if there is nothing
     /// more to learn of it.
     pub fn of_belief(&self) -> Result<Option<Self>> {
-        let estimator = self.config.decisions.estimator;
+        let Some(by) = &self.belief()?.learned_by else {
+            return Ok(None);
+        };
         let mut belief = self.clone();
         belief.out = self.belief_folder();
-        belief.config.learner = match estimator {
-            EstimatorKind::Neural => LearnerKind::Neural,
-            _ if estimator.sees_own_state() => LearnerKind::OwnFilter,
-            _ => LearnerKind::Filter,
-        };
+        belief.config.learner = by.learner.into();
         belief.resume = self.resume && belief.out.join(CHECKPOINT).exists();
-        let contents = belief.check()?;
-        let learned = contents.map(|contents| match belief.config.learner {
-            LearnerKind::Neural => Ok(contents.state::<SavedNeural>()?.world_steps),
-            _ => Ok::<_, anyhow::Error>(contents.state::<SavedFilter>()?.fit.world_steps),
-        });
-        let all = match belief.config.learner {
-            LearnerKind::Neural => self.config.neural.steps,
-            _ => self.config.decisions.filter_steps,
+        let kind = belief.learner()?;
+        let done = belief.check()?.map(|contents| (kind.done)(&contents));
+        let all = match (kind.steps)(&self.config) {
+            0 => self.config.decisions.filter_steps,
+            steps => steps,
         };
-        belief.steps = all.saturating_sub(learned.transpose()?.unwrap_or(0));
+        belief.steps = all.saturating_sub(done.transpose()?.unwrap_or(0));
         Ok((belief.steps > 0).then_some(belief))
     }
 
-    /// Whose belief decisions are to be learned on, if their training was left while that was learned.
-    pub fn estimator_of_belief(&self) -> Result<Option<EstimatorKind>> {
+    /// Whose belief decisions are to be learned on, if their training was left while that was learned; settings that its
+    /// checkpoint decides become those.
+    pub fn go_on_with_belief(&mut self) -> Result<Option<&'static BeliefKind>> {
         let place = self.belief_folder().join(CHECKPOINT);
         if self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
         }
-        let (_, contents) = checkpoint::read(&place, &[fit::KIND, fit::OWN_KIND, neural::KIND])?;
+        let (_, contents) = checkpoint::read(&place)?;
         let settings = contents.settings();
         let settings = settings.with_context(|| format!("checkpoint {}", place.display()))?;
-        let estimator = settings.decisions.estimator;
-        Ok(estimator.is_learned().then_some(estimator))
+        let belief = belief_of_saved(&settings.decisions.estimator);
+        let belief = belief.with_context(|| format!("checkpoint {}", place.display()))?;
+        let Some(by) = &belief.learned_by else {
+            return Ok(None);
+        };
+        let learner = learners::named(by.learner).map_err(anyhow::Error::msg)?;
+        (learner.adopt)(&contents, &mut self.config);
+        Ok(Some(belief))
     }
 
     /// Where [`Self::of_belief`] leaves its checkpoint.
@@ -114,12 +123,12 @@ impl TrainingSpec {
     /// The numbers of the robots on a server.
     pub(super) fn robots(&self, info: &ServerInfo) -> Result<Range<u32>> {
         let team = info.n_robots;
-        if self.config.learner == LearnerKind::Autoencoder {
-            ensure!(
-                team == 1,
-                "the autoencoder follows one robot: expected a server with --robots 1, got {team}"
-            );
-        }
+        let kind = self.learner()?;
+        ensure!(
+            team == 1 || !kind.is_single,
+            "the {} follows one robot: expected a server with --robots 1, got {team}",
+            kind.name
+        );
         let n_worlds = info.n_worlds;
         ensure!(
             self.worlds.end <= n_worlds,

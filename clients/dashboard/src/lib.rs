@@ -10,7 +10,7 @@
 pub mod access;
 pub mod album;
 pub mod entry;
-mod memory;
+mod last_seen;
 pub mod page;
 pub mod picture;
 pub mod player;

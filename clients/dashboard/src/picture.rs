@@ -6,7 +6,7 @@
 
 use crate::album::Strip;
 use crate::entry::Entry;
-use crate::memory::Memory;
+use crate::last_seen::LastSeen;
 use crate::scene::{Info, Lost, Player, Scene};
 use emberwatch_protocol::Airspace;
 use emberwatch_protocol::control::ServerStatus;
@@ -233,10 +233,10 @@ impl Arrays {
             frame[cell as usize] = value;
         }
         self.add_bytes("frame", &frame);
-        let memory = Memory::of(strip, serial, entry);
-        self.add_bytes("seen", &memory.seen);
-        self.add_bytes("age", &memory.age);
-        memory.since
+        let last = LastSeen::of(strip, serial, entry);
+        self.add_bytes("seen", &last.seen);
+        self.add_bytes("age", &last.age);
+        last.since
     }
 
     /// What lies on the grid; nothing where it is another than the server's.

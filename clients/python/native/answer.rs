@@ -1,7 +1,7 @@
 //! The answer to a step: results of the worlds, results of the robots, frames.
 
 use crate::refusal::invalid;
-use crate::samples::{Robot, World, of_robot, of_world};
+use crate::samples::{Robot, WorldRow, of_robot, of_world};
 use emberwatch_messages::message::{
     FLAG_TEAM_FRAMES, RobotResult, StepReply, WorldResult, worlds_of,
 };
@@ -156,7 +156,7 @@ impl Answer {
     }
 
     /// The fields of one robot's `WorldResult` and `RobotResult`.
-    fn result(&self, py: Python<'_>, index: usize) -> PyResult<(World, Robot)> {
+    fn result(&self, py: Python<'_>, index: usize) -> PyResult<(WorldRow, Robot)> {
         let (world, robot) = self.results_of(py, index)?;
         Ok((of_world(&world), of_robot(&robot)))
     }

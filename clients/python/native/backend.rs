@@ -1,12 +1,10 @@
-//! The backend of a connection, which answers its requests: a server, or worlds in this process.
+//! The worlds behind a connection: a server's, or worlds in this process.
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
 use crate::wire::Connection;
-use emberwatch_messages::control::ServerInfo;
-use emberwatch_messages::errors::ConnectionError;
+use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
-use emberwatch_messages::message::{StepReply, StepRequest};
 use emberwatch_sim::config::{Checked, ServerConfig};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
@@ -18,39 +16,16 @@ use std::time::{Duration, Instant};
 /// How long it may take to read settings and their files.
 const LONGEST_READ: Duration = Duration::from_secs(20);
 
-pub enum Backend {
-    Server(Box<Connection>),
+pub enum Worlds {
+    Served(Box<Connection>),
     Embedded(Box<Embedded>),
 }
 
-impl Backend {
-    pub fn info(&self) -> ServerInfo {
+impl Worlds {
+    pub fn backend(&mut self) -> &mut dyn Backend {
         match self {
-            Self::Server(wire) => wire.info().clone(),
-            Self::Embedded(worlds) => worlds.info(),
-        }
-    }
-
-    pub fn control_text(
-        &mut self,
-        text: &[u8],
-        timeout: Duration,
-    ) -> Result<Vec<u8>, ConnectionError> {
-        match self {
-            Self::Server(wire) => wire.control_text(text, timeout),
-            Self::Embedded(worlds) => worlds.control_text(text, timeout),
-        }
-    }
-
-    pub fn step_payload(
-        &mut self,
-        request: StepRequest,
-        body: &[u8],
-        timeout: Duration,
-    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
-        match self {
-            Self::Server(wire) => wire.step_payload(request, body, timeout),
-            Self::Embedded(worlds) => worlds.step_payload(request, body),
+            Self::Served(connection) => &mut **connection,
+            Self::Embedded(worlds) => &mut **worlds,
         }
     }
 }

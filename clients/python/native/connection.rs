@@ -1,19 +1,21 @@
 //! Connections, to a server or to embedded worlds.
 
 use crate::answer::Answer;
-use crate::backend::{Backend, embedded};
+use crate::backend::{Worlds, embedded};
 use crate::errors::{raise, raise_of_channel};
 use crate::model::shape_of;
 use crate::owned::Owned;
 use crate::refusal::invalid;
 use crate::samples::{Truth, truth_of};
 use crate::wire::Connection;
+use emberwatch_messages::backend::StepAnswer;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::instance::Instance;
-use emberwatch_messages::message::{StepReply, StepRequest, WorldResult};
+use emberwatch_messages::message::{StepRequest, WorldResult};
 use emberwatch_model::Shape;
 use emberwatch_sim::embedded::INSTANCE;
+use emberwatch_sim::results::world_result;
 use emberwatch_sim::world::Episode;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
@@ -26,16 +28,11 @@ const BRIEF_NANOS: u64 = 1_000_000;
 /// A connection to a server, or worlds in this process. Threads may share it: they take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Server {
-    pub backend: Owned<Backend>,
-    /// What the server said of itself, as JSON.
-    #[pyo3(get)]
-    info: String,
-    pub team: u32,
-    pub n_moves: usize,
+    pub worlds: Owned<Worlds>,
+    /// What the server said of itself.
+    pub info: ServerInfo,
     /// Height and width of the grid.
-    pub shape: Shape,
-    /// How long a step waits for teammates.
-    pub deadline: Duration,
+    shape: Shape,
     is_embedded: bool,
     /// Duration of the last step divided by its number of robots, nanoseconds; 0 before the first step.
     nanos_of_robot: AtomicU64,
@@ -48,7 +45,7 @@ impl Server {
         let name = checked(py, instance)?;
         let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
         let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
-        Self::of(py, instance, Backend::Server(Box::new(wire)))
+        Self::of(py, instance, Worlds::Served(Box::new(wire)))
     }
 
     /// Worlds in this process, of these settings of `config/server.toml`, as JSON. `warns`: of starts that no-fly cells
@@ -56,8 +53,14 @@ impl Server {
     #[staticmethod]
     #[pyo3(name = "embedded")]
     fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
-        let worlds = Backend::Embedded(Box::new(embedded(py, settings, warns)?));
+        let worlds = Worlds::Embedded(Box::new(embedded(py, settings, warns)?));
         Self::of(py, INSTANCE, worlds)
+    }
+
+    /// What the server said of itself, as JSON.
+    #[getter]
+    fn info(&self) -> String {
+        serde_json::to_string(&self.info).expect("invariant: replies serialise")
     }
 
     /// Hidden states of consecutive embedded worlds that publish them, as the fields of `Truth`.
@@ -68,14 +71,14 @@ impl Server {
         n_worlds: usize,
     ) -> PyResult<Vec<Truth<'py>>> {
         let worlds = first_world..first_world.saturating_add(n_worlds);
-        let read = |backend: &mut Backend| match backend {
-            Backend::Embedded(own) if own.publishes_truth() => {
+        let read = |from: &mut Worlds| match from {
+            Worlds::Embedded(own) if self.info.publish_truth => {
                 let found = own.episodes(worlds.clone())?;
                 Ok(found.map(|found| worlds.zip(found).map(copied).collect::<Vec<_>>()))
             }
             _ => Ok(None),
         };
-        let found = self.backend.with(py, read)?;
+        let found = self.worlds.with(py, read)?;
         let found = found.map_err(|error| raise(py, error, "truths", 0.0))?;
         let Some(found) = found else {
             let expected = "embedded worlds with publish_truth that are not in a reset";
@@ -89,9 +92,8 @@ impl Server {
 
     /// Sends JSON text, `what` in errors; returns that of the answer.
     fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
-        let answer = self
-            .backend
-            .with(py, |backend| backend.control_text(text, duration(seconds)))?;
+        let ask = |to: &mut Worlds| to.backend().control_text(text, duration(seconds));
+        let answer = self.worlds.with(py, ask)?;
         decoded(answer).map_err(|error| raise(py, error, what, seconds))
     }
 
@@ -118,28 +120,25 @@ impl Server {
             flags,
             ..StepRequest::default()
         };
-        let step = |to: &mut Backend| to.step_payload(request, body, duration(seconds));
-        let answer = self.backend.with(py, step)?;
+        let step = |to: &mut Worlds| to.backend().step(request, body, duration(seconds));
+        let answer = self.worlds.with(py, step)?;
         self.answered(py, answer, seconds)
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.backend.close(py)
+        self.worlds.close(py)
     }
 }
 
 impl Server {
-    fn of(py: Python<'_>, instance: &str, backend: Backend) -> PyResult<Self> {
-        let info: ServerInfo = backend.info();
+    fn of(py: Python<'_>, instance: &str, mut worlds: Worlds) -> PyResult<Self> {
+        let info = worlds.backend().info().clone();
         Ok(Self {
             shape: shape_of(py, info.height, info.width)?,
-            deadline: Duration::from_millis(info.deadline_millis),
-            is_embedded: matches!(backend, Backend::Embedded(_)),
+            is_embedded: matches!(worlds, Worlds::Embedded(_)),
             nanos_of_robot: AtomicU64::new(0),
-            info: serde_json::to_string(&info).expect("invariant: replies serialise"),
-            team: info.n_robots.max(1),
-            n_moves: info.n_moves,
-            backend: Owned::new(instance, backend),
+            info,
+            worlds: Owned::new(instance, worlds),
         })
     }
 
@@ -147,11 +146,12 @@ impl Server {
     pub fn answered(
         &self,
         py: Python<'_>,
-        answer: Result<(StepReply, Vec<u8>), ConnectionError>,
+        answer: Result<StepAnswer, ConnectionError>,
         seconds: f64,
     ) -> PyResult<Answer> {
         let (reply, payload) = answer.map_err(|error| raise(py, error, "a step", seconds))?;
-        Ok(Answer::of(py, self.team, self.shape, &reply, payload))
+        let team = self.info.n_robots;
+        Ok(Answer::of(py, team, self.shape, &reply, payload))
     }
 
     /// Whether a step of this number of robots ends so soon that other Python threads need not get the interpreter: to
@@ -170,7 +170,11 @@ impl Server {
 
 /// A world's present, without the interpreter.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
-    (world, *episode.result(), episode.states().to_owned())
+    (
+        world,
+        world_result(episode.outcome()),
+        episode.states().to_owned(),
+    )
 }
 
 /// Checks an instance's name.

@@ -13,7 +13,7 @@ use std::ffi::CString;
 use std::fmt::Display;
 
 thread_local! {
-    /// What a signal's handler raised during a wait of this thread.
+    /// What Python raised during a wait of this thread, such as in a signal's handler.
     static RAISED: RefCell<Option<PyErr>> = const { RefCell::new(None) };
 }
 
@@ -32,6 +32,12 @@ pub fn interrupted() -> bool {
                 true
             }
         })
+}
+
+/// An exception as the end of a wait; [`raise`] raises it.
+pub fn interruption(raised: PyErr) -> ConnectionError {
+    RAISED.set(Some(raised));
+    ChannelError::Interrupted.into()
 }
 
 /// An error of the class of this name in `emberwatch/errors.py`, or made by its function.

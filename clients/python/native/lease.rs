@@ -1,40 +1,31 @@
 //! A lease: the right to fly consecutive robots, and the step k for which each world's next path is.
 
 use crate::answer::Answer;
-use crate::backend::Backend;
+use crate::backend::Worlds;
 use crate::connection::{Server, duration};
+use crate::errors::interruption;
 use crate::moves;
 use crate::refusal::invalid;
+use emberwatch_messages::backend::StepAnswer;
 use emberwatch_messages::errors::ConnectionError;
-use emberwatch_messages::message::worlds_of;
-use emberwatch_messages::message::{Operation, Status, StepReply, StepRequest, WorldResult};
-use emberwatch_messages::payload::{WORLD_BYTES, write_step_body};
-use emberwatch_messages::resend::{Flown, until_moved};
+use emberwatch_messages::lease::{self, Call};
+use emberwatch_messages::message::{Operation, worlds_of};
 use pyo3::prelude::*;
-use std::ops::Range;
-use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
-/// The steps of a lease's worlds.
+/// A lease on robots of a server.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Lease {
     server: Py<Server>,
-    number: u64,
-    worlds: Range<u32>,
-    steps: Mutex<Vec<u64>>,
+    lease: lease::Lease,
 }
 
 #[pymethods]
 impl Lease {
     #[new]
     fn new(server: Py<Server>, number: u64, first_robot: u32, n_robots: u32) -> Self {
-        let worlds = worlds_of(first_robot, n_robots, server.get().team);
-        Self {
-            server,
-            number,
-            steps: Mutex::new(vec![0; worlds.len()]),
-            worlds,
-        }
+        let robots = first_robot..first_robot.saturating_add(n_robots);
+        let lease = lease::Lease::new(&server.get().info, number, &robots);
+        Self { server, lease }
     }
 
     /// Flies a path with each robot; `None` if the paths must be converted first, see `moves::paths`.
@@ -50,8 +41,8 @@ impl Lease {
         let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
             return Ok(None);
         };
-        let request = self.step_request(first_robot, n_robots, flags);
-        let answer = self.ask(py, request, &moves, &mut Vec::new(), duration(seconds))?;
+        let place = (first_robot, n_robots, flags);
+        let answer = self.ask(py, &mut self.call(Operation::Step, place, &moves, seconds));
         self.server.get().answered(py, answer, seconds).map(Some)
     }
 
@@ -67,41 +58,21 @@ impl Lease {
         accepts_late: bool,
         seconds: f64,
     ) -> PyResult<Option<(Answer, u64)>> {
-        let server = self.server.get();
         let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
             return Ok(None);
         };
-        let request = self.step_request(first_robot, n_robots, 0);
-        let first_world = worlds_of(first_robot, 1, server.team).start;
-        // Sooner would take back the path with which the deadline began.
-        let timeout = duration(seconds).saturating_add(server.deadline);
-        // Each world's step for which the paths are meant, known once they are sent.
-        let mut steps = Vec::new();
-        let send = |steps: &mut Vec<u64>| match self.ask(py, request, &moves, steps, timeout)? {
-            Err(ConnectionError::Timeout { .. }) => Ok(None),
-            Err(ConnectionError::Refused { status, .. })
-                if accepts_late && status == Status::Late =>
-            {
-                Ok(None)
-            }
-            answer => server.answered(py, answer, seconds).map(Some),
+        let paths = self.call(Operation::Step, (first_robot, n_robots, 0), &moves, seconds);
+        let send = |call: &mut Call<'_>| self.ask(py, call);
+        let waits = || {
+            let warned = self.warn_of_wait(py, first_robot);
+            warned.map(|()| false).map_err(interruption)
         };
-        let look = |steps: &mut Vec<u64>| {
-            let seen = self.observe(py, first_robot, n_robots, 0, seconds)?;
-            if steps.first().is_some_and(|&before| seen.step() > before) {
-                return Ok(Some(seen));
-            }
-            warn_of_wait(py, first_world)?;
-            Ok(None)
-        };
-        match until_moved(&mut steps, send, look, || false)? {
-            Flown::Answered(answer) => Ok(Some((answer, 0))),
-            Flown::Observed(seen) => {
-                let n_moved = seen.step() - steps[0];
-                Ok(Some((seen, n_moved - 1)))
-            }
-            Flown::GivenUp => unreachable!("invariant: it is never given up"),
-        }
+        let flown = self.lease.fly(paths, accepts_late, send, waits);
+        let flown = flown.map(|flown| flown.expect("invariant: it is never given up"));
+        let n_skipped = flown.as_ref().map_or(0, |flown| flown.1);
+        let answer = flown.map(|flown| flown.0);
+        let answer = self.server.get().answered(py, answer, seconds)?;
+        Ok(Some((answer, n_skipped)))
     }
 
     /// The last results and frames again; steps go on from there.
@@ -113,48 +84,34 @@ impl Lease {
         flags: u32,
         seconds: f64,
     ) -> PyResult<Answer> {
-        let request = self.request(Operation::Observe, first_robot, n_robots, flags);
-        let answer = self.ask(py, request, &[], &mut Vec::new(), duration(seconds))?;
+        let place = (first_robot, n_robots, flags);
+        let answer = self.ask(py, &mut self.call(Operation::Observe, place, &[], seconds));
         self.server.get().answered(py, answer, seconds)
     }
 
     /// From here on a world of the lease is at this step.
     fn note(&self, world: u32, step: u64) {
-        let (index, mut noted) = (world.checked_sub(self.worlds.start), self.noted());
-        if let Some(noted) = index.and_then(|index| noted.get_mut(index as usize)) {
-            *noted = step;
-        }
+        self.lease.note(world, step);
     }
 
     /// The step of each world.
     #[getter]
     fn steps(&self) -> Vec<u64> {
-        self.noted().clone()
+        self.lease.steps()
     }
 }
 
 impl Lease {
-    fn request(
+    fn call<'a>(
         &self,
         operation: Operation,
-        first_robot: u32,
-        n_robots: u32,
-        flags: u32,
-    ) -> StepRequest {
-        StepRequest {
-            operation: operation as u32,
-            lease: self.number,
-            first_robot,
-            n_robots,
-            flags,
-            ..StepRequest::default()
-        }
-    }
-
-    fn step_request(&self, first_robot: u32, n_robots: u32, flags: u32) -> StepRequest {
-        let n_moves = self.server.get().n_moves as u32;
-        let request = self.request(Operation::Step, first_robot, n_robots, flags);
-        StepRequest { n_moves, ..request }
+        (first_robot, n_robots, flags): (u32, u32, u32),
+        moves: &'a [u8],
+        seconds: f64,
+    ) -> Call<'a> {
+        let robots = first_robot..first_robot.saturating_add(n_robots);
+        let request = self.lease.request(operation, &robots, flags);
+        Call::new(request, moves, duration(seconds))
     }
 
     /// Checks paths of robots of the lease.
@@ -164,94 +121,45 @@ impl Lease {
         first_robot: u32,
         n_robots: u32,
     ) -> PyResult<Option<Vec<u8>>> {
-        let server = self.server.get();
-        let worlds = worlds_of(first_robot, n_robots, server.team);
-        if worlds.start < self.worlds.start || worlds.end > self.worlds.end {
-            let expected = format!("robots of worlds {:?}", self.worlds);
+        let (info, own) = (&self.server.get().info, self.lease.worlds());
+        let worlds = worlds_of(first_robot, n_robots, info.n_robots);
+        if worlds.start < own.start || worlds.end > own.end {
+            let expected = format!("robots of worlds {own:?}");
             let got = format!("{n_robots} from {first_robot} on");
             return Err(invalid(paths.py(), "step", expected, got));
         }
-        Ok(moves::paths(paths, n_robots as usize, server.n_moves))
+        Ok(moves::paths(paths, n_robots as usize, info.n_moves))
     }
 
-    /// Sends a request. `steps`: the step of each world for which the paths are meant; if empty, it is filled with the
-    /// steps at which the worlds were last seen.
-    fn ask(
-        &self,
-        py: Python<'_>,
-        request: StepRequest,
-        moves: &[u8],
-        steps: &mut Vec<u64>,
-        timeout: Duration,
-    ) -> PyResult<Result<(StepReply, Vec<u8>), ConnectionError>> {
-        let server = self.server.get();
-        let worlds = worlds_of(request.first_robot, request.n_robots, server.team);
-        let n_worlds = worlds.len();
-        // Within the connection's turn: each thread's path is for a step of its own.
-        let exchange = |backend: &mut Backend| {
-            self.exchange(backend, worlds, request, (moves, steps), timeout)
+    /// Sends a request while no other thread uses the connection: each thread's path is for a step of its own.
+    fn ask(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
+        let (server, request) = (self.server.get(), *call.request());
+        let send = |worlds: &mut Worlds| self.lease.send(worlds.backend(), call);
+        let answer = if server.is_brief(request.n_robots) {
+            if worlds_of(request.first_robot, request.n_robots, server.info.n_robots).len() > 1 {
+                server.worlds.check(py).map_err(interruption)?;
+            }
+            server.worlds.with_briefly(py, send)
+        } else {
+            server.worlds.with(py, send)
         };
-        if !server.is_brief(request.n_robots) {
-            return server.backend.with(py, exchange);
-        }
-        if n_worlds > 1 {
-            server.backend.check(py)?;
-        }
-        server.backend.with_briefly(py, exchange)
-    }
-
-    fn exchange(
-        &self,
-        backend: &mut Backend,
-        worlds: Range<u32>,
-        request: StepRequest,
-        (moves, steps): (&[u8], &mut Vec<u64>),
-        timeout: Duration,
-    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
-        let mut body = Vec::new();
+        let answer = answer.map_err(interruption)??;
         if request.operation == Operation::Step as u32 {
-            if steps.is_empty() {
-                steps.extend_from_slice(&self.noted()[self.indices(&worlds)]);
-            }
-            write_step_body(steps, moves, &mut body);
+            server.took(answer.0.simulation_nanos, request.n_robots);
         }
-        let (reply, payload) = backend.step_payload(request, &body, timeout)?;
-        if !moves.is_empty() {
-            let server = self.server.get();
-            server.took(reply.simulation_nanos, request.n_robots);
-        }
-        // Robots outside the lease may be observed, too.
-        let own = worlds.start.max(self.worlds.start)..worlds.end.min(self.worlds.end);
-        if !own.is_empty() {
-            let skipped = (own.start - worlds.start) as usize;
-            let results = payload.chunks_exact(WORLD_BYTES).skip(skipped);
-            let mut noted = self.noted();
-            for (noted, result) in noted[self.indices(&own)].iter_mut().zip(results) {
-                let result: WorldResult = bytemuck::pod_read_unaligned(result);
-                *noted = result.step;
-            }
-        }
-        Ok((reply, payload))
+        Ok(answer)
     }
 
-    /// The positions of these worlds in `steps`.
-    fn indices(&self, worlds: &Range<u32>) -> Range<usize> {
-        (worlds.start - self.worlds.start) as usize..(worlds.end - self.worlds.start) as usize
+    /// Logs that a step waits for other robots.
+    fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
+        let world = worlds_of(first_robot, 1, self.server.get().info.n_robots).start;
+        let text = format!(
+            "world {world} waits for the paths of other robots that are held; environments of one world need a thread or \
+             a process each"
+        );
+        let logger = py
+            .import("logging")?
+            .call_method1("getLogger", ("emberwatch",))?;
+        logger.call_method1("warning", (text,)).map(|_| ())
     }
-
-    fn noted(&self) -> MutexGuard<'_, Vec<u64>> {
-        self.steps.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// Logs that a step waits for other robots.
-fn warn_of_wait(py: Python<'_>, world: u32) -> PyResult<()> {
-    let text = format!(
-        "world {world} waits for the paths of other robots that are held; environments of one world need a thread or a \
-         process each"
-    );
-    let logger = py
-        .import("logging")?
-        .call_method1("getLogger", ("emberwatch",))?;
-    logger.call_method1("warning", (text,)).map(|_| ())
 }

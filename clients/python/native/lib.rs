@@ -25,6 +25,10 @@ mod windows;
 mod wire;
 
 use emberwatch_messages::interrupt::interrupt_when;
+use emberwatch_model::grid::MAX_SIDE;
+use emberwatch_model::path::MAX_MOVES;
+use emberwatch_model::task::FIRST_TRAINING_SEED;
+use emberwatch_model::{MAX_RADIUS, MAX_VALUES};
 use pyo3::prelude::*;
 
 #[pymodule]
@@ -47,12 +51,18 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<belief::Transition>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
+    module.add_function(wrap_pyfunction!(options::estimator_names, module)?)?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
     module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
+    module.add("FIRST_TRAINING_SEED", FIRST_TRAINING_SEED)?;
+    module.add("MAX_MOVES", MAX_MOVES)?;
+    module.add("MAX_RADIUS", MAX_RADIUS)?;
+    module.add("MAX_SIDE", MAX_SIDE)?;
+    module.add("MAX_VALUES", MAX_VALUES)?;
     module.add_function(wrap_pyfunction!(model::built_in, module)?)?;
     module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::grid_of_maps, module)?)?;
@@ -60,5 +70,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(model::model_with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;
-    module.add_function(wrap_pyfunction!(planning::beam_search, module)?)
+    module.add_function(wrap_pyfunction!(planning::beam_search, module)?)?;
+    module.add_function(wrap_pyfunction!(refusal::explain, module)?)
 }

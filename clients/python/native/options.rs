@@ -15,10 +15,10 @@ use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::estimator::EstimatorError;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
+use emberwatch_learning::beliefs::{self, BeliefKind, NEURAL};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::options::{Crew, Planned, Shown};
-use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_learning::learners;
+use emberwatch_learning::options::{Crew, Planned, Shown, usual};
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};
@@ -45,6 +45,14 @@ pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
         OPTIONS.iter().map(|option| option.name).collect(),
         feature_names(),
     )
+}
+
+/// Name of each estimator that options can be planned on, and what it is.
+#[pyfunction]
+pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
+    let serves = |kind: &&BeliefKind| beliefs::of_options(kind.label).is_ok();
+    let kinds = beliefs::BELIEFS.iter().copied().filter(serves);
+    kinds.map(|kind| (kind.label, kind.about)).collect()
 }
 
 /// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
@@ -95,7 +103,7 @@ struct Watched {
 }
 
 /// The observation of one world, and what to do with it.
-struct Task<'a> {
+struct WorldWork<'a> {
     index: usize,
     planned: &'a mut Planned,
     world: WorldResult,
@@ -129,17 +137,17 @@ impl Options {
         prior: &str,
         watched: Option<(String, u32)>,
     ) -> PyResult<Self> {
-        let estimator = estimator.map(str::parse).transpose();
-        let estimator: Option<EstimatorKind> =
-            estimator.map_err(|problem: String| refused(py, format!("estimator: {problem}")))?;
+        let estimator = estimator.map(beliefs::of_options).transpose();
+        let estimator =
+            estimator.map_err(|problem| refused(py, format!("estimator: {problem}")))?;
         let kind: PriorKind = serde_json::from_value(prior.into()).map_err(|_| {
             let got = format!("'{prior}'");
             invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
         })?;
-        let learned = py.detach(|| Learned::read(checkpoint.as_deref(), &Device::Cpu));
+        let learned = py.detach(|| learners::read(checkpoint.as_deref(), &Device::Cpu));
         let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
         let shape = shape_of(py, spec.height, spec.width)?;
-        let kind_of_belief = estimator.unwrap_or_else(|| learned.estimator());
+        let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));
         let model = model(py, &spec, kind_of_belief)?;
         let crew = Crew::new(estimator, learned, model, shape, spec.n_moves);
         let crew = crew.map_err(|error| refused(py, format!("{error:#}")))?;
@@ -147,7 +155,7 @@ impl Options {
             prior: kind,
             ..AgentConfig::default()
         };
-        let first = if crew.estimator().knows_model() {
+        let first = if crew.estimator().knows_model {
             config.prior(spec.burn_in)
         } else {
             Prior::Initial
@@ -160,7 +168,7 @@ impl Options {
             })
         });
         Ok(Self {
-            estimator: crew.estimator().label(),
+            estimator: crew.estimator().label.into(),
             first: (first, crew.model().clone()),
             prior: OnceLock::new(),
             state: Owned::new(
@@ -301,7 +309,7 @@ impl State {
             let (planned, row) = (planned.as_mut()?, row?);
             let result = &results[row * RESULT_BYTES..][..RESULT_BYTES];
             let (world, robot) = result.split_at(WORLD_BYTES);
-            Some(Task {
+            Some(WorldWork {
                 index,
                 planned,
                 world: bytemuck::pod_read_unaligned(world),
@@ -350,7 +358,7 @@ impl State {
         if n_worlds == 0 {
             Vec::new()
         } else {
-            feed.turn(n_worlds)
+            feed.due(n_worlds)
         }
     }
 
@@ -374,7 +382,7 @@ impl State {
     }
 }
 
-impl Task<'_> {
+impl WorldWork<'_> {
     fn done(self, crew: &Crew) -> Result<Option<Outlook>> {
         let planned = self.planned;
         let mut outlook = None;
@@ -408,7 +416,7 @@ fn in_parallel<T: Send, U: Send>(
     tasks: Vec<T>,
     work: impl Fn(T) -> U + Send + Sync,
 ) -> Vec<U> {
-    if tasks.len() == 1 && crew.estimator() != EstimatorKind::Neural {
+    if tasks.len() == 1 && *crew.estimator() != NEURAL {
         return tasks.into_iter().map(work).collect();
     }
     if threads.is_none() {
@@ -422,18 +430,18 @@ fn in_parallel<T: Send, U: Send>(
 }
 
 /// The model that filters know, or a stand-in where the worlds' model is hidden.
-fn model(py: Python<'_>, spec: &Spec<'_>, estimator: EstimatorKind) -> PyResult<Model> {
+fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Model> {
     if let Some(model) = &spec.model {
         return model_of(&model.toml);
     }
-    if estimator.knows_model() {
+    if estimator.knows_model {
         let got = match spec.description {
             Some(_) => "recorded worlds, which have none",
             None => "a server that hides its own",
         };
         let expected = format!(
             "one for the estimator '{}', or a checkpoint of a learned belief",
-            estimator.label()
+            estimator.label
         );
         return Err(invalid(py, "model", expected, got));
     }

@@ -10,7 +10,7 @@ use numpy::ndarray::Array2;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 
-pub type World = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
+pub type WorldRow = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
 pub type Robot = (f64, f64, u32, u32, u32, u32, u32, u32, u32, u32);
 
 /// Its result, what it saw, and the path that it flew.
@@ -19,7 +19,7 @@ type RobotFrame<'py> = (Robot, Bound<'py, PyArray2<u8>>, Bound<'py, PyArray1<u8>
 #[derive(IntoPyObject)]
 pub struct Frame<'py> {
     world: u32,
-    result: World,
+    result: WorldRow,
     robots: Vec<RobotFrame<'py>>,
     n_lost: u64,
 }
@@ -181,7 +181,7 @@ pub fn outlook<'py>(
 }
 
 /// The fields of `WorldResult`.
-pub fn of_world(it: &WorldResult) -> World {
+pub fn of_world(it: &WorldResult) -> WorldRow {
     (
         it.step,
         it.seed,

@@ -34,7 +34,7 @@ BELIEFS: dict[str, dict[str, Any]] = {
         "checkpoint": "learned_filter",
         "estimator": "learned_spatial_filter",
     },
-    "learned_own_filter": {"checkpoint": "learned_own_filter"},
+    "learned_filter, own kernels": {"checkpoint": "own_kernels"},
     "neural_belief": {"checkpoint": "neural_belief"},
 }
 

@@ -342,7 +342,7 @@ def test_the_filter_knows_zones_and_rings() -> None:
         Transition(model, height=5, width=5).apply(np.full((3, 5, 5), 1 / 3))
 
 
-def test_a_server_tells_zones_that_learners_may_know(seeing: Any) -> None:
+def test_a_server_tells_zones(seeing: Any) -> None:
     path = seeing(zone_map=np.eye(*SHAPE, dtype=np.uint8))["model"]
     keys = {"height": 7, "width": 5, "moves": 4, "burn_in": 5, "model": path}
     for info in (server(**keys).connect().info, closed_later(emberwatch.embed(**keys)).info):
@@ -350,8 +350,6 @@ def test_a_server_tells_zones_that_learners_may_know(seeing: Any) -> None:
         assert info.zones is not None and info.zones.names == ("land", "sea")
         assert info.zones.map.tolist() == np.eye(*SHAPE, dtype=int).tolist()
         assert info.zones.colors == ("#010203", "#040506")
-    path.write_text("zones_public = false\n" + path.read_text())
-    assert closed_later(emberwatch.embed(**keys)).info.zones is None
 
 
 @pytest.mark.parametrize("air", [{}, {"radius": 1}, {"radius": 1, "pays": "seen"}], ids=str)

@@ -11,6 +11,9 @@ import pytest
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
 
 from emberwatch.landscape.__main__ import main
+from emberwatch.landscape.fire import MOST_STATES
+from emberwatch.landscape.layers import MOST_CELLS
+from emberwatch.landscape.numpy_file import MOST_BYTES
 
 ARRIVALS = ("--kind", "arrival", "--step", "10 min", "--burning", "2", "--unit", "min")
 MASKS = ("--kind", "mask", "--step", "10 min", "--burning", "2")
@@ -571,3 +574,13 @@ def test_damaged_numpy_files_are_refused_or_read(
             (line,) = capsys.readouterr().err.splitlines()
             told.add(line.partition("got: ")[2])
     assert len(told) > 3, told
+
+
+def test_the_limits_are_on_the_page() -> None:
+    page = (Path(__file__).parents[3] / "docs/landscapes.md").read_text("utf-8")
+    for words in (
+        f"more than {MOST_STATES >> 30} GiB of states",
+        f"a layer of more than {MOST_CELLS:,} cells",
+        f"a NumPy array of more than {MOST_BYTES >> 30} GiB",
+    ):
+        assert words in page

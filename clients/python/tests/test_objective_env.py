@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
 import os
 import pickle
+import re
 import subprocess
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import environments
 import golden_options
@@ -26,7 +28,8 @@ from gymnasium.utils.env_checker import check_env
 from processes import eventually, find, server
 
 import emberwatch
-from emberwatch import errors
+from emberwatch import _native, errors
+from emberwatch.envs.plans import Estimator
 from emberwatch.wrappers import BeliefObservation
 
 GOLDEN = np.load(golden_options.FILE)
@@ -86,6 +89,18 @@ def test_actions_and_numbers_have_names(env: Any) -> None:
     assert np.allclose(named["n_paths"], 1 / 200)
 
 
+def test_types_documents_and_refusals_name_the_same_estimators() -> None:
+    estimators = _native.estimator_names()
+    names = [name for name, _ in estimators]
+    assert list(get_args(Estimator)) == names
+    lines = [f'* `"{name}"`: {about}' for name, about in estimators]
+    document = inspect.getdoc(emberwatch.WildfireObjectiveEnv)
+    assert document is not None
+    assert re.findall(r'\* `".*', document) == lines
+    with refuses(f"estimator: expected one of {', '.join(names)}, got"):
+        make(estimator="truth")
+
+
 @pytest.mark.filterwarnings("ignore:.*is out of date")
 def test_the_former_version_is_named() -> None:
     with pytest.raises(gymnasium.error.DeprecatedEnv, match="WildfireObjective-v1"):
@@ -108,7 +123,7 @@ def trained(folder: Path, **world: object) -> Path:
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the checkpoints of the golden episodes, by what they are of."""
     folder = tmp_path_factory.mktemp("checkpoints")
-    for name in ("learned_filter", "learned_own_filter", "neural_belief"):
+    for name in ("learned_filter", "own_kernels", "neural_belief"):
         (folder / name).write_bytes(GOLDEN[f"checkpoint {name}"].tobytes())
     return folder
 
@@ -137,7 +152,7 @@ def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> 
             assert_same(value, expected, key)
 
 
-@pytest.mark.parametrize("name", ["spatial_filter", "learned_own_filter", "neural_belief"])
+@pytest.mark.parametrize("name", ["spatial_filter", "learned_filter, own kernels", "neural_belief"])
 @pytest.mark.parametrize("is_left", [True, False])
 def test_the_next_one_goes_on_from_the_same_belief(
     name: str, is_left: bool, checkpoints: Path
@@ -193,8 +208,8 @@ def ringed(folder: Path) -> Path:
 
 
 def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Path) -> None:
-    with refuses("checkpoint: expected one of a learned_own_filter, got none"):
-        make(checkpoint=checkpoints / "learned_filter", estimator="learned_own_filter")
+    with refuses("checkpoint.*of `train --learner neural`"):
+        make(checkpoint=checkpoints / "own_kernels", estimator="neural_belief")
     for name in ("learned_filter", "neural_belief"):
         for maker in (make, make_vec):
             with refuses("checkpoint: expected 6 observations as the world's, got 3"):
@@ -286,10 +301,10 @@ def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("policy", "estimator"),
-    [("known_exploit", "known_model"), ("spatial_exploit", "spatial_filter")],
+    ("belief", "estimator"),
+    [("known", "known_model"), ("known+spatial", "spatial_filter")],
 )
-def test_exploiting_makes_the_steps_of_a_policy_that_does(policy: str, estimator: str) -> None:
+def test_exploiting_makes_the_steps_of_a_policy_that_does(belief: str, estimator: str) -> None:
     found = []
     for flies in (False, True):
         started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
@@ -300,6 +315,7 @@ def test_exploiting_makes_the_steps_of_a_policy_that_does(policy: str, estimator
             for _ in range(5):
                 env.step(0)
         else:
+            policy = f"{belief}/options/exploit"
             flags = ["--instance", started.instance, "--policy", policy, "--steps", "5"]
             command = [find("emberwatch-agent"), "run", "--prior", "initial", *flags]
             subprocess.run(command, check=True, capture_output=True, timeout=60)
@@ -369,7 +385,7 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: obj
         ({"prior": None}, "prior: expected the name of one, got None"),
         ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
-        ({"estimator": "neural_belief"}, "checkpoint: expected one of a neural_belief, got none"),
+        ({"estimator": "neural_belief"}, "checkpoint.*of `train --learner neural`"),
     ],
 )
 @pytest.mark.parametrize("maker", [make, make_vec])

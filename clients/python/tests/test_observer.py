@@ -3,12 +3,12 @@
 import subprocess
 from collections.abc import Callable
 
+import document
 import numpy as np
 import pytest
 from failures import fails, refuses
 from processes import PATIENCE, eventually, find, server, services, unused_instance
 
-from emberwatch.client import wire
 from emberwatch.client.observer import (
     Frame,
     Observer,
@@ -17,6 +17,9 @@ from emberwatch.client.observer import (
     TruthReader,
     observe,
 )
+
+LIMITS = document.limits()
+FRAME_BUFFER = LIMITS["FRAME_BUFFER"]
 
 
 def frames_until(observer: Observer, step: int, world: int = 0, seed: int = 0) -> list[Frame]:
@@ -112,15 +115,15 @@ def test_what_a_slow_observer_misses_is_counted() -> None:
         lease.step(paths(0))
         frames_until(slow, 1), frames_until(quick, 1)
         n_published = 0
-        for k in range(2, 2 * wire.FRAME_BUFFER + 1):
+        for k in range(2, 2 * FRAME_BUFFER + 1):
             lease.step(paths(k))
             n_published += len(frames_until(quick, k))
-        frames = frames_until(slow, 2 * wire.FRAME_BUFFER)
-    assert len(frames) == wire.FRAME_BUFFER, "the newest are kept"
-    assert frames[0].n_lost == n_published - wire.FRAME_BUFFER
+        frames = frames_until(slow, 2 * FRAME_BUFFER)
+    assert len(frames) == FRAME_BUFFER, "the newest are kept"
+    assert frames[0].n_lost == n_published - FRAME_BUFFER
     assert sum(frame.n_lost for frame in frames[1:]) == 0
     steps = [frame.result.step for frame in frames]
-    assert steps == list(range(wire.FRAME_BUFFER + 1, 2 * wire.FRAME_BUFFER + 1))
+    assert steps == list(range(FRAME_BUFFER + 1, 2 * FRAME_BUFFER + 1))
 
 
 def test_losses_among_other_worlds_are_counted() -> None:
@@ -128,14 +131,14 @@ def test_losses_among_other_worlds_are_counted() -> None:
     lease = started.connect().acquire(0, 2)
     with observe(started.instance, world=1) as observer, observe(started.instance) as other:
         frames_until(observer, 0, world=1)
-        for k in range(wire.FRAME_BUFFER):
+        for k in range(FRAME_BUFFER):
             lease.step(paths(k, 2))
-        frames_until(other, wire.FRAME_BUFFER, world=1)  # Published after the answer.
+        frames_until(other, FRAME_BUFFER, world=1)  # Published after the answer.
         # World 0 is published first, so that the gap ends at a sample of the other world.
-        frames = frames_until(observer, wire.FRAME_BUFFER, world=1)
+        frames = frames_until(observer, FRAME_BUFFER, world=1)
     # One observer may get the last sample a moment before the other.
-    assert abs(len(frames) - wire.FRAME_BUFFER // 2) <= 1
-    assert frames[0].n_lost >= wire.FRAME_BUFFER - 2
+    assert abs(len(frames) - FRAME_BUFFER // 2) <= 1
+    assert frames[0].n_lost >= FRAME_BUFFER - 2
     assert sum(frame.n_lost for frame in frames[1:]) == 0
 
 
@@ -240,9 +243,9 @@ def test_an_agent_s_beliefs_are_read() -> None:
 @pytest.mark.parametrize(
     "make, limit",
     [
-        (observe, wire.MAX_OBSERVERS),
-        (TruthReader, wire.MAX_TRUTH_READERS),
-        (OutlookReader, wire.MAX_AGENT_READERS),
+        (observe, LIMITS["MAX_OBSERVERS"]),
+        (TruthReader, LIMITS["MAX_TRUTH_READERS"]),
+        (OutlookReader, LIMITS["MAX_AGENT_READERS"]),
     ],
 )
 def test_one_too_many_is_told_the_limit_and_others_go_on(

@@ -25,20 +25,10 @@ with warnings.catch_warnings(action="ignore"):  # of its own games, which it imp
 
 CONFIG = Path(__file__).parents[3] / "config"
 
-PREFIXES = {
-    "wildfire": "Wildfire",
-    "small": "WildfireSmall",
-    "sparse": "WildfireSparse",
-    "latent": "WildfireLatent",
-    "burnout": "WildfireBurnout",
-    "terrain": "WildfireTerrain",
-    "road-ice": "RoadIce",
-    "team": "WildfireTeam",
-    "jacksboro": "Jacksboro",
-}
+TASKS = built_in_tasks()
 
 #: Those that one robot flies in.
-ALONE = [name for name in PREFIXES if name != "team"]
+ALONE = [name for name, task in TASKS.items() if task.robots == 1]
 
 
 def warns_of_tests(name: str) -> Any:
@@ -52,27 +42,28 @@ def by_hand(name: str) -> dict[str, Any]:
     """The keywords that a task stands for."""
     file = tomllib.loads((CONFIG / f"tasks/{name}.toml").read_text("utf-8"))
     renamed = {"n_moves" if key == "moves" else key: value for key, value in file.items()}
-    not_keywords = ("name", "test_seeds", "max_steps")
+    not_keywords = ("name", "test_seeds", "max_steps", "listing")
     return {key: value for key, value in renamed.items() if key not in not_keywords}
 
 
 def test_the_package_has_the_files_of_the_programs() -> None:
-    states = (CONFIG / "landscapes/jacksboro/jacksboro.toml").read_text()
-    assert built_in("states") == {"jacksboro": states}
-    files = {file.stem: file for file in (CONFIG / "tasks").iterdir()}
-    assert set(files) == set(PREFIXES) == set(built_in_tasks())
-    for name, file in files.items():
-        assert file.read_text() == built_in("tasks")[name]
-        assert Task.named(name) == Task.named(file) == built_in_tasks()[name]
+    def texts(pattern: str) -> dict[str, str]:
+        return {file.stem: file.read_text("utf-8") for file in CONFIG.glob(pattern)}
+
+    assert built_in("models") == texts("models/*.toml")
+    assert built_in("tasks") == texts("tasks/*.toml")
+    assert built_in("states") == texts("landscapes/*/*.toml")
+    for name, task in TASKS.items():
+        assert Task.named(name) == Task.named(CONFIG / f"tasks/{name}.toml") == task
     with refuses("task ash: No such file .*expected one, or wildfire, small, "):
         Task.named("ash")
 
 
-@pytest.mark.parametrize("name", PREFIXES)
+@pytest.mark.parametrize("name", TASKS)
 def test_ids_end_episodes_with_the_task(name: str) -> None:
-    task = built_in_tasks()[name]
+    task = TASKS[name]
     for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
-        spec = gymnasium.spec(f"emberwatch/{PREFIXES[name]}{kind}")
+        spec = gymnasium.spec(f"emberwatch/{TASKS[name].ids}{kind}")
         assert spec.max_episode_steps == n_moves * task.max_steps
         assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
 
@@ -85,7 +76,7 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
         ("Moves-v0", 2 * by_hand(name)["n_moves"], {"task": file}),
     ):
         worlds: list[Any] = [
-            gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}"),
+            gymnasium.make(f"emberwatch/{TASKS[name].ids}{kind}"),
             gymnasium.make(f"emberwatch/Wildfire{kind}", **other),
         ]
         first, second = [rollout(env, steps, seed=1005) for env in worlds]
@@ -94,13 +85,13 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
             env.close()
 
 
-@pytest.mark.parametrize("name", PREFIXES)
+@pytest.mark.parametrize("name", TASKS)
 def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
-    task = built_in_tasks()[name]
+    task = TASKS[name]
     n_rows = 2 * task.robots
     for kind, steps in (("-v0", 3), ("Moves-v0", 2 * task.n_moves)):
         worlds: list[Any] = [
-            gymnasium.make_vec(f"emberwatch/{PREFIXES[name]}{kind}", num_envs=n_rows),
+            gymnasium.make_vec(f"emberwatch/{TASKS[name].ids}{kind}", num_envs=n_rows),
             gymnasium.make_vec(f"emberwatch/Wildfire{kind}", num_envs=n_rows, **by_hand(name)),
         ]
         first, second = [rollout(envs, steps, seed=1005) for envs in worlds]
@@ -115,7 +106,7 @@ def test_gymnasium_finds_no_fault(name: str) -> None:
     kinds = ["-v0", "Moves-v0"] + (["Objective-v1"] if name == "small" else [])
     for kind in kinds:
         with no_warnings():
-            env = gymnasium.make(f"emberwatch/{PREFIXES[name]}{kind}", disable_env_checker=True)
+            env = gymnasium.make(f"emberwatch/{TASKS[name].ids}{kind}", disable_env_checker=True)
             check_env(env.unwrapped, skip_render_check=True)
             env.close()
 
@@ -143,7 +134,7 @@ def test_one_robot_flies_the_team_s_world_only_beside_others() -> None:
 
 def test_a_task_ends_episodes_in_any_environment() -> None:
     env = gymnasium.make("emberwatch/Wildfire-v0", task="small")
-    *_, last = rollout(env, built_in_tasks()["small"].max_steps, seed=1001)
+    *_, last = rollout(env, TASKS["small"].max_steps, seed=1001)
     assert last[3]
     env.close()
 

@@ -1,6 +1,6 @@
 //! The least and the greatest value of each number among the settings.
 
-use emberwatch_messages::capacity::MAX_ROBOTS;
+use emberwatch_messages::capacity::{MAX_ROBOTS, MAX_WORLDS};
 use emberwatch_model::MAX_RADIUS;
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::path::MAX_MOVES;
@@ -13,7 +13,7 @@ const ANY: i128 = u64::MAX as i128;
 
 /// By the name of the setting. A `sensor_radius` of -1 is the model's own.
 pub const BOUNDS: [(&str, i128, i128); 16] = [
-    ("worlds", 1, 1024),
+    ("worlds", 1, MAX_WORLDS as i128),
     ("moves", 1, MAX_MOVES as i128),
     ("sensor_radius", -1, MAX_RADIUS as i128),
     ("height", 1, MAX_SIDE as i128),

@@ -8,6 +8,7 @@ use emberwatch_messages::control::CoverageRule;
 use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::instance::Instance;
 use emberwatch_model::ModelError;
+use emberwatch_model::built_in::listed;
 use emberwatch_model::grid::ShapeError;
 use emberwatch_model::task::{Start, Task, TaskError};
 use emberwatch_model::text::read_text;
@@ -297,8 +298,8 @@ impl ServerConfig {
         Model::read(path).map_err(|error| match error {
             // The name may be mistyped.
             ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
-                let names: Vec<&str> = Model::built_in_names().collect();
-                let problem = format!("{problem}: expected one, or {}", names.join(", "));
+                let names = listed(Model::built_in_names());
+                let problem = format!("{problem}: expected one, or {names}");
                 file_error("model file", path, problem)
             }
             ModelError::File { path: of, problem } if Path::new(&of) == path => {

@@ -13,11 +13,12 @@ use crate::simulator::{Simulator, Stepped};
 use crate::snapshot::Job;
 use crate::world::{Episode, Rules};
 use anyhow::Result;
+use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, ServerInfo};
 use emberwatch_messages::errors::{ConnectionError, check_status};
 use emberwatch_messages::interrupt::check_interrupt;
 use emberwatch_messages::limits::threads::NoThreads;
-use emberwatch_messages::message::{Status, StepReply, StepRequest, VERSION};
+use emberwatch_messages::message::{Status, StepRequest, VERSION};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::ops::Range;
 use std::sync::Arc;
@@ -47,7 +48,7 @@ pub struct Embedded {
     /// One thread: of two snapshots to one file the later one stays.
     file_thread: ThreadPool,
     n_files: Arc<AtomicUsize>,
-    publishes_truth: bool,
+    info: ServerInfo,
     client: ClientId,
     started: Instant,
     rate: Rate,
@@ -62,7 +63,6 @@ impl Embedded {
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
         let n_threads = n_threads(config).min(config.worlds as usize);
-        let publishes_truth = config.publish_truth;
         let mut n_leases = 0;
         let next_token = move || {
             n_leases += 1;
@@ -75,12 +75,12 @@ impl Embedded {
         let now = Instant::now();
         let embedded = Self {
             rules: Arc::new(simulator.spec().rules.clone()),
+            info: simulator.info(),
             simulator,
             resets: channel(),
             reset_threads,
             file_thread,
             n_files: Arc::default(),
-            publishes_truth,
             client: ClientId {
                 node: 0,
                 pid: std::process::id(),
@@ -91,84 +91,6 @@ impl Embedded {
         };
         embedded.start(jobs);
         Ok(embedded)
-    }
-
-    /// What a server of these worlds would say of itself.
-    pub fn info(&self) -> ServerInfo {
-        self.simulator.info()
-    }
-
-    /// Whether hidden states may be read.
-    pub fn publishes_truth(&self) -> bool {
-        self.publishes_truth
-    }
-
-    /// Answers a control request, JSON with JSON.
-    ///
-    /// # Errors
-    /// If it is refused, not done in time, or interrupted; and after a `shutdown`.
-    pub fn control_text(
-        &mut self,
-        text: &[u8],
-        timeout: Duration,
-    ) -> Result<Vec<u8>, ConnectionError> {
-        let (now, client) = (Instant::now(), self.client);
-        self.begin(now)?;
-        let stats = ServerStats {
-            uptime: now - self.started,
-            steps_per_second: self.rate.per_second,
-            n_clients: 1,
-            n_observers: 0,
-        };
-        let reply = match self.simulator.control(now, client, VERSION, text, &stats) {
-            Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
-            Outcome::Pending(jobs, pending) => {
-                self.start(jobs);
-                self.reset(&pending, timeout)?
-            }
-            Outcome::File(job, pending) => self.file(job, &pending, timeout)?,
-            Outcome::Shutdown => {
-                self.is_over = true;
-                Reply::Done
-            }
-        };
-        if let Reply::Error {
-            status,
-            detail,
-            message,
-        } = reply
-        {
-            let refused = check_status("a control request", status as u32, detail, Some(message));
-            return refused.map(|()| Vec::new());
-        }
-        Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
-    }
-
-    /// Answers a step request: the header, and results of the worlds, results of the robots, frames.
-    ///
-    /// # Errors
-    /// If it is refused; and after a `shutdown`.
-    pub fn step_payload(
-        &mut self,
-        request: StepRequest,
-        body: &[u8],
-    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
-        let now = Instant::now();
-        self.begin(now)?;
-        let request = StepRequest {
-            version: VERSION,
-            ..request
-        };
-        let mut payload = Vec::new();
-        let stepped = self
-            .simulator
-            .step(now, self.client, &request, body, &mut payload);
-        let Stepped::Reply(mut reply) = stepped else {
-            unreachable!("invariant: the only client names all robots that it holds in a world");
-        };
-        check_status("step", reply.status, reply.detail, None)?;
-        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
-        Ok((reply, payload))
     }
 
     /// The present episodes of consecutive worlds; `None` if one is missing, or in its reset.
@@ -262,6 +184,71 @@ impl Embedded {
             self.simulator.cancel_file(now, pending);
         }
         Ok(self.simulator.file_reply(now, pending, done?))
+    }
+}
+
+/// A server's requests and answers; `control_text` may also be interrupted, and after a `shutdown` the server is gone.
+impl Backend for Embedded {
+    fn info(&self) -> &ServerInfo {
+        &self.info
+    }
+
+    fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError> {
+        let (now, client) = (Instant::now(), self.client);
+        self.begin(now)?;
+        let stats = ServerStats {
+            uptime: now - self.started,
+            steps_per_second: self.rate.per_second,
+            n_clients: 1,
+            n_observers: 0,
+        };
+        let reply = match self.simulator.control(now, client, VERSION, text, &stats) {
+            Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
+            Outcome::Pending(jobs, pending) => {
+                self.start(jobs);
+                self.reset(&pending, timeout)?
+            }
+            Outcome::File(job, pending) => self.file(job, &pending, timeout)?,
+            Outcome::Shutdown => {
+                self.is_over = true;
+                Reply::Done
+            }
+        };
+        if let Reply::Error {
+            status,
+            detail,
+            message,
+        } = reply
+        {
+            let refused = check_status("a control request", status as u32, detail, Some(message));
+            return refused.map(|()| Vec::new());
+        }
+        Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
+    }
+
+    /// Needs no time limit: nobody else holds robots of these worlds.
+    fn step(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+        _: Duration,
+    ) -> Result<StepAnswer, ConnectionError> {
+        let now = Instant::now();
+        self.begin(now)?;
+        let request = StepRequest {
+            version: VERSION,
+            ..request
+        };
+        let mut payload = Vec::new();
+        let stepped = self
+            .simulator
+            .step(now, self.client, &request, body, &mut payload);
+        let Stepped::Reply(mut reply) = stepped else {
+            unreachable!("invariant: the only client names all robots that it holds in a world");
+        };
+        check_status("step", reply.status, reply.detail, None)?;
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        Ok((reply, payload))
     }
 }
 

@@ -15,6 +15,7 @@ pub mod embedded;
 pub mod given;
 pub mod limits;
 pub mod rate;
+pub mod results;
 pub mod simulator;
 pub mod snapshot;
 pub mod states_file;

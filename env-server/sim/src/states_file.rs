@@ -3,8 +3,8 @@
 //! An array's header is checked before its values are read or inflated. Memory grows with what is there, not with what
 //! is claimed, and each array stays where it was read to.
 
+use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;
-use emberwatch_model::task::BUILT_IN_STATES;
 use emberwatch_model::text::read_text;
 use emberwatch_model::{Description, Model};
 use ndarray::{Array3, ShapeBuilder};
@@ -17,15 +17,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 use zip::ZipArchive;
 
-/// Those that ship, by name: archive and description.
-const BUILT_IN: [(&str, &[u8], &str); 1] = [(
-    BUILT_IN_STATES[0],
-    include_bytes!("../landscapes/jacksboro/jacksboro.npz"),
-    include_str!("../landscapes/jacksboro/jacksboro.toml"),
-)];
-
-/// Most bytes of all arrays together: 4 GiB.
-const MAX_BYTES: u64 = 1 << 32;
+/// Maximum number of bytes of all arrays together: 4 GiB.
+pub const MAX_BYTES: u64 = 1 << 32;
 
 /// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
@@ -67,7 +60,7 @@ pub struct StatesError {
 impl StatesFile {
     /// The built-in one of a name, or that of a path.
     pub fn named(name: &str) -> Result<Self, StatesError> {
-        match BUILT_IN.iter().find(|(known, ..)| *known == name) {
+        match STATES.iter().find(|(known, ..)| *known == name) {
             Some((_, archive, description)) => Ok(read_built_in(archive, description)
                 .expect("invariant: built-in states are valid, as a test shows")),
             None => Self::read(Path::new(name)),
@@ -76,7 +69,7 @@ impl StatesFile {
 
     /// The built-in recorded states: name, and text of the description.
     pub fn built_in_descriptions() -> impl Iterator<Item = (&'static str, &'static str)> {
-        BUILT_IN.iter().map(|(name, _, text)| (*name, *text))
+        STATES.iter().map(|(name, _, text)| (*name, *text))
     }
 
     /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.

@@ -1,5 +1,6 @@
 //! States files as NumPy writes them, and broken ones: one error each.
 
+use emberwatch_model::built_in::state_names;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::states_file::{Sequences, StatesFile};
 use ndarray::{Array, Array3, Dimension};
@@ -372,9 +373,12 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
 
 #[test]
 fn built_in_states_are_those_of_their_files() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("landscapes/jacksboro");
-    let file = StatesFile::read(&folder.join("jacksboro.npz")).expect("a states file");
-    let built_in = StatesFile::named("jacksboro").expect("built in");
-    let of = |file: StatesFile| (file.sequences.checksum(), file.description, file.shape);
-    assert_eq!(of(built_in), of(file));
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/landscapes");
+    for name in state_names() {
+        let file = folder.join(name).join(name).with_extension("npz");
+        let file = StatesFile::read(&file).expect("a states file");
+        let built_in = StatesFile::named(name).expect("built in");
+        let of = |file: StatesFile| (file.sequences.checksum(), file.description, file.shape);
+        assert_eq!(of(built_in), of(file));
+    }
 }

@@ -147,7 +147,7 @@ fn replace(
     };
     let mut client = Client::acquire(server, &claim)?;
     let request = request(client.lease());
-    let replaced = client.connection_mut().control(&request, TIMEOUT);
+    let replaced = client.backend().control(&request, TIMEOUT);
     client.release()?;
     let Reply::Restored { worlds } = replaced? else {
         bail!("expected worlds that were replaced");

@@ -59,7 +59,7 @@ pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
         lost = summary.totals.n_lost_frames + summary.totals.n_lost_truths,
         "replaying"
     );
-    let mut replay = Replay {
+    let mut replay = Playback {
         options,
         stop,
         ports,
@@ -82,7 +82,7 @@ struct RecordingSummary {
     totals: Totals,
 }
 
-struct Replay<'a> {
+struct Playback<'a> {
     options: &'a ReplayOptions,
     stop: &'a AtomicBool,
     ports: Ports,
@@ -136,7 +136,7 @@ impl RecordingSummary {
     }
 }
 
-impl Replay<'_> {
+impl Playback<'_> {
     fn run(&mut self) -> Result<()> {
         if !self.options.at_once {
             tracing::info!("waiting for an observer");

@@ -1,5 +1,5 @@
-//! Memory for a server's messages. There must be enough for all clients and observers before a server starts. Each gets
-//! its part when it comes, so that few clients take little, and a server writes only where there is memory.
+//! Shared memory for a server's messages. A server starts only if there is enough for all clients and observers. Each
+//! gets its part when it comes, so that few clients take little, and a server writes only where there is memory.
 
 use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
@@ -19,8 +19,8 @@ const FIXED_BYTES: u64 = 8 << 20;
 /// Answers to one client, as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
 const ANSWERS: usize = 2 * 3;
 
-/// Memory for the messages of a server's ports.
-pub struct Memory {
+/// Shared memory for the messages of a server's ports.
+pub struct PortMemory {
     control: MessageMemory,
     step: MessageMemory,
     frames: MessageMemory,
@@ -35,7 +35,7 @@ pub struct PortIds {
     pub truth: Option<u128>,
 }
 
-impl Memory {
+impl PortMemory {
     /// That of these ports, with enough for a first client.
     pub fn new(ids: &PortIds, config: &PortConfig) -> Result<Self, ChannelError> {
         let n_answers = MAX_CLIENTS * ANSWERS;

@@ -53,13 +53,13 @@ impl Server {
     /// Warns of the first world in which there is nothing to find.
     fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
         let is_recorded = self.simulator.is_recorded();
-        if self.has_warned_of_barren || is_recorded || episode.result().n_target_cells > 0 {
+        if self.has_warned_of_barren || is_recorded || episode.outcome().n_target_cells > 0 {
             return;
         }
         self.has_warned_of_barren = true;
         tracing::warn!(
             world,
-            seed = episode.result().seed,
+            seed = episode.outcome().seed,
             "no cell is in the state that pays most: set --burn-in, a larger grid, or a model for small ones, \
              --model wildfire-small"
         );

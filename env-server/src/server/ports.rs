@@ -1,7 +1,7 @@
 //! The server's ends of the channels.
 
 use super::descriptors::raise_limit;
-use super::memory::{Memory, PortIds, check_shared_memory};
+use super::memory::{PortIds, PortMemory, check_shared_memory};
 use super::port_config::{PortConfig, frame_bytes};
 use super::taken::{Taken, once_free};
 use anyhow::Result;
@@ -50,7 +50,7 @@ pub struct Ports {
     truth: Option<Publisher<Ipc, [u8], WireHeader<TruthHeader>>>,
     listener: Listener<Ipc>,
     answers: Answers,
-    memory: Memory,
+    memory: PortMemory,
     failed_connections: FailedConnections,
     unpublished: RefCell<Throttle>,
     control_service: ControlService,
@@ -122,7 +122,7 @@ impl Ports {
             frames: frames.id().value(),
             truth: truth.as_ref().map(|truth| truth.id().value()),
         };
-        let memory = Memory::new(&ids, config)?;
+        let memory = PortMemory::new(&ids, config)?;
         let entries = Entries::of(&node)?;
         Ok(Self {
             step,

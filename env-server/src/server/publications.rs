@@ -3,6 +3,7 @@
 use super::ports::Ports;
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use emberwatch_protocol::message::{FrameHeader, TruthHeader, VERSION};
+use emberwatch_sim::results::{robot_result, world_result};
 use emberwatch_sim::simulator::Simulator;
 use emberwatch_sim::world::Episode;
 use std::ops::Range;
@@ -72,12 +73,12 @@ impl Publications {
             n_robots: robots.len() as u32,
             height: height as u32,
             width: width as u32,
-            result: *episode.result(),
+            result: world_result(episode.outcome()),
         };
         self.payload.clear();
         for robot in robots {
             self.payload
-                .extend_from_slice(bytemuck::bytes_of(robot.result()));
+                .extend_from_slice(bytemuck::bytes_of(&robot_result(robot.outcome())));
         }
         for robot in robots {
             self.payload.extend_from_slice(robot.frame().as_bytes());
@@ -90,15 +91,15 @@ impl Publications {
     }
 
     fn publish_truth(&mut self, ports: &Ports, world: usize, episode: &Episode) {
-        let (states, result) = (episode.states(), episode.result());
+        let (states, outcome) = (episode.states(), episode.outcome());
         let (height, width) = states.dim();
         let header = TruthHeader {
             version: VERSION,
             world: world as u32,
             sequence: self.n_truths,
-            episode: result.episode,
-            step: result.step,
-            seed: result.seed,
+            episode: outcome.episode,
+            step: outcome.step,
+            seed: outcome.seed,
             height: height as u32,
             width: width as u32,
         };

@@ -1,7 +1,10 @@
-//! Maximum numbers of clients, robots and cells, which PROTOCOL.md lists.
+//! Maximum numbers of clients, worlds, robots and cells, which PROTOCOL.md lists.
 
 /// Maximum number of clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
+
+/// Maximum number of worlds of a server.
+pub const MAX_WORLDS: usize = 1024;
 
 /// Maximum number of robots of a world.
 pub const MAX_ROBOTS: usize = 64;

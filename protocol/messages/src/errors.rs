@@ -214,6 +214,15 @@ pub fn check_answer(
     Err(garbled(what, problem))
 }
 
+/// The refusal that a server would give.
+pub fn refused(status: Status, detail: u64) -> ConnectionError {
+    ConnectionError::Refused {
+        status,
+        detail,
+        message: status.explain(detail),
+    }
+}
+
 /// The error of an answer that makes no sense.
 pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
     ConnectionError::Garbled {

@@ -43,7 +43,7 @@ pub struct ServerInfo {
     /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,
-    /// Which land each cell is, where lands differ and learners are told.
+    /// Which land each cell is, where lands differ. For pictures: learners do not read it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zones: Option<ZonesInfo>,
     /// What worlds show whose hidden states were recorded.

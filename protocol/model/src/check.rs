@@ -17,8 +17,8 @@ const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 /// Most weights of all kernels: 512 MiB. 64 states with kernels of their own of 15 x 15 cells have 59 million.
 const MAX_WEIGHTS: usize = 1 << 26;
 
-/// Names that no state may have, as names of policies have them: `shooting_explore` beside `shooting_<state>`.
-const RESERVED: [&str; 3] = ["exploit", "exploit_only", "explore"];
+/// Names that no state may have: policies have goals of these names beside the states.
+const RESERVED: [&str; 5] = ["coverage", "exploit", "exploit_only", "explore", "learned"];
 
 /// How far a probability distribution in a model file may be from summing to one.
 const SUM_TOLERANCE: f64 = 1e-6;

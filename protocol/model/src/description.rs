@@ -67,7 +67,6 @@ impl Description {
         Model::new(ModelFile {
             name: self.name.clone(),
             kernel_size: [1, 1],
-            zones_public: true,
             zone_map: None,
             no_fly: self.no_fly.clone(),
             sensor: self.sensor.clone(),

@@ -31,9 +31,6 @@ pub struct ModelFile {
     pub name: String,
     /// Rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
-    /// Whether learners are told the zones.
-    #[serde(default = "yes", skip_serializing_if = "is_yes")]
-    pub zones_public: bool,
     /// The zone of each cell: its place in `zones`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone_map: Option<CellMap>,
@@ -287,13 +284,4 @@ pub fn parse_color(text: &str) -> Option<[u8; 3]> {
 
 fn one() -> f64 {
     1.0
-}
-
-fn yes() -> bool {
-    true
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's form")]
-fn is_yes(it: &bool) -> bool {
-    *it
 }

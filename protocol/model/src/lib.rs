@@ -2,9 +2,10 @@
 //!
 //! Nothing here knows messages. [`grid`] is what every other file indexes; [`dynamics`] draws hidden states,
 //! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
-//! A [`task`] is a world with a name. [`text`] reads settings and model files.
+//! A [`task`] is a world with a name; [`built_in`] has those that ship. [`text`] reads settings and model files.
 
 mod airspace;
+pub mod built_in;
 mod cell_map;
 mod check;
 mod description;

@@ -4,38 +4,13 @@
 //! [`super::file`] is the file format. [`super::transition`] applies them to beliefs, [`super::dynamics`] to states.
 
 use super::airspace::Airspace;
+use super::built_in::MODELS;
 use super::check::Checker;
 use super::file::{LEAST_SHARE, ModelError, ModelFile};
 use super::grid::{Cell, Grid, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
 use std::sync::Arc;
-
-/// The built-in models by name.
-const BUILT_IN: [(&str, &str); 7] = [
-    ("wildfire", include_str!("../models/wildfire.toml")),
-    (
-        "wildfire-sparse",
-        include_str!("../models/wildfire-sparse.toml"),
-    ),
-    (
-        "wildfire-latent",
-        include_str!("../models/wildfire-latent.toml"),
-    ),
-    (
-        "wildfire-small",
-        include_str!("../models/wildfire-small.toml"),
-    ),
-    (
-        "wildfire-burnout",
-        include_str!("../models/wildfire-burnout.toml"),
-    ),
-    (
-        "wildfire-terrain",
-        include_str!("../models/wildfire-terrain.toml"),
-    ),
-    ("road-ice", include_str!("../models/road-ice.toml")),
-];
 
 /// A checked model: every model that exists can be simulated and filtered.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,10 +32,9 @@ impl Model {
         Self::built_in("wildfire").expect("invariant: the wildfire is built in")
     }
 
-    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`,
-    /// `wildfire-burnout`, `wildfire-terrain` or `road-ice` (`config/models`).
+    /// The built-in model of a name (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
-        let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
+        let (_, text) = MODELS.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);
         Some(model.expect("invariant: built-in models are valid, as a test shows"))
     }
@@ -72,7 +46,7 @@ impl Model {
 
     /// The built-in models: name, and text of the file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
-        BUILT_IN.into_iter()
+        MODELS.iter().copied()
     }
 
     /// Reads and checks a model file's text.

@@ -1,5 +1,6 @@
 //! Tasks: worlds with a name, fixed completely, on which results can be compared.
 
+use crate::built_in::{TASKS, listed, state_names};
 use crate::grid::Cell;
 use crate::parameters::Model;
 use crate::text::read_text;
@@ -11,21 +12,8 @@ use thiserror::Error;
 /// Most seeds of worlds that are compared on.
 pub const MAX_SEEDS: u64 = 100_000;
 
-/// Names of the recorded states that are built in.
-pub const BUILT_IN_STATES: [&str; 1] = ["jacksboro"];
-
-/// The built-in tasks by name.
-const BUILT_IN: [(&str, &str); 9] = [
-    ("wildfire", include_str!("../tasks/wildfire.toml")),
-    ("small", include_str!("../tasks/small.toml")),
-    ("sparse", include_str!("../tasks/sparse.toml")),
-    ("latent", include_str!("../tasks/latent.toml")),
-    ("burnout", include_str!("../tasks/burnout.toml")),
-    ("terrain", include_str!("../tasks/terrain.toml")),
-    ("road-ice", include_str!("../tasks/road-ice.toml")),
-    ("team", include_str!("../tasks/team.toml")),
-    ("jacksboro", include_str!("../tasks/jacksboro.toml")),
-];
+/// Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+pub const FIRST_TRAINING_SEED: u64 = 1000;
 
 /// The settings of a server that make a task's worlds, by their names there, and the seeds to test on.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -72,6 +60,19 @@ pub struct Task {
     pub max_steps: u64,
     /// Seeds of the worlds to test on.
     pub test_seeds: Range<u64>,
+    /// How it is listed, if it is built in.
+    #[serde(default)]
+    pub listing: Option<Listing>,
+}
+
+/// What lists of the built-in tasks say of one.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Listing {
+    /// Its place in lists.
+    pub place: u32,
+    /// What the ids of its Python environments begin with.
+    pub ids: String,
 }
 
 /// Where the robots of a world are after a reset.
@@ -109,7 +110,7 @@ impl Task {
     /// # Errors
     /// If there is no such file, or it is no task.
     pub fn named(name: &str) -> Result<Self, TaskError> {
-        let read = match BUILT_IN.iter().find(|(known, _)| *known == name) {
+        let read = match TASKS.iter().find(|(known, _)| *known == name) {
             Some((_, text)) => Self::from_toml(text),
             None if name.is_empty() => Err("expected a name or a file, got \"\"".into()),
             None => Self::read(Path::new(name)),
@@ -129,9 +130,15 @@ impl Task {
         Self::built_in_files().map(|(name, _)| name)
     }
 
-    /// The built-in tasks: name, and text of the file.
+    /// The built-in tasks in the order of their places: name, and text of the file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
-        BUILT_IN.into_iter()
+        let mut files = TASKS.to_vec();
+        files.sort_by_cached_key(|(_, text)| {
+            let task = Self::from_toml(text);
+            let task = task.expect("invariant: built-in tasks are valid, as a test shows");
+            task.listing.map(|listing| listing.place)
+        });
+        files.into_iter()
     }
 
     /// Whether its hidden states were recorded.
@@ -145,12 +152,18 @@ impl Task {
             if path.exists() {
                 return error.to_string();
             }
-            let names: Vec<&str> = Self::built_in_names().collect();
-            format!("{error}: expected one, or {}", names.join(", "))
+            let names = listed(Self::built_in_names());
+            format!("{error}: expected one, or {names}")
         })?;
-        let mut task = Self::from_toml(&text)?;
-        let same_name = BUILT_IN.iter().find(|(name, _)| *name == task.name);
-        if same_name.is_some_and(|(_, text)| Self::from_toml(text).as_ref() != Ok(&task)) {
+        let unlisted = |text| {
+            Self::from_toml(text).map(|task| Self {
+                listing: None,
+                ..task
+            })
+        };
+        let mut task = unlisted(&text)?;
+        let same_name = TASKS.iter().find(|(name, _)| *name == task.name);
+        if same_name.is_some_and(|(_, text)| unlisted(text).as_ref() != Ok(&task)) {
             return Err(format!(
                 "name: expected one of its own, got {}, which is built in",
                 task.name
@@ -158,7 +171,7 @@ impl Task {
         }
         let folder = path.parent().unwrap_or(Path::new(""));
         let is_model = Model::built_in(&task.model).is_some();
-        let is_states = BUILT_IN_STATES.contains(&&*task.states);
+        let is_states = state_names().any(|name| name == task.states);
         for (setting, file, is_built_in) in [
             ("model", &mut task.model, is_model),
             ("states", &mut task.states, is_states),
@@ -249,6 +262,7 @@ fn one() -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeSet;
 
     #[test]
     fn built_in_tasks_have_their_names_and_a_model_or_states() {
@@ -257,12 +271,29 @@ mod tests {
             assert_eq!((&*task.name, &*task.source), (name, name));
             let model = Model::built_in(&task.model);
             assert_eq!(model.is_none(), task.is_recorded(), "{name}");
+            let is_states = state_names().any(|states| states == task.states);
+            assert_eq!(is_states, task.is_recorded(), "{name}");
         }
     }
 
     #[test]
+    fn built_in_tasks_have_places_and_ids_of_their_own() {
+        let tasks = Task::built_in_names().map(|name| Task::named(name).expect(name));
+        let listings: Vec<Listing> = tasks.filter_map(|task| task.listing).collect();
+        assert_eq!(listings.len(), TASKS.len());
+        assert!(listings.is_sorted_by(|a, b| a.place < b.place));
+        let ids: BTreeSet<&str> = listings.iter().map(|listing| &*listing.ids).collect();
+        assert_eq!(ids.len(), TASKS.len());
+    }
+
+    #[test]
+    fn the_default_world_is_the_first_task() {
+        assert_eq!(Task::built_in_names().next(), Some("wildfire"));
+    }
+
+    #[test]
     fn wrong_tasks_are_refused_by_their_setting() {
-        let task = |name| BUILT_IN.iter().find(|(known, _)| *known == name);
+        let task = |name| TASKS.iter().find(|(known, _)| *known == name);
         let text = |name| task(name).map(|(_, text)| *text).expect(name);
         let check = |name, from: &str, to: &str, words: &str| {
             let (before, text) = (text(name), text(name).replacen(from, to, 1));

@@ -110,36 +110,25 @@ impl<T: NdFloat> Transition<T> {
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let bias = model.bias().to_vec();
-        let zones = model.zone_map().map(|map| &**map);
-        Ok(Self::of_weights(
-            model.kernels(),
-            &bias,
-            shape,
-            (zones, model.n_zones()),
-        ))
+        let land = (model.zone_map().map(|map| &**map), model.n_zones());
+        Ok(Self::on_land(model.kernels(), &bias, shape, land))
     }
 
     /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid:
-    /// one kernel for all cells, or one for each state that a cell itself can be in; as many for each of so many zones,
-    /// which the map tells of each cell, shape `[H, W]`.
+    /// one kernel for all cells, or one for each state that a cell itself can be in.
     /// All are finite and 0 or more; where a cell's weights can all be 0, its prediction is NaN.
-    ///
-    /// # Panics
-    /// If the map is of another grid, or the kernels are not as many for each zone.
-    pub fn of_weights(
+    pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
+        Self::on_land(kernels, bias, shape, (None, 1))
+    }
+
+    /// [`Self::of_weights`] with as many kernels for each zone. The map has the zone of each cell, shape `[H, W]`.
+    fn on_land(
         kernels: &[Array4<f64>],
         bias: &[f64],
         shape: Shape,
         (zones, n_zones): (Option<&Grid<u8>>, usize),
     ) -> Self {
         let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
-        let dim = zones.map_or(shape.dim(), |map| map.dim());
-        assert_eq!(dim, shape.dim(), "zones: expected the grid");
-        assert_eq!(
-            kernels.len() % n_zones,
-            0,
-            "kernels: expected those of {n_zones} zones"
-        );
         let layout = Layout::new(shape, kernel_height, kernel_width);
         let n_own = kernels.len() / n_zones;
         let (columns, groups): (Vec<_>, Vec<_>) = taps_that_weigh_alike(kernels, n_own > 1, layout)

@@ -1,7 +1,8 @@
 //! docs/model-file.md: its example is a model, and it names every key with its limits.
 
+use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::text::MAX_TEXT_BYTES;
-use emberwatch_model::{Description, MAX_KERNEL_SIDE, MAX_VALUES};
+use emberwatch_model::{Description, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES};
 use emberwatch_model::{Model, Shape};
 use std::collections::BTreeSet;
 use toml::{Table, Value};
@@ -95,8 +96,11 @@ fn the_limits_are_the_parser_s() {
     let mebibytes = MAX_TEXT_BYTES >> 20;
     for words in [
         format!("2 to {MAX_VALUES},"),
+        format!("1 to {MAX_VALUES},"),
         format!("each odd, 1 to {MAX_KERNEL_SIDE} |"),
-        format!("at most {mebibytes} MiB"),
+        format!("0 to {MAX_ZONES} kinds of land"),
+        format!("| `radius` | integer | 0 to {MAX_RADIUS} |"),
+        format!("at most {mebibytes} MiB. Grids have up to {MAX_SIDE} x {MAX_SIDE} cells"),
     ] {
         assert!(PAGE.contains(&words), "{words:?} is not on the page");
     }

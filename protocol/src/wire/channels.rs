@@ -23,7 +23,7 @@ pub use super::ipc::{Ipc, WireHeader};
 pub use super::node::create_node;
 pub use super::resources::{call_error, check_room, ipc_error, limited_error};
 pub use emberwatch_messages::capacity::{
-    MAX_CLIENTS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS,
+    MAX_CLIENTS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_WORLDS,
 };
 pub use emberwatch_messages::errors::ChannelError;
 pub use emberwatch_messages::instance::Instance;

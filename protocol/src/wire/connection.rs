@@ -9,28 +9,16 @@ use super::resources::{CLIENT_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::texts::TextPort;
 use super::turn::Turn;
+use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, Request, ServerInfo};
 use emberwatch_messages::errors::{check_answer, garbled};
-use emberwatch_messages::message::{RobotResult, StepReply, StepRequest, VERSION, WorldResult};
-use emberwatch_messages::payload::{ROBOT_BYTES, StepParts, WORLD_BYTES, split_step_payload};
+use emberwatch_messages::message::{StepReply, StepRequest, VERSION};
+use emberwatch_messages::payload::split_step_payload;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-pub use emberwatch_messages::errors::{ConnectionError, check_status, unexpected};
+pub use emberwatch_messages::errors::{ConnectionError, check_status, refused, unexpected};
 pub use emberwatch_messages::message::worlds_of;
-
-/// The answer to a step: results and frames of consecutive robots, and results of their worlds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StepAnswer {
-    /// The binary header.
-    pub reply: StepReply,
-    /// One result per world.
-    pub worlds: Vec<WorldResult>,
-    /// One result per robot.
-    pub robots: Vec<RobotResult>,
-    /// The frames, `H * W` bytes per robot, or per world if team frames were asked for.
-    pub frames: Vec<u8>,
-}
 
 /// A connection to a running server.
 pub struct Connection {
@@ -62,9 +50,9 @@ impl Connection {
         let left = || timeout.saturating_sub(start.elapsed());
         let mut ports = Self::open_ports(instance, left())?;
         let hello = ports.texts.shake_hands(client, left())?;
-        let info = match parse("hello", &hello)? {
-            Reply::Hello(info) => *info,
-            other => return Err(unexpected("hello", &other)),
+        let said = serde_json::from_slice(&hello).map_err(|error| garbled("hello", error))?;
+        let Reply::Hello(info) = said else {
+            return Err(unexpected("hello", &said));
         };
         let of_world = size_of::<u64>() + info.n_robots as usize * info.n_moves;
         let longest = info.n_worlds as usize * of_world;
@@ -75,7 +63,7 @@ impl Connection {
         fill_ports(&ports.texts.exchange.node, true)?;
         Ok(Self {
             ports,
-            info,
+            info: *info,
             sequence: 0,
         })
     }
@@ -108,6 +96,18 @@ impl Connection {
         &self.info
     }
 
+    /// Asks on the control channel.
+    ///
+    /// # Errors
+    /// If the server refuses, has ended, or gives no good answer in time.
+    pub fn control(
+        &mut self,
+        request: &Request,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        Backend::control(self, request, timeout)
+    }
+
     /// The server's process: readable when it has ended.
     pub fn server_process(&self) -> BorrowedFd<'_> {
         self.ports.texts.exchange.server_process.descriptor()
@@ -124,65 +124,23 @@ impl Connection {
             Ok(())
         }
     }
+}
 
-    /// Asks on the control channel.
-    ///
-    /// # Errors
-    /// If the server refuses, has ended, or gives no good answer in time.
-    pub fn control(
-        &mut self,
-        request: &Request,
-        timeout: Duration,
-    ) -> Result<Reply, ConnectionError> {
-        let text = serde_json::to_vec(request).expect("invariant: requests serialise");
-        parse("a control request", &self.control_text(&text, timeout)?)
+impl Backend for Connection {
+    fn info(&self) -> &ServerInfo {
+        &self.info
     }
 
-    /// As [`Self::control`], of JSON text.
-    ///
-    /// # Errors
-    /// As [`Self::control`].
-    pub fn control_text(
-        &mut self,
-        text: &[u8],
-        timeout: Duration,
-    ) -> Result<Vec<u8>, ConnectionError> {
+    fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError> {
         self.ports.texts.ask(text, timeout)
     }
 
-    /// Asks on the step channel; version, sequence and listener are filled in here. The answer is for the robots that
-    /// were asked for, and waits until their world has moved.
-    ///
-    /// # Errors
-    /// If the server refuses, has ended, or gives no good answer in time.
-    pub fn step(
+    fn step(
         &mut self,
         request: StepRequest,
         body: &[u8],
         timeout: Duration,
     ) -> Result<StepAnswer, ConnectionError> {
-        let (reply, mut payload) = self.step_payload(request, body, timeout)?;
-        let StepParts { worlds, robots, .. } = parts(&reply, &payload)?;
-        payload.drain(..worlds.len() * WORLD_BYTES + robots.len() * ROBOT_BYTES);
-        Ok(StepAnswer {
-            reply,
-            worlds,
-            robots,
-            frames: payload,
-        })
-    }
-
-    /// As [`Self::step`]; the answer's header, and its payload as it came, checked: results of the worlds, results of the
-    /// robots, and frames.
-    ///
-    /// # Errors
-    /// As [`Self::step`].
-    pub fn step_payload(
-        &mut self,
-        request: StepRequest,
-        body: &[u8],
-        timeout: Duration,
-    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
         self.sequence += 1;
         let step = self.ports.step.as_ref();
         let step = step.expect("invariant: made when it was opened");
@@ -201,9 +159,9 @@ impl Connection {
         check_status(WHAT, reply.status, reply.detail, None)?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         check_asked(&self.info, &request, &reply)?;
-        parts(&reply, &payload)?
-            .check(&self.info)
-            .map_err(|problem| garbled(WHAT, problem))?;
+        let parts = split_step_payload(&reply, &payload)
+            .map_err(|expected| garbled(WHAT, format!("expected a payload of {expected} bytes")))?;
+        parts.check(&self.info).map_err(|it| garbled(WHAT, it))?;
         Ok((reply, payload))
     }
 }
@@ -231,13 +189,4 @@ fn check_asked(
             format!("expected {what} {asked:?}, got {got:?}"),
         ))
     }
-}
-
-fn parts<'a>(reply: &StepReply, payload: &'a [u8]) -> Result<StepParts<'a>, ConnectionError> {
-    split_step_payload(reply, payload)
-        .map_err(|expected| garbled(WHAT, format!("expected a payload of {expected} bytes")))
-}
-
-fn parse(what: &'static str, text: &[u8]) -> Result<Reply, ConnectionError> {
-    serde_json::from_slice(text).map_err(|error| garbled(what, error))
 }

@@ -57,11 +57,11 @@ impl Feed {
 
     /// Whether it is time to show beliefs, and anybody looks.
     pub fn is_due(&self) -> bool {
-        !self.turn(1).is_empty()
+        !self.due(1).is_empty()
     }
 
     /// Which of several worlds are to be shown now, if anybody looks.
-    pub fn turn(&self, n_worlds: usize) -> Vec<usize> {
+    pub fn due(&self, n_worlds: usize) -> Vec<usize> {
         let due = self.turns.due(Instant::now(), n_worlds);
         if due.is_empty() || self.is_watched() {
             due

@@ -6,6 +6,7 @@ use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::message::AgentHeader;
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::path::path_to_bytes;
+use emberwatch_protocol::payload::split_step_payload;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tests::harness::{Paths, Program, Server};
@@ -68,14 +69,15 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
             std::hint::spin_loop();
         }
         last = Instant::now();
-        let answer = stepper.step(&path);
+        let (reply, payload) = stepper.step(&path);
         if n > N_STEPS / 10 {
-            work.push(answer.reply.simulation_nanos as f64 / 1e3);
+            work.push(reply.simulation_nanos as f64 / 1e3);
             trips.push(last.elapsed().as_secs_f64() * 1e6);
         }
         // As an agent shows its beliefs: at most each 20 ms.
         if n % 40 == 0 && showcase.is_watched() {
-            let world = &answer.worlds[0];
+            let parts = split_step_payload(&reply, &payload).expect("a good answer");
+            let world = &parts.worlds[0];
             let about = AgentHeader {
                 step: world.step,
                 seed: world.seed,

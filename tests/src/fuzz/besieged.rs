@@ -12,6 +12,7 @@ use emberwatch_protocol::message::{
 use emberwatch_protocol::path::path_to_bytes;
 use emberwatch_protocol::payload::split_step_payload;
 use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::results::{robot_result, world_result};
 use emberwatch_sim::simulator::{
     ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
 };
@@ -226,7 +227,7 @@ impl Siege {
         if self.shared_step.is_some() || self.mirror.is_over() {
             return;
         }
-        let k = self.mirror.result().step;
+        let k = self.mirror.outcome().step;
         let path: Vec<u8> = (0..N_MOVES as u64)
             .map(|turn| ((k + turn) % 4) as u8)
             .collect();
@@ -249,7 +250,7 @@ impl Siege {
     /// Takes the answers to steps that waited, and checks that the shared world is as its own paths make it.
     pub fn check_shared(&mut self) {
         let (mut payload, mut waited) = (Vec::new(), Duration::ZERO);
-        let before = self.mirror.result().step;
+        let before = self.mirror.outcome().step;
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut payload) {
             let status = check_answer(&reply, &payload);
             if let Some((_, since)) = self.attackers_step.take_if(|(own, _)| *own == ticket) {
@@ -264,7 +265,7 @@ impl Siege {
             assert_ne!(world, HOME, "the victim's world moved on its own");
         }
         self.check_shared_step(None);
-        let now = self.mirror.result();
+        let now = self.mirror.outcome();
         let is_late = now.step > before && now.late & 2 != 0;
         let is_due = !is_late || waited >= DEADLINE;
         assert!(is_due, "the victim was not waited for");
@@ -274,8 +275,8 @@ impl Siege {
     fn check_shared_step(&mut self, path: Option<&[u8]>) {
         let episode = self.simulator.episode(SHARED);
         let episode = episode.expect("nobody but who holds both robots resets it");
-        let result = episode.result();
-        if result.step == self.mirror.result().step {
+        let result = world_result(episode.outcome());
+        if result.step == self.mirror.outcome().step {
             assert_eq!(path, None, "the victim's path was answered, but not flown");
         } else {
             let stayed = result.hovered | result.late;
@@ -283,9 +284,9 @@ impl Siege {
             let flown = (stayed & 2 == 0).then(|| path_to_bytes(episode.robots()[1].path()));
             assert_eq!(flown.as_deref(), path, "not the victim's path");
             let robots = episode.robots().iter();
-            let robots = robots.map(|robot| (robot.path().to_vec(), *robot.result()));
+            let robots = robots.map(|robot| (robot.path().to_vec(), robot_result(robot.outcome())));
             let rules = &self.simulator.spec().rules;
-            step_again(&mut self.mirror, rules, result, robots);
+            step_again(&mut self.mirror, rules, &result, robots);
         }
         assert!(
             seen(episode) == seen(&self.mirror),
@@ -296,8 +297,13 @@ impl Siege {
 
 fn seen(episode: &Episode) -> WorldSeen {
     let robots = episode.robots().iter();
-    let robots = robots.map(|robot| (*robot.result(), robot.frame().as_bytes().to_vec()));
-    (*episode.result(), robots.collect())
+    let robots = robots.map(|robot| {
+        (
+            robot_result(robot.outcome()),
+            robot.frame().as_bytes().to_vec(),
+        )
+    });
+    (world_result(episode.outcome()), robots.collect())
 }
 
 /// Checks that an answer is whole, and a refusal empty.

@@ -3,24 +3,24 @@
 use super::target::Seed;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use emberwatch_learning::belief::LearnedBelief;
+use emberwatch_learning::beliefs::LEARNED;
+use emberwatch_learning::beliefs::autoencoder::Follower;
+use emberwatch_learning::beliefs::learned::LearnedModel;
 use emberwatch_learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::estimation::Follower;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners::decisions::{self, Base, DecisionsLearner};
-use emberwatch_learning::learners::filter::fit::{self, FilterFit};
+use emberwatch_learning::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
+use emberwatch_learning::learners::filter::fit::FilterFit;
 use emberwatch_learning::learners::filter::{FilterLearner, SavedFilter};
-use emberwatch_learning::learners::network::{self, Position, SavedNetwork};
-use emberwatch_learning::learners::{Learner, Worlds};
-use emberwatch_learning::policy::EstimatorKind;
+use emberwatch_learning::learners::network::{Position, SavedNetwork};
+use emberwatch_learning::learners::{self, Learning, Saving, Worlds};
+use emberwatch_learning::policy::LearnedDecisions;
 use emberwatch_learning::reward::RewardEstimate;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
-use emberwatch_protocol::{Airspace, Dynamics, Frame, Grid, Model, Move, Shape, Transition};
+use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape, Transition};
 use ndarray::{Array3, Axis};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 /// Steps that a model is simulated for.
 const N_STEPS: u64 = 8;
@@ -104,7 +104,7 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
 /// mended, which keeps damage out but nobody who means harm.
 pub fn checkpoint(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
-    let mut learned = Learned::from_bytes(&bytes);
+    let mut learned = learners::from_bytes(&bytes);
     if let Err(error) = &learned
         && let Some(WrongDigest { expected, got }) = error.downcast_ref()
         && expected.len() == got.len()
@@ -113,13 +113,11 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let place = words.position(|word| word == expected.as_bytes());
         let place = place.map_or(0..0, |at| at..at + got.len());
         bytes.splice(place, got.bytes());
-        learned = Learned::from_bytes(&bytes);
+        learned = learners::from_bytes(&bytes);
     }
     let Ok(learned) = learned else { return false };
-    let one = (learned.filter, fit::KIND, dimensions(false));
-    let own = (learned.own_filter, fit::OWN_KIND, dimensions(true));
-    for (filter, kind, dimensions) in [one, own] {
-        let Some(filter) = filter else { continue };
+    let (kind, contents) = decode(&bytes).expect("read before");
+    if let Some(filter) = learned.get::<LearnedModel>() {
         let likelihood = filter.tables.likelihood_array();
         let n_matrices = filter.tables.dimensions.n_matrices as f64;
         let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
@@ -128,25 +126,30 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             "likelihoods sum to {sums}"
         );
         // That of decisions is no learner's.
-        let Ok((_, contents)) = decode(&[kind], &bytes) else {
-            continue;
-        };
-        if let Ok(mut learner) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
-            let again = learner.contents().expect("no device");
-            let saved: SavedFilter = again.state().expect("its state");
-            // More takes its time. Numbers that are finite may be too large to work with.
-            let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
+        if learners::filter::FILTER.checkpoints.contains(&&*kind) {
+            learn(&contents, filter.tables.dimensions.sees_own_state);
         }
     }
-    if learned.decisions.is_some() {
-        let (_, contents) = decode(&[decisions::KIND], &bytes).expect("read before");
-        let base = Base::saved(&contents, worlds().shape(), &Device::Cpu).expect("read before");
-        let base = base.unwrap_or_else(base_of_filter);
+    if learned.get::<LearnedDecisions>().is_some() {
+        let saved: SavedDecisions = contents.state().expect("read before");
+        let base = saved.base(&contents, worlds().shape(), &Device::Cpu);
+        let base = base.expect("read before").unwrap_or_else(base_of_filter);
         if let Ok(learner) = DecisionsLearner::new(base, Some(&contents), worlds(), &config()) {
             learner.contents().expect("no device");
         }
     }
     true
+}
+
+/// Goes on from a filter's checkpoint, if a learner can.
+fn learn(contents: &Contents, sees_own_state: bool) {
+    let learner = FilterLearner::resume(contents, dimensions(sees_own_state), worlds(), &config());
+    if let Ok(mut learner) = learner {
+        let again = learner.contents().expect("no device");
+        let saved: SavedFilter = again.state().expect("its state");
+        // More takes its time. Numbers that are finite may be too large to work with.
+        let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
+    }
 }
 
 fn dimensions(sees_own_state: bool) -> Dimensions {
@@ -155,7 +158,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state,
-        n_zones: 0,
         n_matrices: 1,
     }
 }
@@ -164,7 +166,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
 fn worlds() -> Worlds {
     Worlds {
         airspace: Airspace::open(Shape::new(1, 3).expect("a grid")),
-        zones: None,
         n_observations: 2,
         n_moves: 2,
         numbers: 0..1,
@@ -191,9 +192,10 @@ fn decisions() -> Contents {
 }
 
 fn base_of_filter() -> Base {
-    let fit = FilterFit::new(dimensions(false), None, worlds().shape(), &config());
-    let belief = LearnedBelief::Filter(Box::new(fit.learned()));
-    Base::learned(EstimatorKind::LEARNED, belief, worlds().shape())
+    let fit = FilterFit::new(dimensions(false), worlds().shape(), &config());
+    let mut learned = Learned::default();
+    learned.put(fit.learned());
+    Base::new(&LEARNED, None, learned, worlds().shape()).expect("learned")
 }
 
 fn dqn() -> Dqn {
@@ -204,22 +206,27 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
     let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));
     vec![
-        ("filter", encoded(fit::KIND, filter(dimensions(false)))),
+        (
+            "filter",
+            encoded("learned_filter", filter(dimensions(false))),
+        ),
         (
             "own_filter",
-            encoded(fit::OWN_KIND, filter(dimensions(true))),
+            encoded("learned_own_filter", filter(dimensions(true))),
         ),
-        ("autoencoder", encoded(network::KIND, small)),
-        ("filter_of_zones", encoded(fit::KIND, filter(of_zones()))),
+        ("autoencoder", encoded("autoencoder", small)),
+        (
+            "filter_of_rings",
+            encoded("learned_filter", filter(of_rings())),
+        ),
         // Asked for 30 GiB once.
-        ("autoencoder_large", encoded(network::KIND, large)),
-        ("decisions", encoded(decisions::KIND, decisions())),
+        ("autoencoder_large", encoded("autoencoder", large)),
+        ("decisions", encoded("decisions", decisions())),
     ]
 }
 
-fn of_zones() -> Dimensions {
+fn of_rings() -> Dimensions {
     Dimensions {
-        n_zones: 2,
         n_matrices: 2,
         ..dimensions(false)
     }
@@ -228,16 +235,14 @@ fn of_zones() -> Dimensions {
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape(), config());
-    let zones = Grid::from_shape_vec(shape.dim(), vec![0, 1, 1]).expect("a map");
-    let zones = (dimensions.n_zones > 0).then(|| Arc::new(zones));
-    let mut fit = FilterFit::new(dimensions, zones, shape, &config);
+    let mut fit = FilterFit::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
     fit.begin(0);
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
         let learned = fit.learned();
         fit.see(0, &frame, Some(&belief), &learned);
-        fit.reward(&belief, &[0, 2], 0.5);
+        fit.earn(&belief, &[0, 2], 0.5);
         fit.learn().expect("finite");
     }
     let tensors = fit.named_tensors();

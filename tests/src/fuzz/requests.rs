@@ -90,7 +90,7 @@ impl Siege {
             let (steps, _) = body.as_chunks_mut::<8>();
             for (world, step) in self.simulator.worlds_of(&robots).zip(steps) {
                 if let Some(episode) = self.simulator.episode(world) {
-                    let present = episode.result().step;
+                    let present = episode.outcome().step;
                     *step = u64::from_ne_bytes(*step)
                         .wrapping_add(present)
                         .to_ne_bytes();

@@ -60,7 +60,7 @@ pub fn snapshot(bytes: &[u8]) -> bool {
             if !episode.is_over() {
                 episode.step(rules, &flown(3, 0));
             }
-            let step = episode.result().step;
+            let step = episode.outcome().step;
             assert!(episode.recall(step).is_ok() && episode.recall(step + 1).is_err());
             episode.reset(rules, 5);
         }

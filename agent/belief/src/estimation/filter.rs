@@ -61,6 +61,11 @@ impl BayesFilter {
         }
     }
 
+    /// Names the beliefs of filters of a known model, see [`Handover::kind`].
+    pub fn handover_of_known(model: &Model) -> String {
+        handover_of(known_checksum(model))
+    }
+
     /// Takes newer learned parameters of the same dimensions; the belief stays.
     pub fn set_tables(&mut self, tables: &Tables) {
         (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
@@ -109,8 +114,7 @@ impl Estimator for BayesFilter {
 
 impl Handover for BayesFilter {
     fn kind(&self) -> String {
-        let checksum = self.checksum;
-        format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+        handover_of(self.checksum)
     }
 
     fn to_bytes(&self) -> Vec<u8> {
@@ -121,6 +125,10 @@ impl Handover for BayesFilter {
         let belief = Belief::from_bytes(bytes, self.belief.probabilities().dim());
         belief.map(|belief| self.belief = belief).is_some()
     }
+}
+
+fn handover_of(checksum: u32) -> String {
+    format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 fn known_checksum(model: &Model) -> u32 {
@@ -144,8 +152,7 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
     let bias = vec![0.0; n_states];
-    let zones = (tables.zones.as_deref(), dimensions.n_zones.max(1));
-    let transition = Transition::of_weights(&kernels, &bias, belief.shape(), zones);
+    let transition = Transition::of_weights(&kernels, &bias, belief.shape());
     (transition, likelihood, checksum)
 }
 

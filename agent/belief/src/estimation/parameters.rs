@@ -6,11 +6,9 @@
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Grid, Model, Shape};
-use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES};
+use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Model, Shape};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
@@ -35,12 +33,9 @@ pub struct Dimensions {
     pub n_observations: usize,
     /// Rows and columns of the kernel, odd.
     pub kernel: (usize, usize),
-    /// Whether each state that a cell itself can be in has a kernel of its own. The kind of a checkpoint tells it.
+    /// Whether each state that a cell itself can be in has a kernel of its own. A checkpoint's tensors tell it.
     #[serde(skip)]
     pub sees_own_state: bool,
-    /// Zones of land with kernels of their own; 0: all cells are alike. A checkpoint's tensors tell it.
-    #[serde(skip)]
-    pub n_zones: usize,
     /// Observation matrices of the sensor, at least 1. A checkpoint's tensors tell it.
     #[serde(skip, default = "one")]
     pub n_matrices: usize,
@@ -50,24 +45,17 @@ pub struct Dimensions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
-    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, with an axis for zones before, `[S, O]` or `[S, M, O / M]`, and `[S]`,
-    /// row-major.
+    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]` or `[S, M, O / M]`, and `[S]`, row-major.
     #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
-    /// The zone of each cell, where zones have kernels of their own.
-    #[serde(skip)]
-    pub zones: Option<Arc<Grid<u8>>>,
 }
 
 /// What the free numbers stand for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`; for each
-    /// zone, one after the other.
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
     pub kernel: Vec<f32>,
-    /// The zone of each cell, where zones have kernels of their own.
-    pub zones: Option<Arc<Grid<u8>>>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<f32>,
     /// The belief about every cell before the first frame, shape `[S]`.
@@ -128,9 +116,6 @@ impl Dimensions {
         if self.sees_own_state {
             kernel.insert(0, states);
         }
-        if self.n_zones > 0 {
-            kernel.insert(0, self.n_zones);
-        }
         let likelihood = match self.n_matrices {
             1 => vec![states, self.n_observations],
             n_matrices => vec![states, n_matrices, self.n_of_matrix()],
@@ -138,7 +123,7 @@ impl Dimensions {
         [kernel, likelihood, vec![states]]
     }
 
-    /// Kernels of a zone: one for all cells, or one for each state that a cell itself can be in.
+    /// Number of kernels: one for all cells, or one for each state that a cell itself can be in.
     pub fn n_own(&self) -> usize {
         if self.sees_own_state {
             self.n_states
@@ -187,21 +172,7 @@ impl Parameters {
                 (0..n_likelihood).map(logit).collect(),
                 vec![0.0; n_initial],
             ],
-            zones: None,
         }
-    }
-
-    /// The same on land with kernels for each zone, which the map tells of each cell.
-    ///
-    /// # Panics
-    /// If the dimensions are of other numbers of zones.
-    pub fn on_land(mut self, zones: Option<Arc<Grid<u8>>>) -> Self {
-        assert!(
-            zones.as_deref().map_or(0, n_zones) == self.dimensions.n_zones,
-            "zones: expected those of the dimensions"
-        );
-        self.zones = zones;
-        self
     }
 
     pub fn zeros(dimensions: Dimensions) -> Self {
@@ -209,7 +180,6 @@ impl Parameters {
         Self {
             dimensions,
             tensors,
-            zones: None,
         }
     }
 
@@ -220,7 +190,6 @@ impl Parameters {
         Tables {
             dimensions: self.dimensions,
             kernel: kernel.iter().map(weight).collect(),
-            zones: self.zones.clone(),
             likelihood: cast(self.likelihood()),
             initial: cast(softmax(initial)),
         }
@@ -242,7 +211,6 @@ impl Parameters {
             .chunks_exact(n_of_matrix)
             .zip(by_likelihood.chunks_exact(n_of_matrix));
         Self {
-            zones: None,
             dimensions: self.dimensions,
             tensors: [
                 kernel.iter().zip(by_kernel).map(slope).collect(),
@@ -275,7 +243,11 @@ impl Tables {
 
     /// A model's own parameters: what learning would have to find. Without its bias: beliefs sum to
     /// one, so away from the edges a bias is equal weights of all states.
+    ///
+    /// # Panics
+    /// If the model has several zones.
     pub fn of_model(model: &Model) -> Self {
+        assert_eq!(model.n_zones(), 1, "zones: expected one kernel for all");
         let cast = |value: &f64| *value as f32;
         let (_, _, height, width) = model.kernel().dim();
         Self {
@@ -284,10 +256,8 @@ impl Tables {
                 n_observations: model.n_observations(),
                 kernel: (height, width),
                 sees_own_state: model.sees_own_state(),
-                n_zones: model.zone_map().map_or(0, |_| model.n_zones()),
                 n_matrices: model.n_rings(),
             },
-            zones: model.zone_map().cloned(),
             kernel: model.kernels().iter().flatten().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
             initial: model.initial().iter().map(cast).collect(),
@@ -333,11 +303,6 @@ fn one() -> usize {
     1
 }
 
-/// Zones of a map, shape `[H, W]`, the first of which is 0.
-pub fn n_zones(map: &Grid<u8>) -> usize {
-    map.iter().max().map_or(0, |&last| usize::from(last) + 1)
-}
-
 fn softmax_gradient(logits: &[f32], by: &[f64]) -> Vec<f32> {
     let p = softmax(logits);
     let mean: f64 = p.iter().zip(by).map(|(p, by)| p * by).sum();
@@ -355,7 +320,6 @@ mod tests {
             n_observations: 4,
             kernel: (3, 1),
             sees_own_state: false,
-            n_zones: 0,
             n_matrices: 1,
         }
     }
@@ -382,7 +346,6 @@ mod tests {
     fn the_chain_rule_agrees_with_differences() {
         check_chain_rule(dimensions());
         check_chain_rule(Dimensions {
-            n_zones: 2,
             n_matrices: 2,
             ..dimensions()
         });

@@ -44,6 +44,12 @@ pub fn correcting(
 }
 
 impl SpatialFilter {
+    /// Names the beliefs of filters that spread the probability of a state on top of a named filter's, see
+    /// [`Handover::kind`].
+    pub fn handover_of(filter: &str, state: usize) -> String {
+        format!("spatial {filter}, ages and sums of state {state} as bincode")
+    }
+
     /// Spreads the probability of `state`, the one that pays, with correlations learned before, or from nothing.
     ///
     /// # Panics
@@ -126,8 +132,7 @@ impl Estimator for SpatialFilter {
 
 impl Handover for SpatialFilter {
     fn kind(&self) -> String {
-        let (filter, state) = (self.filter.kind(), self.state);
-        format!("spatial {filter}, ages and sums of state {state} as bincode")
+        Self::handover_of(&self.filter.kind(), self.state)
     }
 
     fn to_bytes(&self) -> Vec<u8> {

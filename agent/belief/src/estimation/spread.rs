@@ -44,12 +44,12 @@ pub struct Spread {
     /// Of the paying state, before the frame.
     deviation: Vec<f32>,
     ages: Vec<u8>,
-    seen: Vec<Seen>,
+    seen: Vec<SeenCell>,
     patches: Vec<Patch>,
 }
 
 #[derive(Debug, Clone)]
-struct Seen {
+struct SeenCell {
     cell: Cell,
     observed: u8,
     posterior: Vec<f64>,
@@ -94,7 +94,7 @@ impl Spread {
                 *deviation = (p * (1.0 - p)).max(0.0).sqrt();
             }
         }
-        let seen = seen.map(|(index, observed)| Seen {
+        let seen = seen.map(|(index, observed)| SeenCell {
             cell: shape.cell(index),
             observed,
             posterior: Vec::new(),
@@ -138,7 +138,7 @@ impl Spread {
 
     /// A seen cell, what is seen there, and what is believed of it by now.
     pub fn prior(&self, index: usize, belief: &Belief) -> (Cell, u8, Vec<f64>) {
-        let Seen { cell, observed, .. } = self.seen[index];
+        let SeenCell { cell, observed, .. } = self.seen[index];
         let now = f64::from(self.probability[self.place(cell)]);
         let mut states = belief.states(self.shape.index(cell));
         let rest: f64 = states.iter().sum::<f64>() - states[self.state];
@@ -202,7 +202,7 @@ impl Spread {
     pub fn end(&self, belief: &mut Belief, ages: &mut Ages) {
         let n_cells = self.shape.n_cells();
         let numbers = belief.as_mut_slice();
-        for Seen {
+        for SeenCell {
             cell, posterior, ..
         } in &self.seen
         {

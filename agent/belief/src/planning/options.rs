@@ -14,6 +14,8 @@ use emberwatch_model::{Cell, Grid};
 pub struct PathOption {
     /// Its name in tables and files.
     pub name: &'static str,
+    /// What it is for, in a few words.
+    pub about: &'static str,
     /// What a distinct cell is worth by itself, by the probability of what pays most, by its entropy, by its novelty.
     worth: [f32; 4],
     /// Paths that the plan looks ahead, at least 1; only the first is flown.
@@ -24,27 +26,49 @@ pub struct PathOption {
 
 const EXPLOIT: PathOption = PathOption {
     name: "exploit",
+    about: "what pays most, and a little for each new cell",
     worth: [BEAM_BONUS, 1.0, 0.0, 0.0],
     n_paths: 1,
     goal: None,
 };
 
-const BEST_REGION: PathOption = towards("best_region", Layer::Surplus);
+const BEST_REGION: PathOption = towards(
+    "best_region",
+    "the region that promises more than any other, way included",
+    Layer::Surplus,
+);
 
 /// All options, in the order of a decision's numbers.
 pub const OPTIONS: [PathOption; 8] = [
     EXPLOIT,
-    exploit_and("exploit_entropy_0.1", 0.1),
-    exploit_and("exploit_entropy_0.3", 0.3),
-    explore("entropy", [0.0, 0.0, 1.0, 0.0]),
-    explore("coverage", [0.0, 0.0, 0.0, 1.0]),
+    exploit_and(
+        "exploit_entropy_0.1",
+        "exploit, and .1 of each cell's entropy",
+        0.1,
+    ),
+    exploit_and(
+        "exploit_entropy_0.3",
+        "exploit, and .3 of each cell's entropy",
+        0.3,
+    ),
+    explore("entropy", "the belief's entropy", [0.0, 0.0, 1.0, 0.0]),
+    explore(
+        "coverage",
+        "cells that were not seen for long",
+        [0.0, 0.0, 0.0, 1.0],
+    ),
     PathOption {
         name: "exploit_ahead_3",
+        about: "exploit over three paths, of which the first is flown",
         n_paths: 3,
         ..EXPLOIT
     },
     BEST_REGION,
-    towards("unseen_region", Layer::Novelty),
+    towards(
+        "unseen_region",
+        "the region that was least seen",
+        Layer::Novelty,
+    ),
 ];
 
 /// Numbers that describe an option: see [`feature_names`].
@@ -68,25 +92,28 @@ const MEAN_SCALE: f32 = 0.1;
 /// Steps after which no more is made of a robot's age.
 const MOST_STEPS: u64 = 200;
 
-const fn exploit_and(name: &'static str, entropy: f32) -> PathOption {
+const fn exploit_and(name: &'static str, about: &'static str, entropy: f32) -> PathOption {
     PathOption {
         name,
+        about,
         worth: [BEAM_BONUS, 1.0, entropy, 0.0],
         ..EXPLOIT
     }
 }
 
-const fn explore(name: &'static str, worth: [f32; 4]) -> PathOption {
+const fn explore(name: &'static str, about: &'static str, worth: [f32; 4]) -> PathOption {
     PathOption {
         name,
+        about,
         worth,
         ..EXPLOIT
     }
 }
 
-const fn towards(name: &'static str, goal: Layer) -> PathOption {
+const fn towards(name: &'static str, about: &'static str, goal: Layer) -> PathOption {
     PathOption {
         name,
+        about,
         goal: Some(goal),
         ..EXPLOIT
     }

@@ -1,11 +1,11 @@
 //! The sections of `config/agent.toml`, which says what each setting means.
 
-use crate::policy::EstimatorKind;
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::belief::EntropyKind;
 use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
+use std::fmt;
 
 /// Below 1, so that Adam's means move.
 const MOST_BETA: f64 = 0.999_999;
@@ -39,6 +39,47 @@ pub struct LearningConfig {
     pub anchor: f64,
     pub explore_steps: u64,
     pub explore_share: f64,
+}
+
+/// What the kernels of a learned filter see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum KernelKind {
+    /// The states of the neighbours (paper eq. 4).
+    Neighbours,
+    /// The cell's own state, too: each has a kernel of its own.
+    Own,
+}
+
+impl KernelKind {
+    /// Each kind with its name, and what such kernels see.
+    pub const ALL: [(Self, &str, &str); 2] = [
+        (
+            Self::Neighbours,
+            "neighbours",
+            "The states of the neighbours, as in the paper",
+        ),
+        (
+            Self::Own,
+            "own",
+            "The cell's own state, too: each has a kernel of its own",
+        ),
+    ];
+
+    pub fn of(sees_own_state: bool) -> Self {
+        if sees_own_state {
+            Self::Own
+        } else {
+            Self::Neighbours
+        }
+    }
+}
+
+impl fmt::Display for KernelKind {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let found = Self::ALL.iter().find(|(kind, ..)| kind == self);
+        formatter.write_str(found.expect("invariant: the table has each").1)
+    }
 }
 
 /// How `train --learner neural` learns.
@@ -76,9 +117,10 @@ pub struct NetworkDqnConfig {
 }
 
 /// What `train --learner decisions` learns on, and how.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DecisionsConfig {
-    pub estimator: EstimatorKind,
+    /// The name or the label of the belief that decisions are made on.
+    pub estimator: String,
     pub filter_steps: u64,
     pub beam_width: usize,
     pub steps: u64,

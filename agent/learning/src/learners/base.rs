@@ -1,43 +1,96 @@
 //! What every learner does, and what it is told.
 
+use super::update::ModelUpdate;
+use crate::beliefs::WorldForm;
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
-use crate::learners::filter::form::WorldForm;
-use anyhow::Result;
-use emberwatch_belief::estimation::Estimator;
-use emberwatch_belief::estimation::belief::Belief;
-
+use crate::learned::Learned;
 use crate::policy::Policy;
 use crate::rollout::agent::{Agent, Chooser, Setup};
-use crate::rollout::{Rollout, Seen};
-use crate::update::{ModelUpdate, Tick};
-use emberwatch_belief::planning::Target;
+use crate::rollout::{Actor, Rollout, Seen};
+use anyhow::{Result, ensure};
+use emberwatch_belief::estimation::Estimator;
+use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::observation::Observation;
-use emberwatch_model::{Airspace, Grid, Move, Shape};
+use emberwatch_model::{Airspace, Shape};
+use emberwatch_network::Device;
+use std::fmt;
 use std::ops::Range;
-use std::sync::Arc;
-use std::time::Duration;
+
+/// A kind of learner: its constructor, and the facts that commands ask for.
+pub struct LearnerKind {
+    /// Its name: `train --learner NAME`.
+    pub name: &'static str,
+    /// What it learns, in a few words.
+    pub about: &'static str,
+    /// How its checkpoints call it: first as it writes them, then as earlier releases did.
+    pub checkpoints: &'static [&'static str],
+    /// Names of the numbers of its updates beside loss and rate.
+    pub columns: &'static [&'static str],
+    /// Whether it follows one robot of one world alone.
+    pub is_single: bool,
+    /// World steps of a whole training under these settings; 0: until stopped.
+    pub steps: fn(&AgentConfig) -> u64,
+    /// Steps of an episode of a server that is started for it; `None`: without end.
+    pub episode_steps: fn(&AgentConfig) -> Option<u64>,
+    /// World steps that a checkpoint has learned from.
+    pub done: fn(&Contents) -> Result<u64>,
+    /// Sets what a checkpoint decides in the settings of a run that resumes it.
+    pub adopt: fn(&Contents, &mut AgentConfig),
+    /// Reads what policies act on from a checkpoint; returns whether there was another before.
+    pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
+    /// Begins to learn, or goes on from a checkpoint.
+    pub begin: fn(Beginning<'_>) -> Result<Box<dyn Learner>>,
+}
+
+impl PartialEq for LearnerKind {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name
+    }
+}
+
+impl fmt::Debug for LearnerKind {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name)
+    }
+}
+
+/// What a learner begins with.
+#[derive(Clone)]
+pub struct Beginning<'a> {
+    pub worlds: Worlds,
+    /// What the server says of itself.
+    pub info: &'a ServerInfo,
+    pub config: &'a AgentConfig,
+    /// Of the checkpoint to go on from, if there is one.
+    pub contents: Option<&'a Contents>,
+    /// What was learned before, for learners that build on it.
+    pub learned: &'a Learned,
+    /// Where networks compute.
+    pub device: &'a Device,
+    /// Whether it only acts.
+    pub is_frozen: bool,
+}
 
 /// The robots to fly, as far as a learner is told.
 #[derive(Debug, Clone)]
 pub struct Worlds {
     /// Where robots may fly and what they see.
     pub airspace: Airspace,
-    /// The zone of each cell, shape `[H, W]`, where land differs and learners are told.
-    pub zones: Option<Arc<Grid<u8>>>,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     pub n_moves: usize,
+    /// The numbers of the robots on the server.
     pub numbers: Range<u32>,
 }
 
 impl Worlds {
     /// What beliefs must have been learned of.
-    pub fn form(&self) -> WorldForm<'_> {
+    pub fn form(&self) -> WorldForm {
         WorldForm {
+            shape: self.shape(),
             n_observations: self.n_observations,
             n_matrices: self.airspace.n_rings(),
-            zones: self.zones.as_deref(),
         }
     }
 
@@ -45,16 +98,25 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// One of them before it takes in what its world shows.
+    /// Refuses a sensor with several observation matrices, for networks.
+    pub(super) fn check_matrices(&self) -> Result<()> {
+        let n_rings = self.airspace.n_rings();
+        ensure!(
+            n_rings == 1,
+            "learner: expected a sensor with one observation matrix, as networks learn such alone, got {n_rings}"
+        );
+        Ok(())
+    }
+
+    /// A robot before it takes in what its world shows. `target`: what its belief calls the state that pays most.
     pub(super) fn rollout(
         &self,
         config: &AgentConfig,
-        policy: &Policy,
+        (policy, target): (&Policy, usize),
         estimator: Box<dyn Estimator>,
         state_names: Vec<String>,
         observation: Observation,
     ) -> Rollout {
-        let objective = config.objective(policy);
         let setup = Setup {
             airspace: self.airspace.clone(),
             basis: config.objective.belief,
@@ -62,11 +124,8 @@ impl Worlds {
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
-            target: match objective.target {
-                Target::State(state) => state,
-                _ => 0,
-            },
-            chooser: Chooser::Objective(objective),
+            target,
+            chooser: Chooser::Objective(policy.objective(target, config)),
         };
         let agent = Agent::new(estimator, policy, config, setup);
         Rollout::new(agent, Seen::new([observation]))
@@ -76,41 +135,27 @@ impl Worlds {
 /// Which step of which run a robot saw, and from where: seed, episode, step k, row, column.
 pub type Place = [u64; 5];
 
-pub trait Learner {
-    /// How its checkpoints call it.
-    fn kind(&self) -> &'static str;
-
-    /// Names of what its updates tell beside loss and rate.
-    fn columns(&self) -> &'static [&'static str];
-
+/// What acts on several robots and learns from what they see.
+pub trait Learning: Actor {
     /// Whether its next frames should show every cell, where the server gives such.
     fn wants_full_frames(&self) -> bool {
         false
     }
 
-    /// Takes in what the robots see when it comes to them. Returns with how many of them it goes on where
-    /// its checkpoint left it.
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
-
+    /// Begins another episode of a robot.
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
-
-    /// The next path of each robot.
-    fn plan(&mut self) -> Vec<Vec<Move>>;
-
-    /// Takes in what the robots saw on these paths; their beliefs are then posteriors.
-    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick>;
-
-    /// A robot's agent at its world, by its index.
-    fn rollout(&self, index: usize) -> &Rollout;
-
-    /// Moves the beliefs to the next step.
-    fn predict(&mut self);
 
     /// Makes the updates that the steps since the last call have earned.
     fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
 
     /// From here on it acts on what was learned, as well as it knows: without random actions.
     fn freeze(&mut self);
+
+    /// A robot's agent at its world, by its index.
+    fn rollout(&self, index: usize) -> &Rollout;
+
+    /// The state that it thinks pays most.
+    fn target(&self) -> usize;
 
     /// World steps that were learned from, of all robots together.
     fn world_steps(&self) -> u64;
@@ -119,16 +164,22 @@ pub trait Learner {
 
     /// Why a run of that many steps made no update, and what to do.
     fn lacks(&self, steps: u64) -> String;
+}
 
-    /// What it predicts of its first world, and the state of that which it thinks pays most.
-    fn belief(&self) -> Option<(&Belief, usize)>;
+/// What is kept of a learner between runs.
+pub trait Saving {
+    /// Takes in what the robots see when it comes to them. Returns with how many of them it goes on where its checkpoint
+    /// left it.
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
     /// What a later run goes on from.
     fn contents(&self) -> Result<Contents>;
-
-    /// Time spent so far, by part.
-    fn times(&self) -> Vec<(&'static str, Duration)>;
 }
+
+/// What `train` drives: it acts, learns, and is saved.
+pub trait Learner: Learning + Saving {}
+
+impl<L: Learning + Saving> Learner for L {}
 
 /// The cause where a run's steps have not earned an update. `name`: the setting.
 pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
@@ -139,10 +190,4 @@ pub(super) fn place(observation: &Observation) -> Place {
     let (world, robot) = (&observation.world, &observation.robot);
     let [row, col] = [robot.row, robot.col].map(u64::from);
     [world.seed, world.episode, world.step, row, col]
-}
-
-/// Observations without hidden states, as learners get them.
-pub(super) fn without_truth(observations: Vec<Observation>) -> Vec<Seen> {
-    let seen = observations.into_iter();
-    seen.map(|observation| Seen::new([observation])).collect()
 }

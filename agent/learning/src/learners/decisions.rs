@@ -5,30 +5,59 @@ mod base;
 mod run;
 mod saved;
 
-pub use self::base::Base;
-pub use self::saved::{LearnedDecisions, SHAPE, SavedDecisions};
+pub use self::base::{Base, belief_of, belief_of_saved};
+pub use self::saved::{SHAPE, SavedDecisions};
 
 use self::run::{Run, features};
-use self::saved::{Held, SavedRun, belief_tensors};
-use crate::belief::SavedBelief;
+use self::saved::{Held, SavedBelief, SavedRun};
+use crate::beliefs::learned::sees_own_state;
 use crate::checkpoint::{Contents, check};
-use crate::config::AgentConfig;
-use crate::learners::base::{Learner, Worlds, lacks_steps, without_truth};
-use crate::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
-use crate::update::{ModelUpdate, Tick};
+use crate::config::{AgentConfig, KernelKind};
+use crate::learners::base::{
+    Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
+};
+use crate::learners::update::ModelUpdate;
+use crate::policy::Policy;
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, in_parallel, predict_all, see_all};
 use anyhow::Result;
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::planning::{OPTIONS, Target};
+use emberwatch_belief::planning::OPTIONS;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_network::Dqn;
 use rand_chacha::rand_core::Rng;
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
 
-pub const KIND: &str = "decisions";
+pub const DECISIONS: LearnerKind = LearnerKind {
+    name: "decisions",
+    about: "A DQN that chooses among options on an estimator's belief, which is learned first, unless it is given",
+    checkpoints: &["decisions"],
+    columns: &["dqn_loss", "dqn_rate", "epsilon"],
+    is_single: false,
+    steps: |config| config.decisions.steps,
+    episode_steps: |config| Some(config.decisions.episode_steps),
+    done: |contents| Ok(contents.state::<SavedDecisions>()?.world_steps),
+    adopt: |contents, config| {
+        let sees_own_state = sees_own_state(&contents.part(saved::BELIEF));
+        config.kernels = KernelKind::of(sees_own_state);
+    },
+    read: saved::read,
+    begin,
+};
+
+fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+    let base = match on.contents {
+        Some(contents) => {
+            let saved: SavedDecisions = contents.state()?;
+            saved.base(contents, on.worlds.shape(), on.device)?
+        }
+        None => None,
+    };
+    let base = base.map_or_else(|| Base::of_settings(&on), Ok)?;
+    base.kind.check(&base.learned, &on.worlds.form())?;
+    let learner = DecisionsLearner::new(base, on.contents, on.worlds, on.config);
+    Ok(Box::new(learner?))
+}
 
 /// A DQN over options that learns on several worlds.
 pub struct DecisionsLearner {
@@ -44,7 +73,6 @@ pub struct DecisionsLearner {
     /// Updates that steps have earned and that are not made yet.
     earned: f64,
     is_frozen: bool,
-    times: [(&'static str, Duration); 2],
 }
 
 impl DecisionsLearner {
@@ -55,9 +83,8 @@ impl DecisionsLearner {
         worlds: Worlds,
         config: &AgentConfig,
     ) -> Result<Self> {
-        let target = Target::State(base.target);
         let mut learner = Self {
-            policy: Policy::new("decisions", base.kind, PlannerKind::Beam, target),
+            policy: Policy::exploiting(base.kind),
             base,
             dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
             runs: Vec::new(),
@@ -65,7 +92,6 @@ impl DecisionsLearner {
             world_steps: 0,
             earned: 0.0,
             is_frozen: false,
-            times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
             worlds,
             config: config.clone(),
         };
@@ -78,11 +104,9 @@ impl DecisionsLearner {
     /// An agent before it takes in what its world shows.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let (base, names) = (&self.base, self.base.state_names.clone());
-        let (config, policy) = (&self.config, &self.policy);
-        let estimator = base.estimator()?;
-        Ok(self
-            .worlds
-            .rollout(config, policy, estimator, names, observation))
+        let (config, policy) = (&self.config, (&self.policy, self.base.target));
+        let (estimator, worlds) = (base.estimator()?, &self.worlds);
+        Ok(worlds.rollout(config, policy, estimator, names, observation))
     }
 
     /// A run that begins with what its world shows.
@@ -138,18 +162,18 @@ impl DecisionsLearner {
 
     fn saved(&self) -> Result<Contents> {
         let runs = self.runs.iter().map(Run::saved);
-        let belief = self.base.belief();
+        let belief = SavedBelief::of(self.base.kind, &self.base.learned)?;
+        let (belief, of_belief) =
+            belief.map_or((None, Vec::new()), |(it, tensors)| (Some(it), tensors));
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: self.base.kind,
-            belief: belief.map(SavedBelief::of),
+            estimator: self.base.kind.label.into(),
+            belief,
             world_steps: self.world_steps,
             earned: self.earned,
             dqn: self.dqn.saved(),
             worlds: self.worlds.numbers.clone().zip(runs).collect(),
         };
-        let of_belief = belief.map(belief_tensors).transpose()?;
-        let of_belief = of_belief.unwrap_or_default();
         let tensors = self.dqn.named_tensors().into_iter().chain(of_belief);
         Ok(Contents::new(tensors, &state))
     }
@@ -158,7 +182,7 @@ impl DecisionsLearner {
     fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         saved.load_into(&mut self.dqn, contents)?;
-        let [expected, got] = [self.base.kind, saved.estimator].map(EstimatorKind::label);
+        let [expected, got] = [self.base.kind, saved.kind()?].map(|kind| kind.name);
         check(got == expected, "decisions.estimator", expected, got)?;
         self.world_steps = saved.world_steps;
         self.earned = saved.earned;
@@ -169,82 +193,45 @@ impl DecisionsLearner {
     }
 }
 
-impl Learner for DecisionsLearner {
-    fn kind(&self) -> &'static str {
-        KIND
-    }
-
-    fn columns(&self) -> &'static [&'static str] {
-        &["dqn_loss", "dqn_rate", "epsilon"]
-    }
-
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut n_gone_on = 0;
-        for (world, observation) in self.worlds.numbers.clone().zip(observations) {
-            let left = self.left.remove(&world);
-            let run = match left.filter(|left| left.is_of(&observation)) {
-                Some(left) => {
-                    n_gone_on += 1;
-                    Run::restore(left, self.rollout_at(observation)?, &self.dqn)?
-                }
-                None => self.begun(observation)?,
-            };
-            self.runs.push(run);
-        }
-        Ok(n_gone_on)
-    }
-
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let begun = self.begun(observation)?;
-        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
-        let mut ended = std::mem::replace(run, begun);
-        if !self.is_frozen {
-            let start = Instant::now();
-            let transitions = ended.end(&self.dqn).into_iter();
-            transitions.for_each(|transition| self.dqn.remember(transition));
-            self.times[0].1 += start.elapsed();
-        }
-        Ok(())
-    }
-
+impl Actor for DecisionsLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        let start = Instant::now();
         self.decide();
-        let paths = self.runs.iter_mut().map(Run::take_up).collect();
-        self.times[0].1 += start.elapsed();
-        paths
+        self.runs.iter_mut().map(Run::take_up).collect()
     }
 
-    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
         let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let turns = see_all(rollouts, without_truth(observations))?;
+        let records = see_all(rollouts, seen)?;
         let scale = self.config.decisions.reward_scale / self.worlds.n_moves as f32;
-        let mut tick = Tick::default();
-        for (run, turn) in self.runs.iter_mut().zip(turns) {
-            let reward = run.rollout.observation().robot.reward;
+        for (run, record) in self.runs.iter_mut().zip(&records) {
             if let Some((_, scaled)) = &mut run.last {
-                *scaled = reward as f32 * scale;
+                *scaled = record.reward as f32 * scale;
             }
-            tick.reward += reward;
-            tick.score += turn.score.unwrap_or_default();
         }
-        tick.n_worlds = self.runs.len() as u64;
-        self.world_steps += tick.n_worlds;
-        tick.world_steps = self.world_steps;
-        self.earned += tick.n_worlds as f64 * self.config.decisions.updates_per_step;
-        Ok(tick)
-    }
-
-    fn rollout(&self, index: usize) -> &Rollout {
-        &self.runs[index].rollout
+        let n_robots = records.len() as u64;
+        self.world_steps += n_robots;
+        self.earned += n_robots as f64 * self.config.decisions.updates_per_step;
+        Ok(records)
     }
 
     fn predict(&mut self) {
         predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
     }
+}
+
+impl Learning for DecisionsLearner {
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let begun = self.begun(observation)?;
+        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
+        let mut ended = std::mem::replace(run, begun);
+        if !self.is_frozen {
+            let transitions = ended.end(&self.dqn).into_iter();
+            transitions.for_each(|transition| self.dqn.remember(transition));
+        }
+        Ok(())
+    }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
-        let start = Instant::now();
         let rate = self.config.decisions.rate * self.rate_share();
         self.dqn.set_learning_rate(rate);
         let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
@@ -261,12 +248,19 @@ impl Learner for DecisionsLearner {
                 more: [loss, rate, epsilon].map(|it| Some(it.into())).into(),
             });
         }
-        self.times[1].1 += start.elapsed();
         Ok(updates)
     }
 
     fn freeze(&mut self) {
         self.is_frozen = true;
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.runs[index].rollout
+    }
+
+    fn target(&self) -> usize {
+        self.base.target
     }
 
     fn world_steps(&self) -> u64 {
@@ -288,17 +282,26 @@ impl Learner for DecisionsLearner {
         let rate = self.config.decisions.updates_per_step;
         lacks_steps("decisions.updates_per_step", rate)
     }
+}
 
-    fn belief(&self) -> Option<(&Belief, usize)> {
-        let run = self.runs.first()?;
-        Some((run.rollout.agent.belief(), self.base.target))
+impl Saving for DecisionsLearner {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
+        let mut n_gone_on = 0;
+        for (world, observation) in self.worlds.numbers.clone().zip(observations) {
+            let left = self.left.remove(&world);
+            let run = match left.filter(|run| run.left.is_of(&observation)) {
+                Some(left) => {
+                    n_gone_on += 1;
+                    Run::restore(left, self.rollout_at(observation)?, &self.dqn)?
+                }
+                None => self.begun(observation)?,
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
     }
 
     fn contents(&self) -> Result<Contents> {
         self.saved()
-    }
-
-    fn times(&self) -> Vec<(&'static str, Duration)> {
-        self.times.to_vec()
     }
 }

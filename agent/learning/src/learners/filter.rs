@@ -2,29 +2,28 @@
 //! the belief of the filter as it is.
 
 pub mod fit;
-pub mod form;
-pub mod model;
 mod saved;
 
 pub use self::saved::SavedFilter;
 
-use self::saved::SavedWorld;
+use self::saved::SavedRobot;
+use crate::beliefs::learned::{LearnedModel, dimensions_of, sees_own_state};
+use crate::beliefs::{LEARNED, numbered_states};
 use crate::checkpoint::Contents;
-use crate::config::AgentConfig;
-use crate::learners::base::{Learner, Worlds, without_truth};
-use crate::learners::filter::fit::{FilterFit, LearnedModel};
-use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
-use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
-use crate::update::{ModelUpdate, Tick};
+use crate::config::{AgentConfig, KernelKind};
+use crate::learners::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds};
+use crate::learners::filter::fit::FilterFit;
+use crate::learners::update::ModelUpdate;
+use crate::policy::Policy;
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, in_parallel, predict_all, see_all};
 use anyhow::Result;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use emberwatch_belief::planning::{Plan, Target};
+use emberwatch_belief::planning::Plan;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
 
 pub struct FilterLearner {
     worlds: Worlds,
@@ -34,18 +33,59 @@ pub struct FilterLearner {
     rollouts: Vec<Rollout>,
     /// What was planned last, of each robot: its belief then, and its path.
     planned: Vec<(Belief, Plan)>,
-    /// Where a checkpoint left the worlds.
-    left: BTreeMap<u32, SavedWorld>,
+    /// Where a checkpoint left the robots.
+    left: BTreeMap<u32, SavedRobot>,
     is_frozen: bool,
-    planning: Duration,
-    learning: Duration,
+}
+
+pub const FILTER: LearnerKind = LearnerKind {
+    name: "filter",
+    about: "A Bayes filter of the paper's form, with unknown parameters",
+    checkpoints: &["learned_filter", "learned_own_filter"],
+    columns: &[],
+    is_single: false,
+    steps: |_| 0,
+    episode_steps: |_| None,
+    done: |contents| Ok(contents.state::<SavedFilter>()?.fit.world_steps),
+    adopt: |contents, config| {
+        config.kernels = KernelKind::of(sees_own_state(&contents.part("")));
+    },
+    read: |contents, _, learned| {
+        let mut fit = contents.state::<SavedFilter>()?.fit;
+        let dimensions = dimensions_of(fit.optimiser.dimensions(), &contents.part(""))?;
+        fit.load(contents, dimensions)?;
+        Ok(learned.put(fit.learned()))
+    },
+    begin,
+};
+
+fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+    let dimensions = dimensions(on.config, &on.worlds)?;
+    Ok(Box::new(match on.contents {
+        Some(contents) => FilterLearner::resume(contents, dimensions, on.worlds, on.config)?,
+        None => FilterLearner::new(dimensions, on.worlds, on.config),
+    }))
+}
+
+fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
+    let (learning, n_rings) = (config.learning, worlds.airspace.n_rings());
+    let dimensions = Dimensions {
+        n_states: match learning.states {
+            0 => worlds.n_observations / n_rings,
+            states => states,
+        },
+        n_observations: worlds.n_observations,
+        kernel: (learning.kernel[0], learning.kernel[1]),
+        sees_own_state: config.kernels == KernelKind::Own,
+        n_matrices: n_rings,
+    };
+    Ok(dimensions.check()?)
 }
 
 impl FilterLearner {
     /// A learner before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let zones = worlds.zones.clone();
-        let fit = FilterFit::new(dimensions, zones, worlds.shape(), config);
+        let fit = FilterFit::new(dimensions, worlds.shape(), config);
         Self::of(fit, BTreeMap::new(), worlds, config)
     }
 
@@ -60,10 +100,9 @@ impl FilterLearner {
             worlds: mut left,
         } = contents.state()?;
         let shape = fit.optimiser.shape;
-        let zones = worlds.zones.clone();
-        let fit = FilterFit::resume(fit, contents, dimensions, zones, worlds.shape(), config)?;
+        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape(), config)?;
         let mut all = left.values();
-        all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
+        all.try_for_each(|robot| robot.check(dimensions.n_states, shape))?;
         if shape != worlds.shape() {
             left.clear();
         }
@@ -72,7 +111,7 @@ impl FilterLearner {
 
     fn of(
         fit: FilterFit,
-        left: BTreeMap<u32, SavedWorld>,
+        left: BTreeMap<u32, SavedRobot>,
         worlds: Worlds,
         config: &AgentConfig,
     ) -> Self {
@@ -85,8 +124,6 @@ impl FilterLearner {
             rollouts: Vec::new(),
             planned: Vec::new(),
             is_frozen: false,
-            planning: Duration::ZERO,
-            learning: Duration::ZERO,
         }
     }
 
@@ -95,28 +132,26 @@ impl FilterLearner {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
         let names = numbered_states(tables.dimensions.n_states);
-        let (policy, config) = (self.policy(), &self.config);
-        let worlds = &self.worlds;
-        worlds.rollout(config, &policy, Box::new(filter), names, observation)
+        let (policy, target) = (Policy::exploiting(&LEARNED), self.learned.target);
+        let (worlds, config) = (&self.worlds, &self.config);
+        worlds.rollout(
+            config,
+            (&policy, target),
+            Box::new(filter),
+            names,
+            observation,
+        )
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.
-    fn begun(&mut self, world: u32, observation: Observation) -> Result<Rollout> {
-        self.fit.begin(world);
+    fn begun(&mut self, robot: u32, observation: Observation) -> Result<Rollout> {
+        self.fit.begin(robot);
         let frame = &observation.frame;
-        self.fit.see(world, frame, None, &self.learned);
+        self.fit.see(robot, frame, None, &self.learned);
         let mut rollout = self.rollout_at(observation);
         rollout.correct()?;
         rollout.agent.predict();
         Ok(rollout)
-    }
-
-    /// What robots that don't walk at random act by.
-    fn policy(&self) -> Policy {
-        let estimator = EstimatorKind::learned(self.learned.tables.dimensions.sees_own_state);
-        let name = format!("{}_beam", estimator.family());
-        let target = Target::State(self.learned.target);
-        Policy::new(&name, estimator, PlannerKind::Beam, target)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen learner.
@@ -132,51 +167,14 @@ impl FilterLearner {
     }
 }
 
-impl Learner for FilterLearner {
-    fn kind(&self) -> &'static str {
-        self.fit.kind()
-    }
-
-    fn columns(&self) -> &'static [&'static str] {
-        &[]
-    }
-
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let worlds = self.worlds.numbers.clone();
-        let mut n_gone_on = 0;
-        if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
-            // Frames of other worlds, perhaps of another model.
-            self.fit.forget();
-        }
-        for (world, observation) in worlds.zip(observations) {
-            let left = self.left.get(&world);
-            let left = left.filter(|left| left.is_of(&observation) && self.fit.has_track(world));
-            let rollout = if let Some(left) = left {
-                let mut rollout = self.rollout_at(observation);
-                left.restore(&mut rollout.agent);
-                n_gone_on += 1;
-                rollout
-            } else {
-                self.begun(world, observation)?
-            };
-            self.rollouts.push(rollout);
-        }
-        Ok(n_gone_on)
-    }
-
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
-        let rollout = self.begun(world, observation)?;
-        self.rollouts[(world - self.worlds.numbers.start) as usize] = rollout;
-        Ok(())
-    }
-
+impl Actor for FilterLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        let start = Instant::now();
         if !self.is_frozen {
             self.learned = self.fit.learned();
         }
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
-        let objective = self.config.objective(&self.policy());
+        let policy = Policy::exploiting(&LEARNED);
+        let objective = policy.objective(self.learned.target, &self.config);
         let rollouts = self.rollouts.iter_mut().enumerate();
         self.planned = in_parallel(rollouts, |(index, rollout)| {
             let belief = rollout.agent.belief().clone();
@@ -190,55 +188,58 @@ impl Learner for FilterLearner {
             };
             (belief, plans.remove(0))
         });
-        self.planning += start.elapsed();
         let plans = self.planned.iter();
         plans.map(|(_, plan)| plan.moves.clone()).collect()
     }
 
-    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
-        let turns = see_all(&mut self.rollouts, without_truth(observations))?;
-        let mut tick = Tick::default();
-        let runs = self.rollouts.iter().zip(&self.planned).zip(turns);
-        for (world, ((rollout, (predictor, plan)), turn)) in (self.worlds.numbers.start..).zip(runs)
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.rollouts, seen)?;
+        let runs = self.rollouts.iter().zip(&self.planned).zip(&records);
+        for (robot, ((rollout, (predictor, plan)), record)) in
+            (self.worlds.numbers.start..).zip(runs)
         {
-            let (belief, observation) = (rollout.agent.belief(), rollout.observation());
-            let reward = observation.robot.reward;
-            let start = turn.before.robot.cell();
+            let frame = &rollout.observation().frame;
+            let start = record.before.robot.cell();
             let paying = self.worlds.airspace.paying(start, &plan.moves);
-            self.fit
-                .see(world, &observation.frame, Some(predictor), &self.learned);
-            self.fit.reward(belief, &paying, reward);
-            tick.reward += reward;
-            tick.score += turn.score.unwrap_or_default();
+            self.fit.see(robot, frame, Some(predictor), &self.learned);
+            let belief = rollout.agent.belief();
+            self.fit.earn(belief, &paying, record.reward);
         }
-        tick.n_worlds = self.rollouts.len() as u64;
-        tick.world_steps = self.fit.world_steps;
-        Ok(tick)
+        Ok(records)
+    }
+
+    fn predict(&mut self) {
+        predict_all(&mut self.rollouts);
+    }
+}
+
+impl Learning for FilterLearner {
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let rollout = self.begun(robot, observation)?;
+        self.rollouts[(robot - self.worlds.numbers.start) as usize] = rollout;
+        Ok(())
+    }
+
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
+        let update = |update: crate::gradient::Update| ModelUpdate {
+            number: update.number,
+            loss: Some(update.loss),
+            rate: Some(update.rate),
+            more: Vec::new(),
+        };
+        Ok(self.fit.learn()?.into_iter().map(update).collect())
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
     }
 
     fn rollout(&self, index: usize) -> &Rollout {
         &self.rollouts[index]
     }
 
-    fn predict(&mut self) {
-        predict_all(&mut self.rollouts);
-    }
-
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
-        let start = Instant::now();
-        let updates = self.fit.learn();
-        self.learning += start.elapsed();
-        let update = |update: crate::filter::Update| ModelUpdate {
-            number: update.number,
-            loss: Some(update.loss),
-            rate: Some(update.rate),
-            more: Vec::new(),
-        };
-        Ok(updates?.into_iter().map(update).collect())
-    }
-
-    fn freeze(&mut self) {
-        self.is_frozen = true;
+    fn target(&self) -> usize {
+        self.learned.target
     }
 
     fn world_steps(&self) -> u64 {
@@ -252,21 +253,37 @@ impl Learner for FilterLearner {
     fn lacks(&self, steps: u64) -> String {
         self.fit.lacks(steps)
     }
+}
 
-    fn belief(&self) -> Option<(&Belief, usize)> {
-        let rollout = self.rollouts.first()?;
-        Some((rollout.agent.belief(), self.learned.target))
+impl Saving for FilterLearner {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
+        let robots = self.worlds.numbers.clone();
+        let mut n_gone_on = 0;
+        if !SavedRobot::any_is_of(&self.left, robots.clone(), &observations) {
+            // Frames of other worlds, perhaps of another model.
+            self.fit.forget();
+        }
+        for (robot, observation) in robots.zip(observations) {
+            let left = self.left.get(&robot);
+            let left = left.filter(|left| left.is_of(&observation) && self.fit.has_track(robot));
+            let rollout = if let Some(left) = left {
+                let mut rollout = self.rollout_at(observation);
+                left.restore(&mut rollout.agent);
+                n_gone_on += 1;
+                rollout
+            } else {
+                self.begun(robot, observation)?
+            };
+            self.rollouts.push(rollout);
+        }
+        Ok(n_gone_on)
     }
 
     fn contents(&self) -> Result<Contents> {
-        let saved = self.rollouts.iter().map(SavedWorld::of);
+        let saved = self.rollouts.iter().map(SavedRobot::of);
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
         // As `SavedFilter`, without a copy of the learner.
         let state = (&self.fit, worlds);
         Ok(Contents::new(self.fit.named_tensors(), &state))
-    }
-
-    fn times(&self) -> Vec<(&'static str, Duration)> {
-        vec![("planning", self.planning), ("updates", self.learning)]
     }
 }

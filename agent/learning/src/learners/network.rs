@@ -10,25 +10,79 @@ mod progress;
 pub use self::progress::{Position, Progress, SavedNetwork};
 
 use self::progress::follower;
-use anyhow::Result;
+use anyhow::{Result, ensure};
+use emberwatch_messages::control::{CoverageRule, ServerInfo};
 
+use crate::beliefs::autoencoder::{AutoencoderEstimator, Follower};
+use crate::beliefs::numbered_states;
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
-use crate::estimation::{AutoencoderEstimator, Follower};
-use crate::learners::base::{Learner, Worlds, place, without_truth};
-use crate::policy::{Policy, numbered_states};
+use crate::learners::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds, place};
+use crate::learners::update::ModelUpdate;
+use crate::policy::{Policy, network_choices};
 use crate::reward::met;
-use crate::rollout::{Rollout, predict_all, see_all};
-use crate::update::{ModelUpdate, Tick};
-use emberwatch_belief::estimation::belief::Belief;
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_network::{Transition, Window};
-use std::time::{Duration, Instant};
 
-pub const KIND: &str = "autoencoder";
+pub const AUTOENCODER: LearnerKind = LearnerKind {
+    name: "autoencoder",
+    about: "The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives",
+    checkpoints: &["autoencoder"],
+    columns: &["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"],
+    is_single: true,
+    steps: |_| 0,
+    episode_steps: |_| None,
+    done: |contents| Ok(contents.state::<SavedNetwork>()?.position.iterations),
+    adopt: |_, _| {},
+    read: |contents, device, learned| {
+        Ok(learned.put(Progress::read(contents, device)?.into_model()))
+    },
+    begin,
+};
 
-const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
+fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+    on.worlds.check_matrices()?;
+    let mut progress = Progress::first(&on.worlds, on.config, on.device)?;
+    if let Some(contents) = on.contents {
+        progress.load(contents)?;
+    }
+    if !on.is_frozen {
+        check_full_frames(&progress, on.config, on.info)?;
+        check_window(on.config, on.info)?;
+    }
+    Ok(Box::new(NetworkLearner::new(
+        progress, on.worlds, on.config,
+    )))
+}
+
+/// Refuses a server without the first frames that the settings ask for, which show every cell.
+fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInfo) -> Result<()> {
+    let full_frames = config.autoencoder.full_frames;
+    ensure!(
+        progress.position.iterations >= full_frames || info.coverage != CoverageRule::Path,
+        "autoencoder.full_frames: {full_frames} frames that show every cell need a server with --coverage client or \
+         full, or the setting 0"
+    );
+    Ok(())
+}
+
+/// Refuses episodes that are too short for a window, from which nothing could be learned.
+fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
+    // Recorded worlds may have longer episodes than their shortest.
+    let is_cut = info.max_steps > 0 && info.recorded_world.is_none();
+    let (window, n_frames) = (
+        config.autoencoder.window as u64,
+        info.max_steps.saturating_add(1),
+    );
+    ensure!(
+        !is_cut || window <= n_frames,
+        "autoencoder.window: expected at most the {n_frames} frames of an episode (--max-steps of the server), got \
+         {window}"
+    );
+    Ok(())
+}
 
 /// An autoencoder and a DQN that are learned.
 pub struct NetworkLearner {
@@ -41,7 +95,6 @@ pub struct NetworkLearner {
     /// The last decision, and the path that was planned for it.
     decision: Option<Decision>,
     is_frozen: bool,
-    times: [(&'static str, Duration); 3],
 }
 
 /// The action of a step, what it was chosen on, and the path for it.
@@ -56,14 +109,13 @@ impl NetworkLearner {
     /// Goes on from some progress, or begins.
     pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
-            choices: Policy::network_choices(progress.autoencoder.shape().n_states),
+            choices: network_choices(progress.autoencoder.shape().n_states),
             progress,
             worlds,
             config: config.clone(),
             rollout: None,
             decision: None,
             is_frozen: false,
-            times: ["planning", "dqn", "autoencoder"].map(|part| (part, Duration::ZERO)),
         }
     }
 
@@ -72,9 +124,9 @@ impl NetworkLearner {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
         let names = numbered_states(network.shape().n_states);
-        let (policy, config) = (&self.choices[0], &self.config);
-        let worlds = &self.worlds;
-        worlds.rollout(config, policy, Box::new(estimator), names, observation)
+        // The first choice is for the first state.
+        let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
+        worlds.rollout(&self.config, first, Box::new(estimator), names, observation)
     }
 
     fn at_world(&self) -> &Rollout {
@@ -132,7 +184,6 @@ impl NetworkLearner {
     }
 
     fn update_dqn(&mut self) -> Result<[Option<f64>; 2]> {
-        let start = Instant::now();
         let rate = self
             .config
             .dqn
@@ -140,12 +191,10 @@ impl NetworkLearner {
             .at(self.progress.position.iterations);
         self.progress.dqn.set_learning_rate(rate as f32);
         let loss = self.progress.dqn.update();
-        self.times[1].1 += start.elapsed();
         Ok([loss?.map(f64::from), Some(rate)])
     }
 
     fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2]> {
-        let start = Instant::now();
         let number = self.progress.autoencoder.n_updates();
         let config = &self.config.autoencoder;
         let replay = &self.progress.replay;
@@ -157,39 +206,50 @@ impl NetworkLearner {
         let rate = config.step_size.at(self.progress.position.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
-        self.times[2].1 += start.elapsed();
         Ok([Some(loss?), Some(rate)])
     }
 }
 
-impl Learner for NetworkLearner {
-    fn kind(&self) -> &'static str {
-        KIND
+impl Actor for NetworkLearner {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let mut decision = self.decide();
+        let objective = self.choices[decision.action].objective(0, &self.config);
+        let rollout = self.at_world_mut();
+        let (cells, step) = (rollout.cells(), rollout.step());
+        decision.path = rollout
+            .agent
+            .plan_for(objective, &cells, step)
+            .remove(0)
+            .moves;
+        let paths = vec![decision.path.clone()];
+        self.decision = Some(decision);
+        paths
     }
 
-    fn columns(&self) -> &'static [&'static str] {
-        &COLUMNS
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.rollout, seen)?;
+        let (record, rollout) = (&records[0], self.at_world());
+        let path = self.decision.as_ref().map(|decision| &*decision.path);
+        let start = record.before.robot.cell();
+        let paying = self.worlds.airspace.paying(start, path.unwrap_or_default());
+        let met = met(rollout.agent.belief(), paying.into_iter());
+        let frame = rollout.observation().frame.clone();
+        let position = &mut self.progress.position;
+        position.reward.add(&met, record.reward);
+        position.iterations += 1;
+        self.progress.replay.push(frame);
+        Ok(records)
     }
 
+    fn predict(&mut self) {
+        predict_all(&mut self.rollout);
+        self.remember();
+    }
+}
+
+impl Learning for NetworkLearner {
     fn wants_full_frames(&self) -> bool {
         !self.is_frozen && self.progress.position.iterations < self.config.autoencoder.full_frames
-    }
-
-    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
-        let observation = observations.remove(0);
-        let shown = self.progress.replay.frames().last();
-        let goes_on = self.progress.position.place == Some(place(&observation))
-            && shown == Some(&observation.frame);
-        if goes_on {
-            let follower = self.progress.position.follower.clone();
-            let mut rollout = self.rollout_at(follower, observation);
-            let estimate = self.progress.position.estimate.as_ref();
-            rollout.agent.remember_estimate(estimate);
-            self.rollout = Some(rollout);
-        } else {
-            self.begin(self.worlds.numbers.start, observation)?;
-        }
-        Ok(usize::from(goes_on))
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
@@ -202,54 +262,6 @@ impl Learner for NetworkLearner {
         rollout.agent.predict();
         self.rollout = Some(rollout);
         Ok(())
-    }
-
-    fn plan(&mut self) -> Vec<Vec<Move>> {
-        let start = Instant::now();
-        let mut decision = self.decide();
-        let objective = self.config.objective(&self.choices[decision.action]);
-        let rollout = self.at_world_mut();
-        let (cells, step) = (rollout.cells(), rollout.step());
-        decision.path = rollout
-            .agent
-            .plan_for(objective, &cells, step)
-            .remove(0)
-            .moves;
-        let paths = vec![decision.path.clone()];
-        self.decision = Some(decision);
-        self.times[0].1 += start.elapsed();
-        paths
-    }
-
-    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
-        let turns = see_all(&mut self.rollout, without_truth(observations))?;
-        let (turn, rollout) = (&turns[0], self.at_world());
-        let path = self.decision.as_ref().map(|decision| &*decision.path);
-        let start = turn.before.robot.cell();
-        let paying = self.worlds.airspace.paying(start, path.unwrap_or_default());
-        let (met, observation) = (
-            met(rollout.agent.belief(), paying.into_iter()),
-            rollout.observation().clone(),
-        );
-        let position = &mut self.progress.position;
-        position.reward.add(&met, observation.robot.reward);
-        position.iterations += 1;
-        self.progress.replay.push(observation.frame);
-        Ok(Tick {
-            reward: observation.robot.reward,
-            score: turn.score.unwrap_or_default(),
-            n_worlds: 1,
-            world_steps: self.progress.position.iterations,
-        })
-    }
-
-    fn rollout(&self, _: usize) -> &Rollout {
-        self.at_world()
-    }
-
-    fn predict(&mut self) {
-        predict_all(&mut self.rollout);
-        self.remember();
     }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
@@ -281,6 +293,14 @@ impl Learner for NetworkLearner {
         self.is_frozen = true;
     }
 
+    fn rollout(&self, _: usize) -> &Rollout {
+        self.at_world()
+    }
+
+    fn target(&self) -> usize {
+        self.progress.target()
+    }
+
     fn world_steps(&self) -> u64 {
         self.progress.position.iterations
     }
@@ -297,17 +317,27 @@ impl Learner for NetworkLearner {
             self.config.autoencoder.window
         )
     }
+}
 
-    fn belief(&self) -> Option<(&Belief, usize)> {
-        let rollout = self.rollout.as_ref()?;
-        Some((rollout.agent.belief(), self.progress.target()))
+impl Saving for NetworkLearner {
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
+        let observation = observations.remove(0);
+        let shown = self.progress.replay.frames().last();
+        let goes_on = self.progress.position.place == Some(place(&observation))
+            && shown == Some(&observation.frame);
+        if goes_on {
+            let follower = self.progress.position.follower.clone();
+            let mut rollout = self.rollout_at(follower, observation);
+            let estimate = self.progress.position.estimate.as_ref();
+            rollout.agent.remember_estimate(estimate);
+            self.rollout = Some(rollout);
+        } else {
+            self.begin(self.worlds.numbers.start, observation)?;
+        }
+        Ok(usize::from(goes_on))
     }
 
     fn contents(&self) -> Result<Contents> {
         Ok(self.progress.to_contents(self.at_world())?)
-    }
-
-    fn times(&self) -> Vec<(&'static str, Duration)> {
-        self.times.to_vec()
     }
 }

@@ -7,32 +7,52 @@ mod behaviour;
 mod replay;
 mod saved;
 
-pub use self::saved::{NeuralModel, SavedNeural, new_network};
+pub use self::saved::SavedNeural;
 
 use self::behaviour::Behaviour;
-use self::replay::Replay;
-use self::saved::{SavedRun, estimator};
+use self::replay::LessonReplay;
+use self::saved::SavedRun;
+use crate::beliefs::learned::{LearnedModel, SavedModel};
+use crate::beliefs::neural::{corrected_tensors, estimator};
+use crate::beliefs::{LearnedBelief, NEURAL as BELIEF, numbered_states};
 use crate::checkpoint::{Contents, check};
 use crate::config::AgentConfig;
-use crate::learners::base::{Learner, Worlds, lacks_steps, without_truth};
-use crate::learners::filter::fit::LearnedModel;
-use crate::learners::filter::model::SavedModel;
-use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
+use crate::learners::base::{
+    Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
+};
+use crate::learners::left::Left;
+use crate::learners::update::ModelUpdate;
+use crate::policy::Policy;
 use crate::reward::{RewardEstimate, met};
-use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
-use crate::update::{ModelUpdate, Tick};
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, in_parallel, predict_all, see_all};
 use anyhow::Result;
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::planning::Target;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_network::{Device, NeuralBelief};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
 
-pub const KIND: &str = "neural_belief";
+pub const NEURAL: LearnerKind = LearnerKind {
+    name: "neural",
+    about: "A network that keeps space, from what was seen to what will be seen",
+    checkpoints: &["neural_belief"],
+    columns: &[],
+    is_single: false,
+    steps: |config| config.neural.steps,
+    episode_steps: |config| Some(config.neural.episode_steps),
+    done: |contents| Ok(contents.state::<SavedNeural<'_>>()?.world_steps),
+    adopt: |_, _| {},
+    read: |contents, device, learned| Ok(learned.put(saved::read(contents, device)?)),
+    begin,
+};
+
+fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+    on.worlds.check_matrices()?;
+    let filter = on.learned.get::<LearnedModel>();
+    let learner = NeuralLearner::new(on.contents, filter, on.worlds, on.config, on.device);
+    Ok(Box::new(learner?))
+}
 
 pub struct NeuralLearner {
     worlds: Worlds,
@@ -41,7 +61,7 @@ pub struct NeuralLearner {
     /// The filter that it corrects, if it does.
     filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
-    replay: Replay,
+    replay: LessonReplay,
     runs: Vec<Run>,
     /// Where a checkpoint left the robots.
     left: BTreeMap<u32, SavedRun>,
@@ -49,7 +69,6 @@ pub struct NeuralLearner {
     /// Updates that steps have earned and that are not made yet.
     earned: f64,
     is_frozen: bool,
-    times: [(&'static str, Duration); 2],
 }
 
 /// A robot at its world.
@@ -73,13 +92,12 @@ impl NeuralLearner {
             network: NeuralBelief::new(n_observations, config.seed, device)?,
             filter: filter.cloned().map(Box::new),
             reward: RewardEstimate::new(n_observations),
-            replay: Replay::new(config.neural.replay_frames),
+            replay: LessonReplay::new(config.neural.replay_frames),
             runs: Vec::new(),
             left: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
             is_frozen: false,
-            times: ["planning", "updates"].map(|part| (part, Duration::ZERO)),
             worlds,
             config: config.clone(),
         };
@@ -92,20 +110,9 @@ impl NeuralLearner {
     }
 
     /// The value that pays most, as far as rewards tell by now.
-    fn target(&self) -> usize {
+    fn paying(&self) -> usize {
         let last = self.worlds.n_observations - 1;
         self.reward.target().unwrap_or(last)
-    }
-
-    /// What robots act by that plan on the belief.
-    fn policy(&self) -> Policy {
-        let target = Target::State(self.target());
-        Policy::new(
-            "neural_beam",
-            EstimatorKind::Neural,
-            PlannerKind::Beam,
-            target,
-        )
     }
 
     /// A robot before it takes in what its world shows.
@@ -113,11 +120,15 @@ impl NeuralLearner {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
-        let (policy, config) = (self.policy(), &self.config);
-        let estimator = Box::new(estimator);
-        Ok(self
-            .worlds
-            .rollout(config, &policy, estimator, names, observation))
+        let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
+        let (estimator, worlds) = (Box::new(estimator), &self.worlds);
+        Ok(worlds.rollout(
+            &self.config,
+            (&policy, target),
+            estimator,
+            names,
+            observation,
+        ))
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.
@@ -166,7 +177,7 @@ impl NeuralLearner {
 impl Run {
     /// A run where a checkpoint left it, with a rollout that has not yet taken in what its world shows.
     fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
-        saved.restore(&mut rollout.agent)?;
+        saved.left.restore(&mut rollout.agent)?;
         Ok(Self {
             rollout,
             behaviour: saved.behaviour,
@@ -175,49 +186,10 @@ impl Run {
     }
 }
 
-impl Learner for NeuralLearner {
-    fn kind(&self) -> &'static str {
-        KIND
-    }
-
-    fn columns(&self) -> &'static [&'static str] {
-        &[]
-    }
-
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut left = std::mem::take(&mut self.left);
-        let robots = self.worlds.numbers.clone().zip(&observations);
-        left.retain(|robot, left| {
-            let mut robots = robots.clone();
-            robots.any(|(other, observation)| other == *robot && left.is_of(observation))
-        });
-        if left.is_empty() {
-            // Frames of other worlds, perhaps of another model.
-            self.replay.forget();
-            self.earned = 0.0;
-        }
-        self.replay.end_others(&self.worlds.numbers);
-        let n_gone_on = left.len();
-        for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
-            let run = match left.remove(&robot) {
-                Some(left) => Run::restore(left, self.rollout_at(observation)?)?,
-                None => self.begun(robot, observation)?,
-            };
-            self.runs.push(run);
-        }
-        Ok(n_gone_on)
-    }
-
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let run = self.begun(robot, observation)?;
-        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
-        Ok(())
-    }
-
+impl Actor for NeuralLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        let start = Instant::now();
-        let (policy, target, first) = (self.policy(), self.target(), self.worlds.numbers.start);
-        let objective = self.config.objective(&policy);
+        let (target, first) = (self.paying(), self.worlds.numbers.start);
+        let objective = Policy::exploiting(&BELIEF).objective(target, &self.config);
         let is_exploring = self.progress() < self.config.neural.explore_share;
         let (seed, step, is_frozen) = (self.config.seed, self.world_steps, self.is_frozen);
         let mut runs = std::mem::take(&mut self.runs);
@@ -245,43 +217,41 @@ impl Learner for NeuralLearner {
             run.path.clone()
         });
         self.runs = runs;
-        self.times[0].1 += start.elapsed();
         paths
     }
 
-    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
         let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let turns = see_all(rollouts, without_truth(observations))?;
-        let mut tick = Tick::default();
+        let records = see_all(rollouts, seen)?;
         let runs = self.worlds.numbers.clone().zip(&self.runs);
-        for ((robot, run), turn) in runs.zip(turns) {
+        for ((robot, run), record) in runs.zip(&records) {
             let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
-            let reward = observation.robot.reward;
-            let start = turn.before.robot.cell();
+            let start = record.before.robot.cell();
             let paying = self.worlds.airspace.paying(start, &run.path);
-            self.reward.add(&met(belief, paying.into_iter()), reward);
+            self.reward
+                .add(&met(belief, paying.into_iter()), record.reward);
             let base = run.rollout.agent.estimator().base();
             self.replay.push(robot, &observation.frame, base);
-            tick.reward += reward;
-            tick.score += turn.score.unwrap_or_default();
         }
-        tick.n_worlds = self.runs.len() as u64;
-        self.world_steps += tick.n_worlds;
-        self.earned += tick.n_worlds as f64 * self.config.neural.updates_per_step;
-        tick.world_steps = self.world_steps;
-        Ok(tick)
-    }
-
-    fn rollout(&self, index: usize) -> &Rollout {
-        &self.runs[index].rollout
+        let n_robots = records.len() as u64;
+        self.world_steps += n_robots;
+        self.earned += n_robots as f64 * self.config.neural.updates_per_step;
+        Ok(records)
     }
 
     fn predict(&mut self) {
         predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
     }
+}
+
+impl Learning for NeuralLearner {
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let run = self.begun(robot, observation)?;
+        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
+        Ok(())
+    }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
-        let start = Instant::now();
         let mut updates = Vec::new();
         while self.earned >= 1.0 {
             self.earned -= 1.0;
@@ -299,12 +269,19 @@ impl Learner for NeuralLearner {
                 more: Vec::new(),
             });
         }
-        self.times[1].1 += start.elapsed();
         Ok(updates)
     }
 
     fn freeze(&mut self) {
         self.is_frozen = true;
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.runs[index].rollout
+    }
+
+    fn target(&self) -> usize {
+        self.paying()
     }
 
     fn world_steps(&self) -> u64 {
@@ -322,15 +299,39 @@ impl Learner for NeuralLearner {
         }
         "the frames show no cell".into()
     }
+}
 
-    fn belief(&self) -> Option<(&Belief, usize)> {
-        let run = self.runs.first()?;
-        Some((run.rollout.agent.belief(), self.target()))
+impl Saving for NeuralLearner {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
+        let mut left = std::mem::take(&mut self.left);
+        let robots = self.worlds.numbers.clone().zip(&observations);
+        left.retain(|robot, left| {
+            let mut robots = robots.clone();
+            robots.any(|(other, observation)| other == *robot && left.left.is_of(observation))
+        });
+        if left.is_empty() {
+            // Frames of other worlds, perhaps of another model.
+            self.replay.forget();
+            self.earned = 0.0;
+        }
+        self.replay.end_others(&self.worlds.numbers);
+        let n_gone_on = left.len();
+        for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
+            let run = match left.remove(&robot) {
+                Some(left) => Run::restore(left, self.rollout_at(observation)?)?,
+                None => self.begun(robot, observation)?,
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
     }
 
     fn contents(&self) -> Result<Contents> {
         let runs = self.runs.iter();
-        let runs = runs.map(|run| SavedRun::of(&run.rollout, run.behaviour));
+        let runs = runs.map(|run| SavedRun {
+            left: Left::of(&run.rollout),
+            behaviour: run.behaviour,
+        });
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
         let state = SavedNeural {
             shape: self.worlds.shape(),
@@ -343,12 +344,8 @@ impl Learner for NeuralLearner {
             replay: Cow::Borrowed(&self.replay),
             worlds,
         };
-        let filter = self.filter.iter().flat_map(|it| it.corrected_tensors());
+        let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
         let tensors = self.network.named_tensors()?.into_iter().chain(filter);
         Ok(Contents::new(tensors, &state))
-    }
-
-    fn times(&self) -> Vec<(&'static str, Duration)> {
-        self.times.to_vec()
     }
 }

@@ -1,20 +1,23 @@
 //! Which belief learners plan on.
 
-use crate::belief::LearnedBelief;
+use crate::beliefs::learned::LearnedModel;
+use crate::beliefs::neural::NeuralModel;
+use crate::beliefs::{KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL};
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
+use crate::learned::Learned;
 use crate::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use crate::learners::filter::FilterLearner;
-use crate::learners::filter::fit::{FilterFit, LearnedModel};
+use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::{NetworkLearner, Progress};
-use crate::learners::neural::{NeuralLearner, NeuralModel};
-use crate::learners::{Learner, Worlds};
-use crate::policy::{EstimatorKind, PlannerKind, Policy};
-use emberwatch_belief::estimation::BayesFilter;
+use crate::learners::neural::NeuralLearner;
+use crate::learners::{Learner, Learning, Saving, Worlds};
+use crate::policy::{Policy, network_choices};
+use crate::rollout::{Actor, Seen};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::{
-    BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
+    BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem,
 };
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
@@ -27,7 +30,6 @@ const ROBOT: Cell = Cell { row: 4, col: 4 };
 fn worlds() -> Worlds {
     Worlds {
         airspace: Airspace::open(Shape::new(8, 9).expect("test shape")),
-        zones: None,
         n_observations: 3,
         n_moves: 6,
         numbers: 0..1,
@@ -67,16 +69,6 @@ fn observation(step: u64) -> Observation {
     }
 }
 
-fn learned_beam() -> Policy {
-    let target = Target::State(0);
-    Policy::new(
-        "learned_beam",
-        EstimatorKind::LEARNED,
-        PlannerKind::Beam,
-        target,
-    )
-}
-
 /// The path that a policy's planner finds for an objective.
 fn path(
     config: &AgentConfig,
@@ -92,13 +84,17 @@ fn path(
         seed: config.planner_seed(0),
         step,
     };
-    config.planner(policy).plan(&problem).moves
+    (policy.planner.build)(config).plan(&problem).moves
+}
+
+fn seen(step: u64) -> Seen {
+    Seen::new([observation(step)])
 }
 
 /// One step: the path, and the posterior after its frame.
 fn fly(learner: &mut impl Learner, step: u64) -> (Vec<Move>, Belief) {
     let path = learner.plan().remove(0);
-    learner.see(vec![observation(step)]).expect("possible");
+    learner.see(vec![seen(step)]).expect("possible");
     let posterior = learner.rollout(0).agent.belief().clone();
     learner.predict();
     (path, posterior)
@@ -116,7 +112,7 @@ fn check(
     let (mut all, mut before) = ([true; 2], None);
     for step in 1..9 {
         let (path, estimate) = fly(&mut learner, step);
-        let (predictor, target) = learner.belief().expect("a belief");
+        let (predictor, target) = (learner.rollout(0).agent.belief(), learner.target());
         let now = [&estimate, predictor].map(|belief| paths(belief, target, step));
         let Some(paths) = before.replace(now) else {
             continue;
@@ -129,7 +125,8 @@ fn check(
         BasisKind::Estimate => [true, false],
         BasisKind::Predictor => [false, true],
     };
-    assert_eq!(all, expected, "{}, {basis:?}", learner.kind());
+    let policy = learner.rollout(0).agent.policy();
+    assert_eq!(all, expected, "{policy:?}, {basis:?}");
 }
 
 #[test]
@@ -141,33 +138,26 @@ fn learners_plan_on_the_belief_that_settings_say() {
             n_observations: 3,
             kernel: (3, 3),
             sees_own_state: false,
-            n_zones: 0,
             n_matrices: 1,
         };
         let learner = FilterLearner::new(dimensions, worlds(), config);
         let beam = |belief: &Belief, target: usize, step: u64| {
-            let policy = learned_beam();
-            let objective = Objective {
-                target: Target::State(target),
-                ..config.objective(&policy)
-            };
+            let policy = Policy::exploiting(&LEARNED);
+            let objective = policy.objective(target, config);
             vec![path(config, &policy, objective, belief, step)]
         };
         check(learner, basis, beam);
         let progress = Progress::first(&worlds(), config, &Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check(learner, basis, |belief, _, step| {
-            let choices = Policy::network_choices(3);
-            let path = |choice| path(config, choice, config.objective(choice), belief, step);
+            let choices = network_choices(3);
+            let path =
+                |choice: &Policy| path(config, choice, choice.objective(0, config), belief, step);
             choices.iter().map(path).collect()
         });
         let learner = NeuralLearner::new(None, None, worlds(), config, &Device::Cpu);
         check(learner.expect("a network"), basis, beam);
-        let model = Model::wildfire();
-        let filter =
-            BayesFilter::known(&model, Belief::uniform(3, worlds().shape())).expect("valid");
-        let base = Base::known(EstimatorKind::KNOWN, filter, &model);
-        let learner = DecisionsLearner::new(base, None, worlds(), config).expect("new");
+        let learner = DecisionsLearner::new(known_base(), None, worlds(), config).expect("new");
         // The robot remembers what every step showed, and never earns.
         let memory = |step: u64| {
             let mut memory = Memory::new(worlds().shape());
@@ -197,6 +187,13 @@ fn learners_plan_on_the_belief_that_settings_say() {
     }
 }
 
+/// The filter of a known model.
+fn known_base() -> Base {
+    let known = (Model::wildfire(), Belief::uniform(3, worlds().shape()));
+    let base = Base::new(&KNOWN, Some(known), Learned::default(), worlds().shape());
+    base.expect("a model")
+}
+
 /// What a checkpoint holds after so many steps in a row.
 fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     for step in steps {
@@ -213,16 +210,10 @@ fn learned_filter(sees_own_state: bool) -> LearnedModel {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_zones: 0,
         n_matrices: 1,
     };
-    FilterFit::new(
-        dimensions,
-        None,
-        worlds().shape(),
-        &config(BasisKind::Estimate),
-    )
-    .learned()
+    let config = config(BasisKind::Estimate);
+    FilterFit::new(dimensions, worlds().shape(), &config).learned()
 }
 
 #[test]
@@ -232,35 +223,36 @@ fn decisions_resume_bit_for_bit() {
         config.decisions.learning.batch,
         config.decisions.updates_per_step,
     ) = (4, 1.0);
-    let filter = |sees_own_state| Box::new(learned_filter(sees_own_state));
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    let neural = |filter| {
-        let network = network.clone();
-        LearnedBelief::Neural(NeuralModel {
-            network,
-            filter,
-            target: 1,
-        })
+    let neural = |filter: Option<LearnedModel>| NeuralModel {
+        network: network.clone(),
+        filter: filter.map(Box::new),
+        target: 1,
     };
-    for (kind, belief) in [
+    let learned = |put: &dyn Fn(&mut Learned) -> bool| {
+        let mut learned = Learned::default();
+        assert!(!put(&mut learned));
+        learned
+    };
+    for (kind, learned) in [
+        (&LEARNED, learned(&|it| it.put(learned_filter(true)))),
         (
-            EstimatorKind::learned(true),
-            LearnedBelief::Filter(filter(true)),
+            &LEARNED_SPATIAL,
+            learned(&|it| it.put(learned_filter(false))),
         ),
+        (&NEURAL, learned(&|it| it.put(neural(None)))),
         (
-            EstimatorKind::LEARNED.spatial(),
-            LearnedBelief::Filter(filter(false)),
+            &NEURAL,
+            learned(&|it| it.put(neural(Some(learned_filter(false))))),
         ),
-        (EstimatorKind::Neural, neural(None)),
-        (EstimatorKind::Neural, neural(Some(filter(false)))),
     ] {
-        let base = Base::learned(kind, belief, worlds().shape());
+        let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");
         let left = learn(&mut learner, 1..20);
-        let base = Base::saved(&left, worlds().shape(), &Device::Cpu)
-            .expect("whole")
-            .expect("a belief");
+        let saved: SavedDecisions = left.state().expect("its state");
+        let base = saved.base(&left, worlds().shape(), &Device::Cpu);
+        let base = base.expect("whole").expect("a belief");
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
         let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
@@ -275,11 +267,8 @@ fn decisions_resume_bit_for_bit() {
 
 /// The transitions that decisions remember of one episode, which ended that way.
 fn remembered(n_steps: u64, is_terminated: bool) -> Vec<Transition> {
-    let model = Model::wildfire();
-    let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape())).expect("valid");
-    let base = Base::known(EstimatorKind::KNOWN, filter, &model);
     let config = config(BasisKind::Estimate);
-    let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
+    let mut learner = DecisionsLearner::new(known_base(), None, worlds(), &config).expect("new");
     learner.attach(vec![observation(0)]).expect("possible");
     for step in 1..=n_steps {
         learner.plan();
@@ -287,7 +276,7 @@ fn remembered(n_steps: u64, is_terminated: bool) -> Vec<Transition> {
         seen.robot.reward = step as f64;
         seen.world.truncated = u16::from(step == n_steps && !is_terminated);
         seen.world.terminated = u16::from(step == n_steps && is_terminated);
-        learner.see(vec![seen]).expect("possible");
+        learner.see(vec![Seen::new([seen])]).expect("possible");
         learner.predict();
     }
     learner.begin(0, observation(0)).expect("possible");

@@ -1,7 +1,7 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 use crate::config::AgentConfig;
-use crate::policy::{PlannerKind, Policy};
+use crate::policy::Policy;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
@@ -10,7 +10,7 @@ use emberwatch_belief::planning::options::choose_by_rule;
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
     BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan,
-    Planner, Proposal, RandomWalk,
+    Planner, Proposal, RandomWalk, Target,
 };
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Airspace, Cell, Frame, Grid};
@@ -88,7 +88,7 @@ impl Agent {
         config: &AgentConfig,
         setup: Setup,
     ) -> Self {
-        let is_random = policy.planner == PlannerKind::RandomWalk;
+        let is_random = !policy.planner.has_goal;
         let aim = if is_random {
             RANDOM_MOVES
         } else {
@@ -101,7 +101,7 @@ impl Agent {
             estimator,
             basis: setup.basis,
             estimate: None,
-            planner: config.planner(policy),
+            planner: (policy.planner.build)(config),
             options: OptionPlanner::new(setup.beam_width),
             target: setup.target,
             aim: aim.into(),
@@ -134,9 +134,10 @@ impl Agent {
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
-        let aim = match self.policy.planner {
-            PlannerKind::RandomWalk => RANDOM_MOVES.into(),
-            _ => objective.target.label(&self.state_names),
+        let aim = if !self.policy.planner.has_goal {
+            RANDOM_MOVES.into()
+        } else {
+            objective.target.label(&self.state_names)
         };
         let values = objective.values_in(self.basis_belief(), &self.airspace);
         self.plan_values(&values, &aim, robots, step)
@@ -219,8 +220,8 @@ impl Agent {
     /// As [`Self::plan`], paths of random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();
-        let belief = self.estimator.belief();
-        let values = self.policy.objective.values_in(belief, &self.airspace);
+        let new_cells = Objective::new(Target::Coverage);
+        let values = new_cells.values_in(self.estimator.belief(), &self.airspace);
         let (planner, random) = (&mut RandomWalk, (self.seed, step));
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
@@ -285,7 +286,7 @@ impl Agent {
     /// Names what [`Self::handover`] gives; `None` of an agent whose bytes no other can go on from.
     pub fn handover_kind(&self) -> Option<String> {
         let kind = self.estimator.handover()?.kind();
-        Some(format!("{kind}; freshness [H, W] as f32, rewards, paths"))
+        Some(handover_of(&kind))
     }
 
     /// All that it knows of its world before X_{k+1}: what its estimator does, and its memory.
@@ -326,7 +327,7 @@ impl Agent {
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
-            belief_from: self.policy.estimator.label(),
+            belief_from: self.policy.belief.label.into(),
             objective: self.aim.clone(),
             states: self.state_names.clone(),
             plan_millis: planning.as_secs_f64() * 1e3,
@@ -336,4 +337,9 @@ impl Agent {
     pub fn policy(&self) -> &Policy {
         &self.policy
     }
+}
+
+/// Names what an agent hands over whose estimator's bytes are of a kind.
+pub fn handover_of(kind: &str) -> String {
+    format!("{kind}; freshness [H, W] as f32, rewards, paths")
 }

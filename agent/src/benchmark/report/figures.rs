@@ -8,7 +8,9 @@ use crate::benchmark::report::teams::teams;
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_figures::{Bar, Color, Ladder, Named};
+use emberwatch_learning::beliefs::{self, BELIEFS, BeliefKind, KNOWN, LEARNED};
 use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::policy;
 use emberwatch_protocol::model::parse_color;
 use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
@@ -17,15 +19,11 @@ use std::path::Path;
 /// What the reward of the wildfire model counts: the label of a reward axis.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
-/// What feeds a policy's plans, and the colour of its bar.
-const FAMILIES: [(&str, Color); 6] = [
-    ("no belief", Color(0xa3, 0xa3, 0xa3)),
-    ("shooting, known model", Color(0x56, 0xb4, 0xe9)),
-    ("beam search, known model", Color(0x00, 0x72, 0xb2)),
-    ("learned", Color(0x00, 0x9e, 0x73)),
-    ("fed with the truth", Color(0xe6, 0x9f, 0x00)),
-    ("added", Color(0xcc, 0x79, 0xa7)),
-];
+/// The legend and the colour of policies that sample paths on the known model, apart from those that search.
+const SHOOTING: (&str, Color) = ("known model, shooting", Color(0x56, 0xb4, 0xe9));
+
+/// Those of rows that others measured.
+const ADDED: (&str, Color) = ("added", Color(0xcc, 0x79, 0xa7));
 
 /// One step of one world, as a policy saw it.
 #[derive(Debug, Clone)]
@@ -127,12 +125,12 @@ pub(super) fn draw_bars(
         }
     };
     bars.sort_by(|a, b| rank(b).total_cmp(&rank(a)));
-    let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
+    let is_used = |entry: &(&str, Color)| bars.iter().any(|bar| bar.color == entry.1);
     let ladder = Ladder {
         title: title.into(),
         note: note.into(),
         axis: axis.into(),
-        legend: FAMILIES.into_iter().filter(is_used).collect(),
+        legend: legend().into_iter().filter(is_used).collect(),
         bars,
     };
     save(path, &ladder.svg())
@@ -157,23 +155,39 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
         name: readable(group.policy),
         remark,
         label: height.label,
-        color: FAMILIES[family(group)].1,
+        color: chart(group).1,
         value: height.value,
         ends: height.ends,
         worlds: group.runs.iter().map(pair).collect(),
     }
 }
 
-fn family(group: &Group<'_>) -> usize {
-    let policy = group.policy.to_lowercase();
-    match group.estimator {
-        _ if group.runs.iter().any(|run| run.is_added) => 5,
-        "truth" | "next_truth" => 4,
-        "none" => 0,
-        "known_model" | "spatial_filter" if policy.contains("beam") => 2,
-        "known_model" | "spatial_filter" if !policy.contains("learn") => 1,
-        _ => 3,
+/// All entries of a legend, from the least to the most informed.
+fn legend() -> Vec<(&'static str, Color)> {
+    let mut all: Vec<_> = BELIEFS.iter().copied().map(chart_of).collect();
+    let at = all.iter().position(|entry| *entry == chart_of(&KNOWN));
+    all.insert(at.unwrap_or(0), SHOOTING);
+    all.push(ADDED);
+    all.dedup();
+    all
+}
+
+fn chart_of(belief: &BeliefKind) -> (&'static str, Color) {
+    let (legend, [red, green, blue]) = belief.chart;
+    (legend, Color(red, green, blue))
+}
+
+/// The legend and the colour of a group: of its belief.
+fn chart(group: &Group<'_>) -> (&'static str, Color) {
+    if group.runs.iter().any(|run| run.is_added) {
+        return ADDED;
     }
+    let belief = beliefs::named(group.estimator).unwrap_or(&LEARNED);
+    let samples = policy::planner_of(group.policy) == Some(&policy::SHOOTING);
+    if belief.knows_model && samples {
+        return SHOOTING;
+    }
+    chart_of(belief)
 }
 
 /// Draws the reward of all robots of a world over their number, a curve for each kind of team; nothing of runs that all

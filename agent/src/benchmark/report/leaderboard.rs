@@ -91,11 +91,11 @@ impl Entry {
             commit,
             training_seconds,
         } = &self.about;
-        let names = self.tasks.iter().map(|task| ("task", &task.task));
-        for (what, name) in [("policy", policy)].into_iter().chain(names) {
+        let tasks = self.tasks.iter().map(|task| ("task", &*task.task));
+        for (what, name) in [("policy", &*file_stem(policy))].into_iter().chain(tasks) {
             ensure!(
                 is_file_name(name),
-                "{what}: expected 1 to 64 letters, digits, - and _, got {name:?}"
+                "{what}: expected 1 to 64 letters, digits, '-', '_' and '.', and in a policy '/' and '+', got {name:?}"
             );
         }
         let runs = || self.tasks.iter().flat_map(|task| &task.runs);
@@ -209,6 +209,11 @@ pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
         .filter(|path| path.extension().is_some_and(|it| it == "csv"));
     let read = |path: &Path| Entry::read(path).with_context(|| format!("entry {}", path.display()));
     files.map(|path| read(path)).collect()
+}
+
+/// The name of a policy's file, without its end: `/` and `+` of a name by parts become `_`.
+pub fn file_stem(policy: &str) -> String {
+    policy.replace(['/', '+'], "_")
 }
 
 /// Checks that each entry has the random walk's worlds of its tasks, and that no policy has two entries.

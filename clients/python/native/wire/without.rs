@@ -1,11 +1,12 @@
 //! Systems other than Linux: servers cannot be attached to, and nothing is shown to observers.
 
 use emberwatch_messages::agent_belief::Intent;
+use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::{ChannelError, ConnectionError};
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{
-    AgentHeader, FrameHeader, StepReply, StepRequest, TruthHeader, WorldResult,
+    AgentHeader, FrameHeader, StepRequest, TruthHeader, WorldResult,
 };
 use emberwatch_messages::sample::Sample;
 use emberwatch_model::Probabilities;
@@ -22,21 +23,23 @@ impl Connection {
     pub fn open(instance: &Instance, _: &str, _: Duration) -> Result<Self, ConnectionError> {
         Err(refusal(instance).into())
     }
+}
 
-    pub fn info(&self) -> &ServerInfo {
+impl Backend for Connection {
+    fn info(&self) -> &ServerInfo {
         match self.0 {}
     }
 
-    pub fn control_text(&mut self, _: &[u8], _: Duration) -> Result<Vec<u8>, ConnectionError> {
-        match self.0 {}
-    }
-
-    pub fn step_payload(
+    fn step(
         &mut self,
         _: StepRequest,
         _: &[u8],
         _: Duration,
-    ) -> Result<(StepReply, Vec<u8>), ConnectionError> {
+    ) -> Result<StepAnswer, ConnectionError> {
+        match self.0 {}
+    }
+
+    fn control_text(&mut self, _: &[u8], _: Duration) -> Result<Vec<u8>, ConnectionError> {
         match self.0 {}
     }
 }
@@ -90,7 +93,7 @@ impl Feed {
     }
 
     /// No world is to be shown.
-    pub fn turn(&self, _: usize) -> Vec<usize> {
+    pub fn due(&self, _: usize) -> Vec<usize> {
         Vec::new()
     }
 

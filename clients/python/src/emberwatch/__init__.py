@@ -78,42 +78,28 @@ __all__ = [
 
 __version__ = VERSION
 
-#: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
-MAX_EPISODE_STEPS = 1000
 
-#: What the ids of each task begin with. Those of `wildfire` are the environments' own.
-_PREFIXES = {
-    "small": "WildfireSmall",
-    "sparse": "WildfireSparse",
-    "latent": "WildfireLatent",
-    "burnout": "WildfireBurnout",
-    "terrain": "WildfireTerrain",
-    "road-ice": "RoadIce",
-    "team": "WildfireTeam",
-    "jacksboro": "Jacksboro",
-}
-
-
-def _register(prefix: str, steps: int, n_moves: int, **keywords: Any) -> None:
-    """Registers the three environments with these keywords."""
-    for module, kind, version, episode in (
-        ("path_env", "", 0, steps),
-        ("moves_env", "Moves", 0, n_moves * steps),
-        ("objective_env", "Objective", 1, steps),
+def _register(task: Task, /, **keywords: Any) -> None:
+    """Registers the three environments of a task, with these keywords."""
+    for module, kind, version, steps in (
+        ("path_env", "", 0, task.max_steps),
+        ("moves_env", "Moves", 0, task.n_moves * task.max_steps),
+        ("objective_env", "Objective", 1, task.max_steps),
     ):
         gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-            f"emberwatch/{prefix}{kind}-v{version}",
+            f"emberwatch/{task.ids}{kind}-v{version}",
             entry_point=f"emberwatch.envs.{module}:Wildfire{kind}Env",
             vector_entry_point=f"emberwatch.envs.{module}:Wildfire{kind}VectorEnv",
-            max_episode_steps=episode,
+            max_episode_steps=steps,
             kwargs=keywords,
         )
 
 
-_register("Wildfire", MAX_EPISODE_STEPS, 64)
-for _name, _task in built_in_tasks().items():
-    if _name in _PREFIXES:
-        _register(_PREFIXES[_name], _task.max_steps, _task.n_moves, task=_name)
+_TASKS = built_in_tasks()
+# Without `task`, as the worlds are the default ones, of which keywords may change anything.
+_register(_TASKS.pop("wildfire"))
+for _name, _task in _TASKS.items():
+    _register(_task, task=_name)
 
 
 #: Modules that are imported when they are first used.

@@ -52,8 +52,26 @@ class _Spec(Protocol):
 
 VERSION: str
 
+#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+FIRST_TRAINING_SEED: int
+
+#: Maximum number of moves in a path.
+MAX_MOVES: int
+
+#: Maximum number of rows and columns that a robot sees beyond its cell.
+MAX_RADIUS: int
+
+#: Maximum number of rows, and of columns, of a grid.
+MAX_SIDE: int
+
+#: Maximum number of states, and of observations, of a model.
+MAX_VALUES: int
+
 def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
     """Texts of the built-in files by name; `states`: descriptions of recorded states."""
+
+def explain(status: int, detail: int) -> tuple[str, str] | None:
+    """The name of a status code, and its sentence for people; None if no refusal has the code."""
 
 def check_settings(settings: str) -> str:
     """All settings that a server with these would have; JSON from JSON."""
@@ -384,6 +402,9 @@ class Recording:
 
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
         """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
+
+def estimator_names() -> list[tuple[str, str]]:
+    """The name of each estimator that options can be planned on, and what it is."""
 
 def option_names() -> tuple[list[str], list[str]]:
     """The names of options, and those of the numbers that describe the plan of each."""

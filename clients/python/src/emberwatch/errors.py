@@ -5,6 +5,8 @@ Subclasses exist only where a caller acts differently.
 
 from typing import Final, Self
 
+from emberwatch._native import explain
+
 
 class EmberwatchError(Exception):
     """Base of all errors of this package.
@@ -81,69 +83,16 @@ class TrainingOnTestWorldsWarning(UserWarning):
     """A reset has begun an episode on a test seed of the task, outside of an evaluation."""
 
 
-#: Name and sentence of each status code, from code 1; `step` sends the code alone. None: not used.
-STATUSES: Final[tuple[tuple[str, str] | None, ...]] = (
-    (
-        "version_mismatch",
-        "protocol version mismatch: the server speaks {}; use a client and a server of one release",
-    ),
-    ("unknown_operation", "operation: expected 1 (step), 2 (observe) or 3 (recall), got {}"),
-    ("malformed", "malformed control message"),
-    (
-        "no_such_world",
-        "no such world: there are worlds 0 to {last}; for more, set worlds (--worlds N of a "
-        "server)",
-    ),
-    ("wrong_length", "wrong payload length: expected {} bytes"),
-    ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
-    ("bad_move", "byte {} of the payload: expected a move in 0..=3"),
-    ("no_lease", "no lease on robot {}: acquire it first"),
-    ("lease_lost", "lease lost to pid {}, which took the robot over or acquired it since"),
-    ("busy", "busy: held by pid {}; wait for its release, or acquire with takeover=True"),
-    ("resetting", "world {} is being reset; wait for the answer to the reset"),
-    ("episode_over", "world {} was truncated: reset it first"),
-    (
-        "not_permitted",
-        'not permitted: full frames need a server with coverage "client" or "full", and a replay '
-        "takes no steps",
-    ),
-    ("unknown_flags", "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {}"),
-    None,
-    None,
-    ("bad_file", "the file cannot be used"),
-    ("not_kept", "not kept: the nearest step that is kept is {}"),
-    (
-        "late",
-        "late: the world is at step {} already; observe it, and send a path for that step",
-    ),
-    ("early", "early: the world is at step {} only"),
-    (
-        "incomplete",
-        "incomplete: robot {} is missing; a step names all robots that its client holds in a "
-        "world, and a step of several worlds needs them all",
-    ),
-    (
-        "no_such_robot",
-        "no such robot: there are robots 0 to {last}; for more, set worlds or robots (--worlds N "
-        "or --robots N of a server)",
-    ),
-    ("no_memory", "memory: expected {} bytes for the answer, got less; ask for fewer robots"),
-)
-
 _CLASSES: Final = {"lease_lost": LeaseLostError, "no_memory": NotEnoughMemoryError}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
-    """The error of a status code other than 0, in the server's words if they fit Python."""
-    known = STATUSES[status - 1] if 1 <= status <= len(STATUSES) else None
+    """The error of a status code other than 0, in the words of its status if none are given."""
+    known = explain(status, detail)
     if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"
         return EmberwatchError(message, detail=detail)
     code, sentence = known
-    if code == "lease_lost" and detail == 0:
-        sentence = "lease lost: it expired or was released; acquire the robots again"
-    if code == "no_memory" and detail == 0:
-        sentence = "shared memory is full: free some, and ask again"
     if message is None or code == "busy":  # the server's words name a flag, not a keyword
-        message = sentence.format(detail, last=max(detail - 1, 0))
+        message = sentence.replace('"takeover": true', "takeover=True")
     return _CLASSES.get(code, EmberwatchError)(message, code, detail)

@@ -26,7 +26,7 @@ def beam_search(
     Args:
         values: What a visit to each cell is worth, `(n, H, W)`; counts in single precision.
         robots: Row and column of each robot, `(n, 2)`; its cell counts only if it is flown over.
-        n_moves: Moves of a path, 1 to 4,096.
+        n_moves: Moves of a path.
         rng: Breaks ties: one number of it for each world.
         visited: Cells that are worth nothing any more, where not 0, `(n, H, W)`.
         width: Paths kept after each move, 1 to 65,536, fewer where they need over 4 GiB; of those
@@ -38,7 +38,7 @@ def beam_search(
         The moves, `(n, n_moves)`: 0 up, 1 down, 2 left, 3 right.
     """
     given, cells = np.asarray(values), np.asarray(robots)
-    n_moves = as_count(n_moves, "n_moves", 1, 4096)
+    n_moves = as_count(n_moves, "n_moves", 1, _native.MAX_MOVES)
     width = as_count(width, "width", 1, 65536)
     _check(given, cells, visited)
     if airspace is not None and airspace.no_fly is not None:

@@ -1,7 +1,9 @@
 use super::*;
 use crate::config::ServerConfig;
+use emberwatch_messages::client::{Claim, Client, Observation};
 use emberwatch_messages::control::{Request, WorldSeed};
-use emberwatch_messages::message::Operation;
+use emberwatch_model::path::Move;
+use std::fmt::Debug;
 
 const LONG: Duration = Duration::from_secs(60);
 
@@ -18,104 +20,111 @@ fn embedded(n_worlds: u32, burn_in: u64) -> Embedded {
     Embedded::new(config.check().expect("settings")).expect("worlds")
 }
 
-fn ask(embedded: &mut Embedded, request: &Request) -> Result<Reply, ConnectionError> {
-    let text = serde_json::to_vec(request).expect("JSON");
-    let answer = embedded.control_text(&text, LONG)?;
-    Ok(serde_json::from_slice(&answer).expect("a reply"))
+fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
+    Client::acquire(embedded(n_worlds, burn_in), &Claim::new(0..n_worlds)).expect("a lease")
 }
 
-fn acquire(embedded: &mut Embedded, n_robots: u32) -> u64 {
-    let request = Request::Acquire {
-        first_robot: 0,
-        n_robots,
-        takeover: false,
-        ttl_millis: None,
-    };
-    match ask(embedded, &request) {
-        Ok(Reply::Lease(lease)) => lease.lease,
-        other => panic!("expected a lease, got {other:?}"),
+/// Flies one path with each robot.
+fn step(client: &mut Client<Embedded>) -> Result<Vec<Observation>, ConnectionError> {
+    let path = vec![Move::Down, Move::Right, Move::Down, Move::Right];
+    let paths = vec![path; client.robots().len()];
+    client.step(client.robots(), &paths)
+}
+
+fn reset(world: u32, seed: u64) -> [WorldSeed; 1] {
+    let seed = Some(seed);
+    [WorldSeed { world, seed }]
+}
+
+fn status<T: Debug>(refused: Result<T, ConnectionError>) -> Status {
+    match refused {
+        Err(ConnectionError::Refused { status, .. }) => status,
+        other => panic!("expected a refusal, got {other:?}"),
     }
 }
 
-fn step(embedded: &mut Embedded, lease: u64, k: u64) -> Result<Vec<u8>, ConnectionError> {
-    let request = StepRequest {
-        operation: Operation::Step as u32,
-        lease,
-        n_robots: 1,
-        n_moves: 4,
-        ..StepRequest::default()
-    };
-    let mut body = k.to_ne_bytes().to_vec();
-    body.extend([1, 3, 1, 3]);
-    embedded
-        .step_payload(request, &body)
-        .map(|(_, payload)| payload)
+#[test]
+fn a_client_flies_resets_and_recalls() {
+    let mut client = client(2, 20);
+    let first = step(&mut client).expect("a step");
+    let second = step(&mut client).expect("a step");
+    assert_eq!(second.len(), 2);
+    for (robot, seen) in second.iter().enumerate() {
+        assert_eq!((seen.world.step, seen.robot.n_moves), (2, 4));
+        assert_eq!(seen.robot.start(), first[robot].robot.cell());
+    }
+    assert_eq!(client.observe(0..2).expect("worlds"), second);
+    assert_eq!(client.recall(0..2, 1).expect("kept"), first);
+    client.reset(&reset(1, 5)).expect("a world");
+    let seen = step(&mut client).expect("a step");
+    assert_eq!([0, 1].map(|robot: usize| seen[robot].world.step), [3, 1]);
+    client.renew().expect("a lease");
+    client.release().expect("a lease");
 }
 
 #[test]
 fn a_snapshot_has_the_same_future() {
-    let mut embedded = embedded(2, 20);
-    let lease = acquire(&mut embedded, 2);
-    step(&mut embedded, lease, 0).expect("a step");
+    let mut client = client(2, 20);
+    step(&mut client).expect("a step");
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("worlds").display().to_string();
-    let (first_world, n_worlds) = (0, 1);
+    let (lease, first_world, n_worlds, from) = (client.lease(), 0, 2, 0);
     let save = Request::Snapshot {
         first_world,
         n_worlds,
         path: path.clone(),
     };
-    ask(&mut embedded, &save).expect("a file");
-    let future = step(&mut embedded, lease, 1).expect("a step");
+    client.backend().control(&save, LONG).expect("a file");
+    let future = step(&mut client).expect("a step");
     let load = Request::Restore {
         lease,
         first_world,
         n_worlds,
-        from: 0,
+        from,
         path,
     };
-    ask(&mut embedded, &load).expect("worlds");
-    assert_eq!(step(&mut embedded, lease, 1).expect("a step"), future);
+    client.backend().control(&load, LONG).expect("worlds");
+    client.observe(0..2).expect("worlds");
+    assert_eq!(step(&mut client).expect("a step"), future);
 }
 
 #[test]
 fn refusals_are_those_of_a_server() {
-    let mut embedded = embedded(1, 20);
-    let lease = acquire(&mut embedded, 1);
-    let status = |refused| match refused {
-        Err(ConnectionError::Refused { status, .. }) => status,
-        other => panic!("expected a refusal, got {other:?}"),
+    let mut client = client(1, 20);
+    let lease = client.lease();
+    let fork = Request::Fork {
+        lease,
+        from: 0,
+        to: 3,
     };
-    assert_eq!(status(step(&mut embedded, lease, 7)), Status::Early);
-    assert_eq!(status(step(&mut embedded, lease + 1, 0)), Status::NoLease);
-    let worlds = vec![WorldSeed {
-        world: 3,
-        seed: None,
-    }];
-    let reset = ask(&mut embedded, &Request::Reset { lease, worlds });
-    assert_eq!(status(reset.map(|_| Vec::new())), Status::NoSuchWorld);
-    ask(&mut embedded, &Request::Shutdown {}).expect("an end");
-    let gone = step(&mut embedded, lease, 0);
+    let forked = client.backend().control(&fork, LONG);
+    assert_eq!(status(forked), Status::NoSuchWorld);
+    assert_eq!(status(client.reset(&reset(3, 1))), Status::NoSuchWorld);
+    assert_eq!(
+        status(client.step(0..1, &[vec![Move::Up; 3]])),
+        Status::WrongPathLength
+    );
+    let release = Request::Release { lease };
+    client.backend().control(&release, LONG).expect("a lease");
+    assert_eq!(status(step(&mut client)), Status::LeaseLost);
+    let shutdown = client.backend().control(&Request::Shutdown {}, LONG);
+    shutdown.expect("an end");
+    let gone = step(&mut client);
     assert!(matches!(gone, Err(ConnectionError::ServerGone { .. })));
 }
 
 #[test]
 fn a_wait_that_ended_early_leaves_the_worlds_to_the_next_one() {
-    let mut embedded = embedded(1, 100_000);
-    let lease = acquire(&mut embedded, 1);
+    let mut client = client(1, 100_000);
     let reset = Request::Reset {
-        lease,
-        worlds: vec![WorldSeed {
-            world: 0,
-            seed: Some(5),
-        }],
+        lease: client.lease(),
+        worlds: reset(0, 5).into(),
     };
-    let text = serde_json::to_vec(&reset).expect("JSON");
-    let ended = embedded.control_text(&text, Duration::ZERO);
+    let ended = client.backend().control(&reset, Duration::ZERO);
     assert!(matches!(ended, Err(ConnectionError::Timeout { .. })));
-    ask(&mut embedded, &Request::Renew { lease }).expect("a world");
-    let worlds = embedded.episodes(0..1).expect("worlds");
-    assert_eq!(worlds.expect("a world")[0].result().seed, 5);
+    client.renew().expect("a world");
+    let worlds = client.backend().episodes(0..1).expect("worlds");
+    assert_eq!(worlds.expect("a world")[0].outcome().seed, 5);
 }
 
 #[test]

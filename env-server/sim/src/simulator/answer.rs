@@ -3,6 +3,7 @@
 use super::lease::Refusal;
 use super::state::{Simulator, within};
 use super::step::numbers;
+use crate::results::{robot_result, world_result};
 use crate::world::Episode;
 use emberwatch_messages::message::{FLAG_TEAM_FRAMES, Status, StepReply, StepRequest, VERSION};
 use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
@@ -24,11 +25,12 @@ pub(super) struct Part<'a> {
 impl Part<'_> {
     /// Writes the present results and frames.
     pub(super) fn write(self, episode: &Episode) {
-        self.world
-            .copy_from_slice(bytemuck::bytes_of(episode.result()));
+        let world = world_result(episode.outcome());
+        self.world.copy_from_slice(bytemuck::bytes_of(&world));
         let robots = &episode.robots()[self.robots];
         for (to, robot) in self.results.chunks_exact_mut(ROBOT_BYTES).zip(robots) {
-            to.copy_from_slice(bytemuck::bytes_of(robot.result()));
+            let result = robot_result(robot.outcome());
+            to.copy_from_slice(bytemuck::bytes_of(&result));
         }
         if !self.is_shared {
             let n_cells = self.frames.len() / robots.len().max(1);
@@ -171,13 +173,13 @@ impl Simulator {
         });
         let past: Vec<_> = past.collect();
         for (past, _) in &past {
-            payload.extend_from_slice(bytemuck::bytes_of(&past.result));
+            payload.extend_from_slice(bytemuck::bytes_of(&world_result(&past.outcome)));
         }
         for robot in past
             .iter()
             .flat_map(|(past, own)| &past.robots[own.clone()])
         {
-            payload.extend_from_slice(bytemuck::bytes_of(&robot.result));
+            payload.extend_from_slice(bytemuck::bytes_of(&robot_result(&robot.outcome)));
         }
         let n_cells = self.spec.rules.shape.n_cells();
         for (past, own) in &past {

@@ -7,6 +7,7 @@ use super::state::Simulator;
 use super::step::Stepped;
 use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
+use crate::results::world_result;
 use crate::world::{Episode, Flown};
 use emberwatch_messages::control::{Reply, Request, WorldSeed};
 use emberwatch_messages::message::{
@@ -146,7 +147,7 @@ impl Lab {
     }
 
     fn world(&self) -> WorldResult {
-        *self.episode().result()
+        world_result(self.episode().outcome())
     }
 
     fn episode(&self) -> &Episode {
@@ -172,10 +173,10 @@ impl Lab {
             expected.step(&spec.rules, &flown);
         }
         let got = self.episode();
-        assert_eq!(got.result(), expected.result());
+        assert_eq!(got.outcome(), expected.outcome());
         assert_eq!(got.states(), expected.states());
         for (got, expected) in got.robots().iter().zip(expected.robots()) {
-            assert_eq!(got.result(), expected.result());
+            assert_eq!(got.outcome(), expected.outcome());
             assert_eq!(got.frame(), expected.frame());
             assert_eq!(got.path(), expected.path());
         }

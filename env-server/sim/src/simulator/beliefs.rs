@@ -1,7 +1,7 @@
 //! Beliefs that agents leave for the next agents: bytes that the server does not interpret.
 
+use crate::world::WorldOutcome;
 use emberwatch_messages::control::{BeliefInfo, MAX_BELIEF_PART};
-use emberwatch_messages::message::WorldResult;
 use std::ops::Range;
 
 /// States that a belief may have under any model, as learned ones have their own. It may have as many as the model.
@@ -50,7 +50,7 @@ impl Beliefs {
     pub fn add(
         &mut self,
         robot: usize,
-        at: &WorldResult,
+        at: &WorldOutcome,
         part: &BeliefPart<'_>,
     ) -> Result<(), String> {
         check_at_most("length", self.longest, part.length)?;
@@ -92,7 +92,7 @@ impl Beliefs {
     }
 
     /// The whole belief for a robot at the step of its world.
-    pub fn of(&self, robot: usize, at: &WorldResult) -> Option<(&BeliefInfo, &[u8])> {
+    pub fn of(&self, robot: usize, at: &WorldOutcome) -> Option<(&BeliefInfo, &[u8])> {
         let StoredBelief { info, bytes } = self.left[robot].as_ref()?;
         let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
         let is_whole = bytes.len() as u64 == info.length;

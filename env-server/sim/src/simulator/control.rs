@@ -3,12 +3,13 @@
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot, cells};
+use crate::world::WorldOutcome;
 use emberwatch_messages::capacity::MAX_CLIENTS;
 use emberwatch_messages::control::{
     AirspaceInfo, LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed,
     WorldStatus, ZonesInfo, parse,
 };
-use emberwatch_messages::message::{Status, VERSION, WorldResult};
+use emberwatch_messages::message::{Status, VERSION};
 use emberwatch_messages::process::pid_namespace;
 use emberwatch_model::CellMap;
 use emberwatch_model::Model;
@@ -215,7 +216,7 @@ impl Simulator {
     fn take_for_reset(&mut self, now: Instant, to: &WorldSeed) -> Option<ResetJob> {
         let world = to.world as usize;
         let before = self.episode(world)?;
-        let (last, cells) = (*before.result(), cells(before));
+        let (last, cells) = (*before.outcome(), cells(before));
         let seed = to.seed.unwrap_or_else(|| next_seed(&last));
         let episode = last.episode.wrapping_add(1);
         let slot = Slot::Resetting {
@@ -307,10 +308,10 @@ fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
     (info.radius > 0 || info.no_fly.is_some()).then_some(info)
 }
 
-/// The zones, if there are any and learners are told.
+/// The zones, if there are any.
 fn zones_info(model: &Model) -> Option<ZonesInfo> {
     let file = model.file();
-    let map = file.zone_map.as_ref().filter(|_| file.zones_public)?;
+    let map = file.zone_map.as_ref()?;
     Some(ZonesInfo {
         names: file.zones.iter().map(|zone| zone.name.clone()).collect(),
         colors: file.zones.iter().map(|zone| zone.color.clone()).collect(),
@@ -332,6 +333,6 @@ fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
 }
 
 /// The seed after an episode whose reset names none; below 2^53, which every JSON reader holds.
-fn next_seed(last: &WorldResult) -> u64 {
+fn next_seed(last: &WorldOutcome) -> u64 {
     stream(last.seed, Purpose::Episode, last.episode).next_u64() >> 11
 }

@@ -149,10 +149,10 @@ impl Leases {
         robots: &Range<usize>,
     ) -> Result<(), Refusal> {
         self.check_robots(robots)?;
-        let held = self.holders[robots.clone()]
+        let missing = self.holders[robots.clone()]
             .iter()
             .position(|holder| *holder != Some(token));
-        if let Some(first) = held {
+        if let Some(first) = missing {
             return Err(self.not_held(token, client, robots.start + first));
         }
         self.renew(now, token, client).map(|_| ())

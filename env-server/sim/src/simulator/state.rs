@@ -5,9 +5,9 @@ use super::beliefs::Beliefs;
 use super::lease::{Leases, Refusal};
 use crate::config::Checked;
 use crate::snapshot::WorldSpec;
-use crate::world::{Episode, Rules};
+use crate::world::{Episode, Robot, Rules, WorldOutcome};
 use emberwatch_messages::control::WorldInfo;
-use emberwatch_messages::message::{Status, WorldResult};
+use emberwatch_messages::message::Status;
 use emberwatch_model::ModelError;
 use rayon::ThreadPool;
 use std::collections::{HashSet, VecDeque};
@@ -43,9 +43,9 @@ pub(super) struct Place {
 /// A world, or what is known of it during its burn-in.
 pub(super) enum Slot {
     Ready(Box<Episode>),
-    /// `last` and `cells` are its result and its robots before.
+    /// `last` and `cells` are its outcome and its robots before.
     Resetting {
-        last: WorldResult,
+        last: WorldOutcome,
         cells: Vec<[u32; 2]>,
         seed: u64,
         episode: u64,
@@ -187,15 +187,15 @@ impl Simulator {
     }
 
     pub(super) fn world_info(&self, world: usize) -> WorldInfo {
-        let (result, robots) = match &self.places[world].slot {
-            Slot::Ready(episode) => (episode.result(), cells(episode)),
+        let (outcome, robots) = match &self.places[world].slot {
+            Slot::Ready(episode) => (episode.outcome(), cells(episode)),
             Slot::Resetting { last, cells, .. } => (last, cells.clone()),
         };
         WorldInfo {
             world: world as u32,
-            step: result.step,
-            seed: result.seed,
-            episode: result.episode,
+            step: outcome.step,
+            seed: outcome.seed,
+            episode: outcome.episode,
             robots,
         }
     }
@@ -218,14 +218,16 @@ pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usi
 /// `[row, col]` of each robot.
 pub(super) fn cells(episode: &Episode) -> Vec<[u32; 2]> {
     let robots = episode.robots().iter();
-    let cell = robots.map(|robot| [robot.result().row, robot.result().col]);
-    cell.collect()
+    let cells = robots.map(Robot::cell);
+    cells
+        .map(|cell| [cell.row as u32, cell.col as u32])
+        .collect()
 }
 
 impl Slot {
     pub(super) fn resetting(job: &ResetJob, n_robots: usize) -> Self {
         Self::Resetting {
-            last: WorldResult::default(),
+            last: WorldOutcome::default(),
             cells: vec![[0, 0]; n_robots],
             seed: job.seed,
             episode: job.episode,

@@ -96,7 +96,7 @@ impl Simulator {
                 self.check_ready(&robots, body)?;
                 self.check_new(client, &robots)?;
                 self.reserve(request, payload)?;
-                let waiting = self.fly(now, client, request, body, coverage, payload);
+                let waiting = self.put_paths(now, client, request, body, coverage, payload);
                 Ok(waiting.map_or(Granted::Written, Granted::Waits))
             }
         }
@@ -104,7 +104,7 @@ impl Simulator {
 
     /// Puts the paths of a request that was checked, and moves its worlds, unless the only one waits for other paths.
     /// Writes the answer of worlds that have moved.
-    fn fly(
+    fn put_paths(
         &mut self,
         now: Instant,
         client: ClientId,
@@ -234,7 +234,7 @@ impl Simulator {
             if episode.is_over() {
                 return Err(Refusal::new(Status::EpisodeOver, world as u64));
             }
-            let present = episode.result().step;
+            let present = episode.outcome().step;
             if step < present {
                 return Err(Refusal::new(Status::Late, present));
             }

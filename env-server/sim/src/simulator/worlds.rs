@@ -5,11 +5,11 @@ use super::lease::{ClientId, Refusal};
 use super::outcome::{Outcome, PendingFile, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot};
 use crate::snapshot::{Done, FileError, Job, NewEpisode, SnapshotError, SnapshotWorld, encode};
-use crate::world::Episode;
+use crate::world::{Episode, WorldOutcome};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use emberwatch_messages::control::{LeftPart, MAX_BELIEF_PART, Reply};
-use emberwatch_messages::message::{Status, WorldResult};
+use emberwatch_messages::message::Status;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -236,10 +236,10 @@ impl Simulator {
     }
 
     /// The world of a robot at present.
-    fn present(&self, robots: &Range<usize>) -> Result<WorldResult, Reply> {
+    fn present(&self, robots: &Range<usize>) -> Result<WorldOutcome, Reply> {
         let world = self.worlds_of(robots).start;
         let episode = self.episode(world);
-        let result = episode.map(|episode| *episode.result());
+        let result = episode.map(|episode| *episode.outcome());
         result.ok_or_else(|| Reply::refusal(Status::Resetting, world as u64))
     }
 

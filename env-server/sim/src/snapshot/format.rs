@@ -6,11 +6,12 @@
 
 use super::error::SnapshotError;
 use super::settings::{Settings, WorldSpec};
+use crate::results::{robot_outcome, robot_result, world_outcome, world_result};
 use crate::world::{Episode, InvalidWorld, PastRobot, PastStep, Robot, SavedRobot, SavedWorld};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use bincode::error::DecodeError;
 use bincode::{Decode, Encode};
-use bytemuck::AnyBitPattern;
+use bytemuck::{AnyBitPattern, NoUninit};
 use emberwatch_messages::limits::memory::in_words;
 use emberwatch_model::Grid;
 use emberwatch_model::path::path_to_bytes;
@@ -57,16 +58,16 @@ pub struct NewEpisode {
 /// A world in the order of its bytes.
 #[derive(Encode)]
 struct EncodedWorld<'a> {
-    result: &'a [u8],
+    result: Vec<u8>,
     states: &'a [u8],
     first_states: &'a [u8],
     /// Result, frame and path of each robot.
-    robots: Vec<(&'a [u8], &'a [u8], Vec<u8>)>,
+    robots: Vec<(Vec<u8>, &'a [u8], Vec<u8>)>,
     history: Vec<Past<&'a [u8]>>,
 }
 
 /// A step's result; result, cells and values of its robots.
-type Past<B> = (B, Vec<[B; 3]>);
+type Past<B> = (Vec<u8>, Vec<(Vec<u8>, B, B)>);
 
 /// The same, out of a file.
 #[derive(Decode)]
@@ -214,8 +215,9 @@ impl<'a> SnapshotWorld<&'a Episode> {
         match *self {
             Self::New(NewEpisode { seed, episode }) => (seed, episode, None),
             Self::Ready(episode) => {
-                let result = episode.result();
-                (result.seed, result.episode, Some(EncodedWorld::of(episode)))
+                let outcome = episode.outcome();
+                let world = EncodedWorld::of(episode);
+                (outcome.seed, outcome.episode, Some(world))
             }
         }
     }
@@ -227,23 +229,23 @@ impl<'a> EncodedWorld<'a> {
             states.as_slice().expect("invariant: states are row-major")
         }
         let robot = |robot: &'a Robot| {
-            let result = bytemuck::bytes_of(robot.result());
             (
-                result,
+                bytes_of(&robot_result(robot.outcome())),
                 robot.frame().as_bytes(),
                 path_to_bytes(robot.path()),
             )
         };
         let past_robot = |past: &'a PastRobot| {
             let cells = bytemuck::cast_slice(&past.cells);
-            [bytemuck::bytes_of(&past.result), cells, &past.values[..]]
+            let result = bytes_of(&robot_result(&past.outcome));
+            (result, cells, &past.values[..])
         };
         let past = |past: &'a PastStep| {
             let robots = past.robots.iter().map(past_robot);
-            (bytemuck::bytes_of(&past.result), robots.collect())
+            (bytes_of(&world_result(&past.outcome)), robots.collect())
         };
         Self {
-            result: bytemuck::bytes_of(episode.result()),
+            result: bytes_of(&world_result(episode.outcome())),
             states: bytes(episode.states()),
             first_states: bytes(episode.first_states()),
             robots: episode.robots().iter().map(robot).collect(),
@@ -273,34 +275,37 @@ impl Snapshot {
 impl DecodedWorld {
     fn into_saved(self) -> Result<SavedWorld, InvalidWorld> {
         let robots = self.robots.into_iter().map(|(result, frame, path)| {
-            let result = read(&result)?;
             Ok(SavedRobot {
-                result,
+                outcome: robot_outcome(&read(&result)?)?,
                 frame,
                 path,
             })
         });
         let history = self.history.into_iter().map(|(result, robots)| {
-            let robots = robots.into_iter().map(|[result, cells, values]| {
+            let robots = robots.into_iter().map(|(result, cells, values)| {
                 Ok(PastRobot {
-                    result: read(&result)?,
+                    outcome: robot_outcome(&read(&result)?)?,
                     cells: read_cells(&cells)?,
                     values,
                 })
             });
             Ok(PastStep {
-                result: read(&result)?,
+                outcome: world_outcome(&read(&result)?)?,
                 robots: robots.collect::<Result<_, _>>()?,
             })
         });
         Ok(SavedWorld {
-            result: read(&self.result)?,
+            outcome: world_outcome(&read(&self.result)?)?,
             states: self.states,
             first_states: self.first_states,
             robots: robots.collect::<Result<_, _>>()?,
             history: history.collect::<Result<_, _>>()?,
         })
     }
+}
+
+fn bytes_of<T: NoUninit>(result: &T) -> Vec<u8> {
+    bytemuck::bytes_of(result).to_vec()
 }
 
 fn read<T: AnyBitPattern>(bytes: &[u8]) -> Result<T, InvalidWorld> {

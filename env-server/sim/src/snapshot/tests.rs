@@ -167,37 +167,36 @@ fn a_world_that_cannot_be_is_refused() {
         "path: expected 0 or 2 moves, got 1",
     );
     misfit(
-        |world| world.robots[0].result.row = 3,
+        |world| world.robots[0].outcome.cell.row = 3,
         "robot: expected a cell of 3 x 5, got (3, ",
     );
     misfit(
-        |world| world.robots[1].result.start_col = 5,
+        |world| world.robots[1].outcome.start.col = 5,
         "start of the path",
     );
     misfit(
-        |world| world.robots[1].result.n_moves = 0,
+        |world| world.robots[1].outcome.n_moves = 0,
         "moves of the path: expected 2, got 0",
     );
     misfit(|world| _ = world.robots.pop(), "robots: expected 2, got 1");
     misfit(
-        |world| world.result.late = 4,
+        |world| world.outcome.late = 4,
         "robots that stayed: expected bits below 2, got 4",
     );
     misfit(
-        |world| world.result.step = u64::MAX,
+        |world| world.outcome.step = u64::MAX,
         "step: expected at most",
     );
-    misfit(|world| world.robots[0].result.coverage = 3, "coverage");
     misfit(
-        |world| world.result.reward = f64::NAN,
+        |world| world.outcome.reward = f64::NAN,
         "reward: expected a number",
     );
     misfit(
-        |world| world.result.truncated = 1,
+        |world| world.outcome.is_truncated = true,
         "ends: expected [0, 0], got [0, 1]",
     );
     misfit(
-        |world| world.result.episode = u64::MAX,
+        |world| world.outcome.episode = u64::MAX,
         "episode: expected at most",
     );
     misfit(
@@ -205,7 +204,7 @@ fn a_world_that_cannot_be_is_refused() {
         "history: expected 1 to 8 steps, got 0",
     );
     misfit(
-        |world| world.history[0].result.step = 9,
+        |world| world.history[0].outcome.step = 9,
         "history: expected seed, episode and step [2, 0, 4], got [2, 0, 9]",
     );
     misfit(

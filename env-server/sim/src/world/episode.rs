@@ -6,12 +6,12 @@
 use super::flown::Flown;
 use super::hidden::World;
 use super::history::{History, PastStep};
+use super::outcome::WorldOutcome;
 use super::reward::pay;
 use super::robot::{Robot, Scratch};
 use super::rules::Rules;
 use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
 use super::sensor::{Sensor, path_cells};
-use emberwatch_messages::message::WorldResult;
 use emberwatch_model::path::path_from_bytes;
 use emberwatch_model::{Coverage, Frame, Grid};
 
@@ -22,7 +22,7 @@ pub struct Episode {
     /// The world at k = 0, so that the next reset to the same seed needs no burn-in.
     beginning: World,
     robots: Vec<Robot>,
-    result: WorldResult,
+    outcome: WorldOutcome,
     /// A 0 for each cell, for [`pay`].
     counts: Vec<u8>,
     scratch: Scratch,
@@ -48,7 +48,7 @@ impl Episode {
         } else {
             World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended)
         };
-        *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
+        *self = Self::beginning(rules, world, self.outcome.episode.wrapping_add(1));
     }
 
     /// Flies paths and moves the world once.
@@ -65,25 +65,25 @@ impl Episode {
         self.world.advance();
         self.observe(rules);
         let (states, step) = (self.world.states(), self.world.step());
-        self.result.step = step;
-        self.result.hovered = flown.hovered;
-        self.result.late = flown.late;
-        self.result.n_target_cells = count(states, rules.target_state);
-        self.result.truncated = u16::from(rules.truncates(self.result.seed, step));
+        self.outcome.step = step;
+        self.outcome.hovered = flown.hovered;
+        self.outcome.late = flown.late;
+        self.outcome.n_target_cells = count(states, rules.target_state);
+        self.outcome.is_truncated = rules.truncates(self.outcome.seed, step);
         let states = states.as_slice().expect("invariant: states are row-major");
         pay(
             rules,
             states,
             &mut self.robots,
             &mut self.counts,
-            &mut self.result,
+            &mut self.outcome,
         );
-        self.history.push(&self.result, &self.robots);
+        self.history.push(&self.outcome, &self.robots);
     }
 
     /// What the last step gave, or the beginning after a reset.
-    pub fn result(&self) -> &WorldResult {
-        &self.result
+    pub fn outcome(&self) -> &WorldOutcome {
+        &self.outcome
     }
 
     /// Its robots, in order.
@@ -96,8 +96,8 @@ impl Episode {
     /// # Errors
     /// If it is not kept; the error is the nearest step that is, the oldest or the present.
     pub fn recall(&self, step: u64) -> Result<&PastStep, u64> {
-        let oldest = self.history.all().next().map(|past| past.result.step);
-        let present = self.result.step;
+        let oldest = self.history.all().next().map(|past| past.outcome.step);
+        let present = self.outcome.step;
         let nearest = oldest.filter(|_| step < present).unwrap_or(present);
         self.history.step(step).ok_or(nearest)
     }
@@ -116,7 +116,7 @@ impl Episode {
 
     /// Whether the episode was truncated: it takes no step before it is reset.
     pub fn is_over(&self) -> bool {
-        self.result.truncated != 0
+        self.outcome.is_truncated
     }
 
     /// The hidden states at k = 0, shape `[H, W]`.
@@ -133,7 +133,7 @@ impl Episode {
     pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
         saved.check(rules)?;
         let SavedWorld {
-            result,
+            outcome,
             states,
             first_states,
             robots,
@@ -144,7 +144,7 @@ impl Episode {
             let states = grid(states).expect("invariant: the length was checked");
             World::at(
                 rules.source.clone(),
-                result.seed,
+                outcome.seed,
                 rules.burn_in,
                 step,
                 states,
@@ -154,10 +154,10 @@ impl Episode {
         history.into_iter().for_each(|past| kept.keep(past));
         let robots = robots.into_iter().map(|robot| restored(rules, &robot));
         Ok(Self {
-            world: world(result.step, states),
+            world: world(outcome.step, states),
             beginning: world(0, first_states),
             robots: robots.collect::<Result<_, _>>()?,
-            result,
+            outcome,
             counts: vec![0; rules.shape.n_cells()],
             scratch: Scratch::default(),
             history: kept,
@@ -167,19 +167,19 @@ impl Episode {
     fn beginning(rules: &Rules, world: World, episode: u64) -> Self {
         let start = |robot| Robot::at(&rules.airspace, rules.start_cell(world.seed(), robot));
         let robots: Vec<Robot> = (0..rules.n_robots).map(start).collect();
-        let result = WorldResult {
+        let outcome = WorldOutcome {
             seed: world.seed(),
             episode,
             n_target_cells: count(world.states(), rules.target_state),
-            ..WorldResult::default()
+            ..WorldOutcome::default()
         };
         let mut history = History::new(rules.history, rules.n_robots, rules.most_seen());
-        history.push(&result, &robots);
+        history.push(&outcome, &robots);
         Self {
             beginning: world.clone(),
             world,
             robots,
-            result,
+            outcome,
             counts: vec![0; rules.shape.n_cells()],
             scratch: Scratch::default(),
             history,
@@ -190,13 +190,13 @@ impl Episode {
         let (sensor, states) = (&rules.sensor, self.world.states());
         let key = Sensor::key(self.world.seed(), self.world.absolute_step());
         for Robot {
-            result,
+            outcome,
             frame,
             seen,
             ..
         } in &mut self.robots
         {
-            if result.coverage == Coverage::Full as u32 {
+            if outcome.coverage == Coverage::Full {
                 sensor.observe(key, states, path_cells(0..rules.shape.n_cells()), frame);
             } else {
                 sensor.observe(key, states, seen.iter().copied(), frame);
@@ -208,7 +208,7 @@ impl Episode {
 fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
     let frame = Frame::from_bytes(rules.shape, rules.n_observations, &saved.frame);
     Ok(Robot {
-        result: saved.result,
+        outcome: saved.outcome,
         frame: frame.map_err(|error| InvalidWorld(error.to_string()))?,
         path: path_from_bytes(&saved.path).map_err(|error| InvalidWorld(error.to_string()))?,
         visited: Vec::new(),
@@ -275,7 +275,7 @@ mod tests {
             let states = episode.states().as_slice().expect("row-major");
             let is_fire = |cell: &&usize| states[**cell] == 2;
             let fires = flight.visited.iter().filter(is_fire).count();
-            let (world, robot) = (episode.result(), episode.robots()[0].result());
+            let (world, robot) = (episode.outcome(), episode.robots()[0].outcome());
             for reward in [world.reward, robot.reward, robot.marginal] {
                 assert_eq!(reward, fires as f64);
             }
@@ -337,10 +337,10 @@ mod tests {
         let n_seen = |robot: &Robot| robot.frame().observed().count();
         let n_seen: Vec<usize> = episode.robots().iter().map(n_seen).collect();
         assert_eq!(n_seen, [0, 2, 2, 0]);
-        let n_moves = |robot: &Robot| robot.result().n_moves;
+        let n_moves = |robot: &Robot| robot.outcome().n_moves;
         let n_moves: Vec<u32> = episode.robots().iter().map(n_moves).collect();
         assert_eq!(n_moves, [0, 2, 2, 0]);
-        assert_eq!((episode.result().hovered, episode.result().late), (1, 8));
+        assert_eq!((episode.outcome().hovered, episode.outcome().late), (1, 8));
     }
 
     #[test]
@@ -353,10 +353,10 @@ mod tests {
             episode.reset(&rules, seed);
             assert_eq!(episode.states(), Episode::new(&rules, seed).states());
             let n_seen = episode.robots()[0].frame().observed().count();
-            assert_eq!((episode.result().step, n_seen), (0, 0));
+            assert_eq!((episode.outcome().step, n_seen), (0, 0));
         }
         assert_eq!(episode.robots()[0].cell(), first.robots()[0].cell());
-        assert_eq!(episode.result().episode, 3);
+        assert_eq!(episode.outcome().episode, 3);
     }
 
     #[test]
@@ -366,8 +366,8 @@ mod tests {
         for k in 1..=3 {
             assert!(!episode.is_over());
             step(&mut episode, &rules, &[1], 0);
-            assert_eq!(episode.result().step, k);
-            assert_eq!(episode.result().terminated, 0);
+            assert_eq!(episode.outcome().step, k);
+            assert!(!episode.outcome().is_terminated);
         }
         assert!(episode.is_over());
     }

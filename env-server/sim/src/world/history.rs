@@ -1,8 +1,8 @@
 //! A world's last frames, kept so that the next agent can compute its belief from them.
 
+use super::outcome::{RobotOutcome, WorldOutcome};
 use super::robot::Robot;
-use emberwatch_messages::message::{RobotResult, WorldResult};
-use emberwatch_model::Coverage;
+use emberwatch_model::{Cell, Coverage};
 use std::collections::VecDeque;
 
 /// Minimum capacity for a world's frames, bytes: whole frames share it, however many steps are to be kept.
@@ -28,17 +28,17 @@ pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> us
 /// What one step showed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PastStep {
-    /// The world's result.
-    pub result: WorldResult,
+    /// What the step gave the world.
+    pub outcome: WorldOutcome,
     /// What its robots saw.
     pub robots: Vec<PastRobot>,
 }
 
 /// What one robot saw in a step.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PastRobot {
-    /// The robot's result.
-    pub result: RobotResult,
+    /// What the step gave the robot.
+    pub outcome: RobotOutcome,
     /// The observed cells, row-major indices; empty where every cell was observed.
     pub cells: Vec<u32>,
     /// What was observed there.
@@ -59,10 +59,10 @@ impl History {
     }
 
     /// Keeps a step; forgets the oldest if there is no room.
-    pub fn push(&mut self, result: &WorldResult, robots: &[Robot]) {
+    pub fn push(&mut self, outcome: &WorldOutcome, robots: &[Robot]) {
         let mut past = self.make_room().unwrap_or_default();
-        past.result = *result;
-        past.robots.resize_with(robots.len(), PastRobot::default);
+        past.outcome = *outcome;
+        past.robots.resize_with(robots.len(), PastRobot::blank);
         for (past, robot) in past.robots.iter_mut().zip(robots) {
             past.set(robot);
         }
@@ -102,7 +102,7 @@ impl History {
 
     /// What step k showed, if it is kept.
     pub fn step(&self, step: u64) -> Option<&PastStep> {
-        let oldest = self.steps.front()?.result.step;
+        let oldest = self.steps.front()?.outcome.step;
         self.steps
             .get(usize::try_from(step.checked_sub(oldest)?).ok()?)
     }
@@ -116,16 +116,25 @@ impl PastStep {
 }
 
 impl PastRobot {
+    /// Room for what a robot saw.
+    fn blank() -> Self {
+        Self {
+            outcome: RobotOutcome::at(Cell { row: 0, col: 0 }),
+            cells: Vec::new(),
+            values: Vec::new(),
+        }
+    }
+
     fn n_bytes(&self) -> usize {
         size_of::<Self>() + 4 * self.cells.len() + self.values.len()
     }
 
     fn set(&mut self, robot: &Robot) {
         let bytes = robot.frame.as_bytes();
-        self.result = robot.result;
+        self.outcome = robot.outcome;
         self.cells.clear();
         self.values.clear();
-        if robot.result.coverage == Coverage::Full as u32 {
+        if robot.outcome.coverage == Coverage::Full {
             self.values.extend_from_slice(bytes);
             return;
         }
@@ -189,7 +198,7 @@ mod tests {
         assert_eq!(episode.recall(6).err(), Some(5));
         for step in 3..=5 {
             let past = episode.recall(step).expect("kept");
-            assert_eq!(past.result.step, step);
+            assert_eq!(past.outcome.step, step);
             for (past, frame) in past.robots.iter().zip(&frames[step as usize - 1]) {
                 let mut bytes = [UNOBSERVED; 24];
                 past.write_over(&mut bytes);
@@ -202,10 +211,10 @@ mod tests {
     #[test]
     fn at_least_the_present_is_kept_and_no_more_than_there_is_room_for() {
         let past = |n_values| PastStep {
-            result: WorldResult::default(),
+            outcome: WorldOutcome::default(),
             robots: vec![PastRobot {
                 values: vec![0; n_values],
-                ..PastRobot::default()
+                ..PastRobot::blank()
             }],
         };
         let mut present = History::new(0, 1, 6);

@@ -1,8 +1,8 @@
 //! What a step pays: a cell that several robots visit pays once, or see where seeing pays.
 
+use super::outcome::WorldOutcome;
 use super::robot::Robot;
 use super::rules::Rules;
-use emberwatch_messages::message::WorldResult;
 use emberwatch_model::Pays;
 
 /// Set in the count of a cell that the team was paid for.
@@ -15,7 +15,7 @@ pub(super) fn pay(
     states: &[u8],
     robots: &mut [Robot],
     counts: &mut [u8],
-    team: &mut WorldResult,
+    team: &mut WorldOutcome,
 ) {
     (team.reward, team.n_visited, team.n_hits) = (0.0, 0, 0);
     for robot in &*robots {
@@ -24,7 +24,7 @@ pub(super) fn pay(
     for Robot {
         visited,
         paying,
-        result,
+        outcome,
         ..
     } in &mut *robots
     {
@@ -32,10 +32,10 @@ pub(super) fn pay(
             let reward = rules.reward[usize::from(states[cell])];
             let is_hit = u32::from(states[cell] == rules.target_state);
             let n_visitors = counts[cell] & !PAID;
-            result.n_hits += is_hit;
-            result.reward += reward / f64::from(n_visitors);
+            outcome.n_hits += is_hit;
+            outcome.reward += reward / f64::from(n_visitors);
             if n_visitors == 1 {
-                result.marginal += reward;
+                outcome.marginal += reward;
             }
             if counts[cell] & PAID == 0 {
                 counts[cell] |= PAID;
@@ -104,7 +104,7 @@ mod tests {
                 robot
             };
             let mut robots: Vec<Robot> = (0..1 + case as usize % 6).map(fly).collect();
-            let mut team = WorldResult::default();
+            let mut team = WorldOutcome::default();
             pay(&rules, &states, &mut robots, &mut counts, &mut team);
             assert!(counts.iter().all(|&count| count == 0));
 
@@ -115,19 +115,19 @@ mod tests {
             let expected = reward(&rules, &states, &all);
             assert!((team.reward - expected).abs() < 1e-12);
             assert_eq!(team.n_visited as usize, all.len());
-            let shares: f64 = robots.iter().map(|robot| robot.result.reward).sum();
+            let shares: f64 = robots.iter().map(|robot| robot.outcome.reward).sum();
             assert!((shares - expected).abs() < 1e-12);
             for (r, robot) in robots.iter().enumerate() {
                 let mut others = robots.iter().enumerate().filter(|(o, _)| *o != r);
                 let without = visited(&mut others.by_ref().map(|(_, other)| other));
                 let marginal = expected - reward(&rules, &states, &without);
-                assert!((robot.result.marginal - marginal).abs() < 1e-12);
+                assert!((robot.outcome.marginal - marginal).abs() < 1e-12);
                 let visitors =
                     |cell: &usize| robots.iter().filter(|o| o.visited.contains(cell)).count();
                 let of_cell =
                     |cell: &usize| rules.reward[usize::from(states[*cell])] / visitors(cell) as f64;
                 let share: f64 = robot.visited.iter().map(of_cell).sum();
-                assert!((robot.result.reward - share).abs() < 1e-12);
+                assert!((robot.outcome.reward - share).abs() < 1e-12);
             }
         }
     }

@@ -1,13 +1,13 @@
 //! One robot of a world: where it is, what it flew and what it saw.
 
-use emberwatch_messages::message::RobotResult;
+use super::outcome::RobotOutcome;
 use emberwatch_model::{Airspace, Cell, Coverage, Frame, Move};
 use emberwatch_model::{Pays, SeenCell};
 
 /// A robot after a step or a reset.
 #[derive(Debug, Clone)]
 pub struct Robot {
-    pub(super) result: RobotResult,
+    pub(super) outcome: RobotOutcome,
     pub(super) frame: Frame,
     pub(super) path: Vec<Move>,
     /// The distinct cells of the path, row-major indices in the order of the first visit.
@@ -37,11 +37,7 @@ impl Robot {
     /// A robot after a reset.
     pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {
         let mut robot = Self {
-            result: RobotResult {
-                row: cell.row as u32,
-                col: cell.col as u32,
-                ..RobotResult::default()
-            },
+            outcome: RobotOutcome::at(cell),
             frame: Frame::empty(airspace.shape()),
             path: Vec::new(),
             visited: Vec::new(),
@@ -68,21 +64,18 @@ impl Robot {
         self.path.clear();
         self.path.extend_from_slice(path);
         self.frame.clear();
-        self.result = RobotResult {
+        self.outcome = RobotOutcome {
             n_visited: self.visited.len() as u32,
-            start_row: start.row as u32,
-            start_col: start.col as u32,
-            row: end.row as u32,
-            col: end.col as u32,
-            coverage: coverage as u32,
+            start,
+            coverage,
             n_moves: path.len() as u32,
-            ..RobotResult::default()
+            ..RobotOutcome::at(end)
         };
     }
 
     /// What the last step gave it.
-    pub fn result(&self) -> &RobotResult {
-        &self.result
+    pub fn outcome(&self) -> &RobotOutcome {
+        &self.outcome
     }
 
     /// Row-major indices of the distinct cells that pay.
@@ -102,6 +95,6 @@ impl Robot {
 
     /// Where it is.
     pub fn cell(&self) -> Cell {
-        self.result.cell()
+        self.outcome.cell
     }
 }

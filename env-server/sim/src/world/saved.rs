@@ -1,10 +1,9 @@
 //! A world out of a file, and the checks that an episode relies on.
 
 use super::history::{PastRobot, PastStep};
+use super::outcome::{RobotOutcome, WorldOutcome};
 use super::rules::Rules;
 use emberwatch_messages::capacity::MAX_ROBOTS;
-use emberwatch_messages::message::{RobotResult, WorldResult};
-use emberwatch_model::{Cell, Coverage};
 use std::fmt::Display;
 use thiserror::Error;
 
@@ -14,8 +13,8 @@ const MAX_COUNT: u64 = 1 << 62;
 /// One world: everything that decides its future, and what its robots saw last.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedWorld {
-    /// The last result: seed, episode, k.
-    pub result: WorldResult,
+    /// What the last step gave: seed, episode, k.
+    pub outcome: WorldOutcome,
     /// Hidden states, row-major.
     pub states: Vec<u8>,
     /// Hidden states at k = 0.
@@ -29,7 +28,7 @@ pub struct SavedWorld {
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedRobot {
     /// What the last step gave it, and where it is.
-    pub result: RobotResult,
+    pub outcome: RobotOutcome,
     pub frame: Vec<u8>,
     pub path: Vec<u8>,
 }
@@ -53,23 +52,23 @@ impl SavedWorld {
             let fine = usize::from(most) < n_states;
             expect(what, fine, &format!("states below {n_states}"), &most)?;
         }
-        let WorldResult {
+        let WorldOutcome {
             step,
             episode,
             seed,
             ..
-        } = self.result;
+        } = self.outcome;
         for (what, got) in [("step", step), ("episode", episode)] {
             let expected = format!("at most {MAX_COUNT}");
             expect(what, got <= MAX_COUNT, &expected, &got)?;
         }
-        let reward = self.result.reward;
+        let reward = self.outcome.reward;
         expect("reward", reward.is_finite(), &"a number", &reward)?;
-        let (stayed, n_robots) = (self.result.hovered | self.result.late, rules.n_robots);
+        let (stayed, n_robots) = (self.outcome.hovered | self.outcome.late, rules.n_robots);
         let fine = stayed <= u64::MAX >> (MAX_ROBOTS - n_robots);
         let expected = format!("bits below {n_robots}");
         expect("robots that stayed", fine, &expected, &stayed)?;
-        let ends = [self.result.terminated, self.result.truncated];
+        let ends = [self.outcome.is_terminated, self.outcome.is_truncated].map(u16::from);
         let expected = [0, u16::from(rules.truncates(seed, step))];
         let (expected, got) = (format!("{expected:?}"), format!("{ends:?}"));
         expect("ends", expected == got, &expected, &got)?;
@@ -83,15 +82,15 @@ impl SavedWorld {
 
     /// Checks that the history ends with the last result and has no gap.
     fn check_history(&self, rules: &Rules) -> Result<(), InvalidWorld> {
-        let last = self.result.step;
+        let last = self.outcome.step;
         let n_kept = self.history.len() as u64;
         if n_kept == 0 || n_kept > last + 1 {
             let text = format!("history: expected 1 to {} steps, got {n_kept}", last + 1);
             return Err(InvalidWorld(text));
         }
         for (past, step) in self.history.iter().zip(last + 1 - n_kept..) {
-            let expected = [self.result.seed, self.result.episode, step];
-            let got = [past.result.seed, past.result.episode, past.result.step];
+            let expected = [self.outcome.seed, self.outcome.episode, step];
+            let got = [past.outcome.seed, past.outcome.episode, past.outcome.step];
             if got != expected {
                 let text =
                     format!("history: expected seed, episode and step {expected:?}, got {got:?}");
@@ -109,26 +108,22 @@ impl SavedWorld {
 
 impl SavedRobot {
     fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
-        let result = &self.result;
-        for (what, row, col) in [
-            ("robot", result.row, result.col),
-            ("start of the path", result.start_row, result.start_col),
+        let outcome = &self.outcome;
+        for (what, cell) in [
+            ("robot", outcome.cell),
+            ("start of the path", outcome.start),
         ] {
-            let (row, col) = (row as usize, col as usize);
-            let cell = Cell { row, col };
             let expected = format!("a cell of {}", rules.shape);
             expect(what, rules.shape.contains(cell), &expected, &cell)?;
             let is_free = rules.airspace.is_free(cell);
             expect(what, is_free, &"a cell where robots may be", &cell)?;
         }
-        let fine = Coverage::try_from(result.coverage).is_ok();
-        expect("coverage", fine, &"0, 1 or 2", &result.coverage)?;
         let (n_moves, got) = (rules.n_moves, self.path.len());
         let expected = format!("0 or {n_moves} moves");
         expect("path", got == 0 || got == n_moves, &expected, &got)?;
-        let fine = result.n_moves as usize == got;
-        expect("moves of the path", fine, &got, &result.n_moves)?;
-        for reward in [result.reward, result.marginal] {
+        let fine = outcome.n_moves as usize == got;
+        expect("moves of the path", fine, &got, &outcome.n_moves)?;
+        for reward in [outcome.reward, outcome.marginal] {
             expect("reward", reward.is_finite(), &"a number", &reward)?;
         }
         Ok(())

@@ -4,14 +4,11 @@ use crate::KernelEntry;
 #[test]
 fn built_in_models_have_their_names_and_fit_the_grid() {
     let shape = Shape::new(64, 64).expect("test shape");
-    let mut n_models = 0;
     for name in Model::built_in_names() {
         let model = Model::built_in(name).expect(name);
         assert_eq!(model.name(), name);
         assert_eq!(model.check_on(shape), Ok(()), "{name}");
-        n_models += 1;
     }
-    assert_eq!(n_models, 7);
     assert_eq!(Model::built_in("wildfire-dense"), None);
 }
 

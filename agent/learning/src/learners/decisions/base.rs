@@ -1,82 +1,99 @@
 //! What keeps the beliefs that decisions are made on.
 
-use super::saved::SavedDecisions;
-use crate::belief::LearnedBelief;
-use crate::checkpoint::Contents;
-use crate::learners::filter::form::WorldForm;
-use crate::policy::{EstimatorKind, numbered_states};
-use anyhow::Result;
-use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use crate::beliefs::first_belief::first_belief;
+use crate::beliefs::{self, BeliefKind, Conditions};
+use crate::learned::Learned;
+use crate::learners::base::Beginning;
+use anyhow::{Context, Result};
+use emberwatch_belief::estimation::Estimator;
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
-use emberwatch_network::Device;
 
-/// What keeps the beliefs that decisions are made on, before a world's first frame.
+/// The belief that decisions are made on, by the setting `decisions.estimator`.
+///
+/// # Errors
+/// Names them all.
+pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
+    let kind = beliefs::of_options(name);
+    kind.map_err(|problem| anyhow::anyhow!("decisions.estimator: {problem}"))
+}
+
+/// As [`belief_of`], by the name in a checkpoint: earlier releases named filters by what their kernels see, too.
+///
+/// # Errors
+/// As [`belief_of`].
+pub fn belief_of_saved(name: &str) -> Result<&'static BeliefKind> {
+    belief_of(&name.replace("learned_own_", "learned_"))
+}
+
+/// A kind of belief with all that it is built from, before a world's first frame.
 pub struct Base {
-    pub kind: EstimatorKind,
+    pub kind: &'static BeliefKind,
+    shape: Shape,
+    /// Of kinds that know the model: that, and the first belief.
+    known: Option<(Model, Belief)>,
+    pub(super) learned: Learned,
     /// The state that pays most.
     pub(super) target: usize,
     pub(super) state_names: Vec<String>,
-    start: Start,
-}
-
-/// Where a belief begins.
-enum Start {
-    Known(Box<BayesFilter>),
-    Learned(LearnedBelief, Shape),
 }
 
 impl Base {
-    /// On a known model, whose filter is given.
-    pub fn known(kind: EstimatorKind, filter: BayesFilter, model: &Model) -> Self {
-        Self {
+    /// `known`: the model and the first belief, for kinds that know the model.
+    ///
+    /// # Errors
+    /// If what the kind acts on is missing.
+    pub fn new(
+        kind: &'static BeliefKind,
+        known: Option<(Model, Belief)>,
+        learned: Learned,
+        shape: Shape,
+    ) -> Result<Self> {
+        let mut base = Self {
             kind,
-            target: model.target_state(),
-            state_names: model.state_names(),
-            start: Start::Known(Box::new(filter)),
-        }
+            shape,
+            known,
+            learned,
+            target: 0,
+            state_names: Vec::new(),
+        };
+        base.target = kind.target(&base.conditions())?;
+        base.state_names = kind.state_names(&base.conditions())?;
+        Ok(base)
     }
 
-    pub fn learned(kind: EstimatorKind, belief: LearnedBelief, shape: Shape) -> Self {
-        Self {
-            kind,
-            target: belief.target(),
-            state_names: numbered_states(belief.n_states()),
-            start: Start::Learned(belief, shape),
+    /// What the settings ask for: what was learned, or the filter of the server's model.
+    pub(super) fn of_settings(on: &Beginning<'_>) -> Result<Self> {
+        let (config, shape) = (on.config, on.worlds.shape());
+        let kind = belief_of(&config.decisions.estimator)?;
+        let mut known = None;
+        if kind.knows_model {
+            let model = on.info.model.as_deref().with_context(|| {
+                format!(
+                    "decisions on the belief {} need the server's model: start it with --reveal-model true, not with \
+                     --states",
+                    kind.name
+                )
+            })?;
+            let model = Model::from_toml(model)?;
+            let prior = config.prior(on.info.burn_in);
+            let prior = first_belief(prior, &model, shape, config.seed)?;
+            known = Some((model, prior));
         }
+        Self::new(kind, known, on.learned.clone(), shape)
     }
 
-    /// Refuses worlds of another form.
-    pub fn check_world(&self, world: &WorldForm<'_>) -> Result<()> {
-        match &self.start {
-            // Made of the world's own model.
-            Start::Known(_) => Ok(()),
-            Start::Learned(belief, _) => belief.check_world(world),
+    fn conditions(&self) -> Conditions<'_> {
+        let known = self.known.as_ref();
+        Conditions {
+            shape: self.shape,
+            model: known.map(|(model, _)| model),
+            prior: known.map(|(_, prior)| prior),
+            learned: &self.learned,
         }
     }
 
     pub(super) fn estimator(&self) -> Result<Box<dyn Estimator>> {
-        let is_spatial = self.kind.is_spatial();
-        match &self.start {
-            Start::Known(filter) => {
-                let neighbours = || (self.target, Correlations::default());
-                Ok(correcting(*filter.clone(), is_spatial.then(neighbours)))
-            }
-            Start::Learned(belief, shape) => belief.estimator(is_spatial, *shape),
-        }
-    }
-
-    /// What was learned, unless the model is known.
-    pub(super) fn belief(&self) -> Option<&LearnedBelief> {
-        match &self.start {
-            Start::Known(_) => None,
-            Start::Learned(belief, _) => Some(belief),
-        }
-    }
-
-    /// What a checkpoint's decisions are on, if that was learned; a network computes on `device`.
-    pub fn saved(contents: &Contents, shape: Shape, device: &Device) -> Result<Option<Self>> {
-        let saved: SavedDecisions = contents.state()?;
-        let belief = saved.belief(contents, device)?;
-        Ok(belief.map(|belief| Self::learned(saved.estimator, belief, shape)))
+        (self.kind.build)(&self.conditions())
     }
 }

@@ -1,8 +1,7 @@
 //! A robot that flies options: its agent, and what the last option led to.
 
 use super::saved::{Held, SavedRun};
-use crate::checkpoint::check;
-use crate::learners::base::place;
+use crate::learners::left::Left;
 use crate::rollout::Rollout;
 use anyhow::Result;
 use emberwatch_belief::planning::Proposal;
@@ -65,17 +64,9 @@ impl Run {
     }
 
     pub(super) fn saved(&self) -> SavedRun {
-        let (agent, observation) = (&self.rollout.agent, self.rollout.observation());
         SavedRun {
-            place: place(observation),
-            frame: observation.frame.as_bytes().to_vec(),
-            belief: agent
-                .estimator()
-                .handover()
-                .map(|it| it.to_bytes())
-                .unwrap_or_default(),
-            estimate: agent.estimate().cloned(),
-            memory: agent.memory.clone(),
+            left: Left::of(&self.rollout),
+            memory: self.rollout.agent.memory.clone(),
             last: self.last.clone(),
             track: self.track.clone(),
             held: self.held,
@@ -84,17 +75,8 @@ impl Run {
 
     /// Goes on from where a checkpoint left it, with an agent that has not yet taken in what its world shows.
     pub(super) fn restore(saved: SavedRun, mut rollout: Rollout, dqn: &Dqn) -> Result<Self> {
-        let agent = &mut rollout.agent;
-        let estimator = agent.estimator_mut().handover_mut();
-        let is_taken = estimator.is_some_and(|it| it.restore(&saved.belief));
-        check(
-            is_taken,
-            "worlds.belief",
-            "that of its estimator",
-            "another",
-        )?;
-        agent.remember_estimate(saved.estimate.as_ref());
-        agent.memory = saved.memory;
+        saved.left.restore(&mut rollout.agent)?;
+        rollout.agent.memory = saved.memory;
         Ok(Self {
             rollout,
             last: saved.last,

@@ -1,14 +1,16 @@
 //! Decisions in a checkpoint: the DQN, the belief that they were learned on, and where the robots are.
 
-use crate::belief::{LearnedBelief, SavedBelief};
-use crate::checkpoint::{Contents, check, check_belief, check_counts, check_numbers};
-use crate::learners::base::{Place, place};
-use crate::policy::EstimatorKind;
-use anyhow::Result;
-use emberwatch_belief::estimation::belief::Belief;
+use super::base::{Base, belief_of_saved};
+use crate::beliefs::learned::{LearnedModel, SavedModel};
+use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
+use crate::beliefs::{BeliefKind, NEURAL};
+use crate::checkpoint::{Contents, check, check_counts, check_numbers};
+use crate::learned::Learned;
+use crate::learners::left::Left;
+use crate::policy::LearnedDecisions;
+use anyhow::{Context, Result, ensure};
 use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_belief::planning::{BasisKind, Memory, OPTIONS};
-use emberwatch_messages::observation::Observation;
+use emberwatch_belief::planning::{Memory, OPTIONS};
 use emberwatch_model::Shape;
 use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor, SavedDqn, Track};
 use serde::{Deserialize, Serialize};
@@ -24,8 +26,10 @@ const MOST_EARNED: f64 = 2e6;
 /// Longest time for which an option is held, steps.
 const LONGEST_HOLD: u64 = 1000;
 
+const NOTHING: &str = "decisions: expected a checkpoint of a belief, got none";
+
 /// Before the names of the belief's tensors.
-const BELIEF: &str = "belief.";
+pub(super) const BELIEF: &str = "belief.";
 
 /// A random option that is flown for some steps in a row.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -34,23 +38,12 @@ pub(super) struct Held {
     pub(super) n_steps: u64,
 }
 
-/// What policies act on.
-#[derive(Debug, Clone)]
-pub struct LearnedDecisions {
-    pub scorer: Arc<Dqn>,
-    /// What keeps the belief.
-    pub estimator: EstimatorKind,
-    /// What paths are planned on.
-    pub basis: BasisKind,
-    /// Width of the beam search that plans the options.
-    pub beam_width: usize,
-}
-
 /// All of a checkpoint of decisions but the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDecisions {
     pub options: Vec<String>,
-    pub estimator: EstimatorKind,
+    /// The label of the belief that they are made on.
+    pub estimator: String,
     pub(super) belief: Option<SavedBelief>,
     pub world_steps: u64,
     pub(super) earned: f64,
@@ -61,45 +54,104 @@ pub struct SavedDecisions {
 /// Where a world was left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedRun {
-    pub(super) place: Place,
-    pub(super) frame: Vec<u8>,
-    /// All that the estimator remembers.
-    pub(super) belief: Vec<u8>,
-    pub(super) estimate: Option<Belief>,
+    pub(super) left: Left,
     pub(super) memory: Memory,
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
     pub(super) held: Held,
 }
 
-impl LearnedDecisions {
-    /// From a checkpoint, with the belief that was learned for them, if it was; a network computes on `device`.
-    pub fn read(contents: &Contents, device: &Device) -> Result<(Self, Option<LearnedBelief>)> {
-        let config = contents.settings()?;
-        let saved: SavedDecisions = contents.state()?;
-        let mut dqn = Dqn::new(config.decisions.settings(), SHAPE, config.seed);
-        saved.load_into(&mut dqn, contents)?;
-        let decisions = Self {
-            scorer: Arc::new(dqn),
-            estimator: saved.estimator,
-            basis: config.objective.belief,
-            beam_width: config.decisions.beam_width,
+/// A belief that was learned, without its tensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) enum SavedBelief {
+    Filter(Box<SavedModel>),
+    Neural(SavedNeuralModel),
+}
+
+impl SavedBelief {
+    /// What was learned for a kind of belief, and its tensors; `None` if nothing was.
+    pub(super) fn of(
+        kind: &BeliefKind,
+        learned: &Learned,
+    ) -> Result<Option<(Self, Vec<NamedTensor>)>> {
+        let Some(by) = &kind.learned_by else {
+            return Ok(None);
         };
-        Ok((decisions, saved.belief(contents, device)?))
+        let (belief, tensors) = if by.learner == "neural" {
+            let model = learned.get::<NeuralModel>().context(NOTHING)?;
+            (Self::Neural(SavedNeuralModel::of(model)), model.tensors()?)
+        } else {
+            ensure!(
+                by.learner == "filter",
+                "decisions: expected the belief of a filter or a neural one, got {}",
+                kind.name
+            );
+            let model = learned.get::<LearnedModel>().context(NOTHING)?;
+            (
+                Self::Filter(Box::new(SavedModel::of(model))),
+                model.tensors().into(),
+            )
+        };
+        let named = |(name, shape, numbers)| (format!("{BELIEF}{name}"), shape, numbers);
+        Ok(Some((belief, tensors.into_iter().map(named).collect())))
     }
 }
 
+/// What policies act on: the decisions, and the belief that was learned for them, if it was. A network computes on
+/// `device`. Returns whether there were others before.
+pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) -> Result<bool> {
+    let config = contents.settings()?;
+    let saved: SavedDecisions = contents.state()?;
+    let mut dqn = Dqn::new(config.decisions.settings(), SHAPE, config.seed);
+    saved.load_into(&mut dqn, contents)?;
+    let decisions = LearnedDecisions {
+        scorer: Arc::new(dqn),
+        belief: saved.kind()?,
+        basis: config.objective.belief,
+        beam_width: config.decisions.beam_width,
+    };
+    ensure!(
+        !saved.read_belief(contents, device, learned)?,
+        "expected one belief of a kind, got two: that of the decisions, and another"
+    );
+    Ok(learned.put(decisions))
+}
+
 impl SavedDecisions {
-    /// The belief that was learned, if it was; a network computes on `device`.
-    pub fn belief(&self, contents: &Contents, device: &Device) -> Result<Option<LearnedBelief>> {
-        let is_neural = matches!(self.belief, Some(SavedBelief::Neural { .. }));
-        let fits = is_neural == (self.estimator == EstimatorKind::Neural);
-        check(fits, "belief", self.estimator.label(), "another")?;
-        let is_own = self.estimator.sees_own_state();
-        let belief = self.belief.as_ref();
-        belief
-            .map(|it| it.read(is_own, &contents.part(BELIEF), device))
-            .transpose()
+    /// The belief that they are made on.
+    pub fn kind(&self) -> Result<&'static BeliefKind> {
+        belief_of_saved(&self.estimator)
+    }
+
+    /// What the decisions are made on, if that was learned; a network computes on `device`.
+    pub fn base(&self, contents: &Contents, shape: Shape, device: &Device) -> Result<Option<Base>> {
+        let (kind, mut learned) = (self.kind()?, Learned::default());
+        self.read_belief(contents, device, &mut learned)?;
+        let is_learned = kind.learned_by.is_some();
+        let base = is_learned.then(|| Base::new(kind, None, learned, shape));
+        base.transpose()
+    }
+
+    /// The belief that was learned, if it was; a network computes on `device`. Returns whether there was another before.
+    pub(super) fn read_belief(
+        &self,
+        contents: &Contents,
+        device: &Device,
+        learned: &mut Learned,
+    ) -> Result<bool> {
+        let (kind, part) = (self.kind()?, contents.part(BELIEF));
+        let is_neural = matches!(self.belief, Some(SavedBelief::Neural(_)));
+        check(
+            is_neural == (*kind == NEURAL),
+            "belief",
+            kind.label,
+            "another",
+        )?;
+        Ok(match &self.belief {
+            None => false,
+            Some(SavedBelief::Filter(model)) => learned.put(model.read(&part)?),
+            Some(SavedBelief::Neural(model)) => learned.put(model.read(&part, device)?),
+        })
     }
 
     pub(super) fn load_into(&self, dqn: &mut Dqn, contents: &Contents) -> Result<()> {
@@ -118,15 +170,8 @@ impl SavedDecisions {
 }
 
 impl SavedRun {
-    /// Whether a world shows what it showed then.
-    pub(super) fn is_of(&self, observation: &Observation) -> bool {
-        self.place == place(observation) && self.frame == observation.frame.as_bytes()
-    }
-
     pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
-        let mut estimates = self.estimate.iter();
-        estimates
-            .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))?;
+        self.left.check(n_states, shape)?;
         let expected = format!("that of a {shape} grid");
         check(
             self.memory.is_of(shape),
@@ -153,17 +198,13 @@ impl SavedRun {
     }
 }
 
-/// The tensors of a belief that was learned.
-pub(super) fn belief_tensors(belief: &LearnedBelief) -> Result<Vec<NamedTensor>> {
-    let named = |(name, shape, numbers)| (format!("{BELIEF}{name}"), shape, numbers);
-    Ok(belief.tensors()?.into_iter().map(named).collect())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::beliefs::KNOWN;
     use crate::config::AgentConfig;
     use emberwatch_messages::message::{RobotResult, WorldResult};
+    use emberwatch_messages::observation::Observation;
     use emberwatch_model::Frame;
 
     #[test]
@@ -172,7 +213,7 @@ mod tests {
         let dqn = Dqn::new(config.decisions.settings(), SHAPE, 3);
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: EstimatorKind::KNOWN,
+            estimator: KNOWN.label.into(),
             belief: None,
             world_steps: 7,
             earned: 0.5,
@@ -180,11 +221,11 @@ mod tests {
             worlds: BTreeMap::new(),
         };
         let mut contents = Contents::new(dqn.named_tensors(), &state);
-        let read = |contents: &Contents| LearnedDecisions::read(contents, &Device::Cpu).map(drop);
+        let read = |contents: &Contents| read(contents, &Device::Cpu, &mut Learned::default());
         let error = read(&contents).expect_err("no settings").to_string();
         assert!(error.starts_with("settings: expected"), "{error}");
         contents.settings = toml::to_string(&config).expect("TOML");
-        read(&contents).expect("whole");
+        assert!(!read(&contents).expect("whole"));
         let refused = |change: fn(&mut SavedDecisions), words: &str| {
             let (mut other, mut saved) = (contents.clone(), state.clone());
             change(&mut saved);
@@ -214,10 +255,7 @@ mod tests {
         let dqn = Dqn::new(AgentConfig::default().decisions.settings(), SHAPE, 3);
         let held = |option, n_steps| {
             let run = SavedRun {
-                place: place(&observation),
-                frame: observation.frame.as_bytes().to_vec(),
-                belief: Vec::new(),
-                estimate: None,
+                left: Left::blank(&observation),
                 memory: Memory::new(shape),
                 last: None,
                 track: dqn.track(),

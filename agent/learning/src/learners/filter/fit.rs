@@ -4,54 +4,25 @@ mod neighbours;
 
 pub use self::neighbours::Neighbours;
 
+use crate::beliefs::learned::{LearnedModel, dimensions_of, named_tensors, read_parameters};
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::config::{AgentConfig, LearningConfig};
-use crate::filter::{Optimiser, Update};
+use crate::config::{AgentConfig, KernelKind, LearningConfig};
+use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
-use crate::learners::filter::form::{Form, check_zones, named_tensors, zones_tensor};
-use crate::replay::Replay;
+use crate::replay::BlockReplay;
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
-use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
-use emberwatch_model::{Frame, Grid, Shape};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_model::{Frame, Shape};
 use emberwatch_network::NamedTensor;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
-
-pub const KIND: &str = "learned_filter";
-
-/// The same where kernels see the cell's own state.
-pub const OWN_KIND: &str = "learned_own_filter";
 
 /// Names of tensors end so: parameters, means and means of squares.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
 /// More updates than a step of all worlds earns.
 const MAX_EARNED: f64 = 2e6;
-
-/// What was learned: all that acting on it needs.
-#[derive(Debug, Clone, PartialEq)]
-pub struct LearnedModel {
-    /// The free numbers, and what they stand for.
-    pub parameters: Parameters,
-    pub tables: Tables,
-    pub target: usize,
-    /// How much that state of one cell says of its neighbours'.
-    pub correlations: Correlations,
-}
-
-impl LearnedModel {
-    pub fn new(parameters: Parameters, target: usize, correlations: Correlations) -> Self {
-        Self {
-            tables: parameters.tables(),
-            parameters,
-            target,
-            correlations,
-        }
-    }
-}
 
 /// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -62,19 +33,14 @@ pub struct FilterFit {
     pub world_steps: u64,
     /// Updates that steps have earned and that are not made yet.
     pub earned: f64,
-    replay: Replay,
+    replay: BlockReplay,
     neighbours: Neighbours,
 }
 
 impl FilterFit {
     /// Before the first frame.
-    pub fn new(
-        dimensions: Dimensions,
-        zones: Option<Arc<Grid<u8>>>,
-        shape: Shape,
-        config: &AgentConfig,
-    ) -> Self {
-        let parameters = Parameters::first(dimensions, config.seed).on_land(zones);
+    pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
+        let parameters = Parameters::first(dimensions, config.seed);
         Self {
             optimiser: Optimiser::new(parameters, shape, config.learning, config.seed),
             reward: RewardEstimate::new(dimensions.n_states),
@@ -85,33 +51,33 @@ impl FilterFit {
         }
     }
 
-    /// A world's track begins, for the first time or again.
-    pub fn begin(&mut self, world: u32) {
-        self.replay.begin(world);
+    /// A robot's track begins, for the first time or again.
+    pub fn begin(&mut self, robot: u32) {
+        self.replay.begin(robot);
         self.neighbours
-            .begin(world, self.optimiser.cut().0.n_cells());
+            .begin(robot, self.optimiser.cut().0.n_cells());
     }
 
-    pub fn has_track(&self, world: u32) -> bool {
-        self.replay.has_track(world)
+    pub fn has_track(&self, robot: u32) -> bool {
+        self.replay.has_track(robot)
     }
 
-    /// A world's next frame, the belief before it unless it is the first, and what was known then.
+    /// A robot's next frame, the belief before it unless it is the first, and what was known then.
     pub fn see(
         &mut self,
-        world: u32,
+        robot: u32,
         frame: &Frame,
         predictor: Option<&Belief>,
         learned: &LearnedModel,
     ) {
-        self.replay.push(world, frame, predictor);
+        self.replay.push(robot, frame, predictor);
         let (tables, target) = (&learned.tables, learned.target);
-        self.neighbours.see(world, frame, predictor, tables, target);
+        self.neighbours.see(robot, frame, predictor, tables, target);
     }
 
-    /// The reward of a path that visited some cells, with the belief after its frame.
-    pub fn reward(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
-        let met = met(posterior, visited.iter().copied());
+    /// Notes the reward of a path on which these cells paid; the belief is that after its frame.
+    pub fn earn(&mut self, posterior: &Belief, paying: &[usize], reward: f64) {
+        let met = met(posterior, paying.iter().copied());
         self.reward.add(&met, reward);
         self.world_steps += 1;
         self.earned += self.optimiser.config().updates_per_step;
@@ -131,12 +97,12 @@ impl FilterFit {
         Ok(updates)
     }
 
-    /// Forgets all frames, and every world's track; what was learned from them stays.
+    /// Forgets all frames, and every robot's track; what was learned from them stays.
     pub fn forget(&mut self) {
         self.replay = replay(self.optimiser.config());
         self.optimiser.leave_replay();
         self.earned = 0.0;
-        self.neighbours.forget_worlds();
+        self.neighbours.forget_robots();
     }
 
     pub fn learned(&self) -> LearnedModel {
@@ -145,14 +111,6 @@ impl FilterFit {
         let target = self.reward.target().unwrap_or(last);
         let correlations = self.neighbours.correlations_of(target);
         LearnedModel::new(parameters.clone(), target, correlations)
-    }
-
-    pub fn kind(&self) -> &'static str {
-        if self.optimiser.dimensions().sees_own_state {
-            OWN_KIND
-        } else {
-            KIND
-        }
     }
 
     /// Why a run of that many steps made no update, and what to do.
@@ -181,28 +139,28 @@ impl FilterFit {
         let adam = &self.optimiser.adam;
         let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
         let parts = SUFFIXES.into_iter().zip(parts);
-        let parts = parts.flat_map(|(suffix, part)| named_tensors(part, suffix));
         parts
-            .chain(zones_tensor(self.optimiser.parameters()))
+            .flat_map(|(suffix, part)| named_tensors(part, suffix))
             .collect()
     }
 
-    /// Takes the tensors of a checkpoint that it is of.
+    /// Loads its tensors from a checkpoint with these dimensions, see [`dimensions_of`].
     ///
     /// # Errors
     /// Names what is missing or of another form.
-    pub fn load(&mut self, contents: &Contents, form: &Form) -> Result<()> {
+    pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
         let counts = [
             ("n_updates", self.n_updates()),
             ("world_steps", self.world_steps),
         ];
         check_counts(&counts)?;
         let part = contents.part("");
-        let [parameters, first, second] = SUFFIXES.map(|suffix| form.parameters(&part, suffix));
+        let [parameters, first, second] =
+            SUFFIXES.map(|suffix| read_parameters(dimensions, &part, suffix));
         self.optimiser.set_parameters(parameters?);
         (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
         contents.check_squares()?;
-        self.reward.check(form.dimensions.n_states)
+        self.reward.check(dimensions.n_states)
     }
 
     /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
@@ -214,16 +172,16 @@ impl FilterFit {
         mut saved: Self,
         contents: &Contents,
         dimensions: Dimensions,
-        zones: Option<Arc<Grid<u8>>>,
         shape: Shape,
         config: &AgentConfig,
     ) -> Result<Self> {
-        let form = Form::read(dimensions, &contents.part(""))?;
-        let (expected, got) = (dimensions.n_matrices, form.dimensions.n_matrices);
+        let of_file = dimensions_of(dimensions, &contents.part(""))?;
+        let [expected, got] = [dimensions, of_file].map(|it| KernelKind::of(it.sees_own_state));
+        check(got == expected, "kernels", expected, got)?;
+        let (expected, got) = (dimensions.n_matrices, of_file.n_matrices);
         check(got == expected, "observation matrices", expected, got)?;
-        check_zones(zones.as_deref(), form.zones.as_deref())?;
-        saved.load(contents, &form)?;
-        let mut fit = Self::new(dimensions, zones, shape, config);
+        saved.load(contents, dimensions)?;
+        let mut fit = Self::new(dimensions, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
             let fits = (0.0..MAX_EARNED).contains(&saved.earned);
             check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
@@ -235,7 +193,7 @@ impl FilterFit {
             let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
             check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
         } else {
-            saved.neighbours.forget_worlds();
+            saved.neighbours.forget_robots();
         }
         fit.optimiser.resume(saved.optimiser)?;
         fit.reward = saved.reward;
@@ -245,8 +203,8 @@ impl FilterFit {
     }
 }
 
-fn replay(config: &LearningConfig) -> Replay {
-    Replay::new(config.window * config.block_windows, config.replay_frames)
+fn replay(config: &LearningConfig) -> BlockReplay {
+    BlockReplay::new(config.window * config.block_windows, config.replay_frames)
 }
 
 #[cfg(test)]
@@ -260,7 +218,6 @@ mod tests {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state: false,
-        n_zones: 0,
         n_matrices: 1,
     };
 
@@ -283,13 +240,13 @@ mod tests {
             let learned = fit.learned();
             fit.see(4, &frame, Some(&belief), &learned);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
-            fit.reward(&belief, &visited, 0.3);
+            fit.earn(&belief, &visited, 0.3);
             fit.learn().expect("finite");
         }
     }
 
     fn fit() -> FilterFit {
-        let mut fit = FilterFit::new(DIMENSIONS, None, shape(), &config());
+        let mut fit = FilterFit::new(DIMENSIONS, shape(), &config());
         fit.begin(4);
         see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
         fit
@@ -304,9 +261,9 @@ mod tests {
         dimensions: Dimensions,
         config: &AgentConfig,
     ) -> Result<FilterFit, String> {
-        let fit = contents.state().and_then(|saved| {
-            FilterFit::resume(saved, contents, dimensions, None, shape(), config)
-        });
+        let fit = contents
+            .state()
+            .and_then(|saved| FilterFit::resume(saved, contents, dimensions, shape(), config));
         fit.map_err(|error| error.to_string())
     }
 
@@ -328,60 +285,34 @@ mod tests {
         assert_eq!(contents(&other).tensors, stored.tensors);
     }
 
-    fn zones(zones: [u8; 3]) -> Option<Arc<Grid<u8>>> {
-        let zones = Grid::from_shape_vec((1, 3), zones.to_vec());
-        Some(Arc::new(zones.expect("a map")))
-    }
-
     #[test]
-    fn zones_and_matrices_are_kept_in_checkpoints() {
+    fn observation_matrices_are_kept_in_checkpoints() {
         let dimensions = Dimensions {
-            n_zones: 2,
             n_matrices: 2,
             ..DIMENSIONS
         };
-        let mut fit = FilterFit::new(dimensions, zones([0, 1, 1]), shape(), &config());
+        let mut fit = FilterFit::new(dimensions, shape(), &config());
         fit.begin(4);
         see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
         assert!(fit.n_updates() > 0);
         let stored = contents(&fit);
-        let resume = |contents: &Contents, dimensions, zones| {
-            let saved = contents.state();
-            let fit = saved.and_then(|saved| {
-                FilterFit::resume(saved, contents, dimensions, zones, shape(), &config())
-            });
-            fit.map_err(|error| error.to_string())
-        };
-        let same = resume(&stored, dimensions, zones([0, 1, 1])).expect("whole");
+        let same = resume(&stored, dimensions, &config()).expect("whole");
         assert!(contents(&same) == stored);
-        let error = |contents: &Contents, dimensions, map| {
-            resume(contents, dimensions, map).expect_err("others")
+        let error = resume(&stored, DIMENSIONS, &config()).expect_err("another sensor");
+        assert_eq!(error, "observation matrices: expected 1, got 2");
+    }
+
+    #[test]
+    fn kernels_for_each_zone_are_refused() {
+        let mut contents = contents(&fit());
+        let zones = Tensor {
+            shape: vec![1, 3],
+            numbers: vec![0.0, 1.0, 1.0],
         };
+        contents.tensors.insert("zones".into(), zones);
         assert_eq!(
-            error(&stored, dimensions, zones([0, 0, 1])),
-            "zones: expected 2 on 1 x 3 cells, got another map"
-        );
-        assert_eq!(
-            error(&stored, DIMENSIONS, zones([0, 1, 1])),
-            "observation matrices: expected 1, got 2"
-        );
-        let forged = |change: fn(&mut Tensor), words: &str| {
-            let mut contents = stored.clone();
-            change(contents.tensors.get_mut("zones").expect("a map"));
-            let error = error(&contents, dimensions, zones([0, 1, 1]));
-            assert!(error.starts_with(words), "{error}");
-        };
-        forged(
-            |map| map.numbers[1] = 0.5,
-            "zones: expected zones from 0 to 255, got 0.5",
-        );
-        forged(
-            |map| map.numbers[1] = 255.0,
-            "zones: expected 2 on 1 x 3 cells, got 256 on 1 x 3 cells",
-        );
-        forged(
-            |map| map.shape = vec![3],
-            "zones: expected a map of a grid, got [3]",
+            resume(&contents, DIMENSIONS, &config()).expect_err("zones"),
+            "zones: expected the same kernels in every cell, got kernels for each zone of land: train the filter again"
         );
     }
 

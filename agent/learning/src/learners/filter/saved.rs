@@ -17,20 +17,20 @@ use std::ops::Range;
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedFilter {
     pub fit: FilterFit,
-    pub worlds: BTreeMap<u32, SavedWorld>,
+    pub worlds: BTreeMap<u32, SavedRobot>,
 }
 
-/// Where a checkpoint left a world: what it showed, the belief about what comes next, and the estimate
+/// Where a checkpoint left a robot: what it showed, the belief about what comes next, and the estimate
 /// behind it, where paths are planned on that.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SavedWorld {
+pub struct SavedRobot {
     place: Place,
     frame: Vec<u8>,
     belief: Belief,
     estimate: Option<Belief>,
 }
 
-impl SavedWorld {
+impl SavedRobot {
     pub fn of(rollout: &Rollout) -> Self {
         let (agent, observation) = (&rollout.agent, rollout.observation());
         Self {
@@ -47,14 +47,14 @@ impl SavedWorld {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    /// Whether any of these worlds shows what it showed then.
+    /// Whether the world of any of these robots shows what it showed then.
     pub fn any_is_of(
         all: &BTreeMap<u32, Self>,
-        worlds: Range<u32>,
+        robots: Range<u32>,
         observations: &[Observation],
     ) -> bool {
-        worlds.zip(observations).any(|(world, observation)| {
-            let saved = all.get(&world);
+        robots.zip(observations).any(|(robot, observation)| {
+            let saved = all.get(&robot);
             saved.is_some_and(|saved| saved.is_of(observation))
         })
     }

@@ -1,10 +1,10 @@
 //! What Algorithm 1 has learned, and where it stands: as a checkpoint, and from one.
 
+use crate::beliefs::autoencoder::{AutoencoderModel, Follower};
 use crate::checkpoint::{Contents, check, check_belief, check_counts, check_numbers, wrong};
 use crate::config::AgentConfig;
-use crate::estimation::Follower;
 use crate::learners::base::{Place, Worlds, place};
-use crate::policy::Policy;
+use crate::policy::network_choices;
 use crate::reward::RewardEstimate;
 use crate::rollout::Rollout;
 use anyhow::Result;
@@ -13,7 +13,7 @@ use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::MAX_VALUES;
 use emberwatch_model::{Airspace, Frame, Shape};
 use emberwatch_network::{
-    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
+    Autoencoder, Device, Dqn, DqnShape, FrameReplay, NetworkError, NetworkShape, SavedDqn, Track,
 };
 use serde::{Deserialize, Serialize};
 
@@ -25,7 +25,7 @@ pub struct Progress {
     /// What the paths are planned on that the DQN values.
     pub basis: BasisKind,
     /// The frames that are learned from.
-    pub replay: Replay,
+    pub replay: FrameReplay,
     pub position: Position,
 }
 
@@ -69,7 +69,7 @@ impl Progress {
         let shape = network_shape(worlds.shape(), worlds.n_observations, config);
         let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
         let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
-        let n_actions = Policy::network_choices(n_states).len();
+        let n_actions = network_choices(n_states).len();
         let actions = DqnShape::of_actions(settings.hidden, n_actions);
         let dqn = Dqn::new(config.dqn.settings(), actions, config.seed);
         let position = Position {
@@ -84,7 +84,7 @@ impl Progress {
             autoencoder,
             dqn,
             basis: config.objective.belief,
-            replay: Replay::new(settings.replay),
+            replay: FrameReplay::new(settings.replay),
             position,
         })
     }
@@ -132,7 +132,6 @@ impl Progress {
         check_belief("prediction", prediction, sizes.n_states, shape)?;
         let worlds = Worlds {
             airspace: Airspace::open(shape),
-            zones: None,
             n_observations,
             n_moves: 0,
             numbers: 0..1,
@@ -140,6 +139,16 @@ impl Progress {
         let mut progress = Self::first(&worlds, &config, device)?;
         progress.load(contents)?;
         Ok(progress)
+    }
+
+    /// What policies act on.
+    pub fn into_model(self) -> AutoencoderModel {
+        AutoencoderModel {
+            target: self.target(),
+            autoencoder: self.autoencoder,
+            dqn: self.dqn,
+            basis: self.basis,
+        }
     }
 
     /// Takes over a checkpoint of the same sizes.

@@ -21,7 +21,7 @@ const BLOCK_FRAMES: usize = 256;
 /// A frame: the cells that it shows, by row-major index, with their values, and what the filter that the network corrects
 /// predicted of each, if there is one, `[cells, O]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Seen {
+struct SeenFrame {
     cells: Vec<(usize, u8)>,
     base: Vec<f32>,
 }
@@ -29,11 +29,11 @@ struct Seen {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Block {
     before: Sightings,
-    frames: Vec<Seen>,
+    frames: Vec<SeenFrame>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Replay {
+pub struct LessonReplay {
     max_frames: usize,
     /// Blocks that are full or whose track has ended, oldest first.
     full: VecDeque<Block>,
@@ -41,7 +41,7 @@ pub struct Replay {
     open: BTreeMap<u32, Block>,
 }
 
-impl Replay {
+impl LessonReplay {
     /// Keeps `max_frames` frames beside those of the last blocks.
     pub fn new(max_frames: usize) -> Self {
         Self {
@@ -92,7 +92,7 @@ impl Replay {
         let base = base.iter();
         let base = base.flat_map(|base| cells.iter().flat_map(|it| of_cell(base, it.0)));
         let base = base.collect();
-        block.frames.push(Seen { cells, base });
+        block.frames.push(SeenFrame { cells, base });
         if block.frames.len() >= BLOCK_FRAMES {
             let before = block.before_frame(BLOCK_FRAMES);
             self.open(robot, before);
@@ -201,8 +201,8 @@ mod tests {
     }
 
     /// Robots 3 and 4 see the steps' numbers, in cells of their own.
-    fn replay(n_steps: usize, max_frames: usize) -> Replay {
-        let mut replay = Replay::new(max_frames);
+    fn replay(n_steps: usize, max_frames: usize) -> LessonReplay {
+        let mut replay = LessonReplay::new(max_frames);
         [3, 4]
             .into_iter()
             .for_each(|robot| replay.begin(robot, shape()));
@@ -236,7 +236,7 @@ mod tests {
             assert_eq!(before.last(1 - cell), None);
         }
         assert!(
-            Replay::new(9)
+            LessonReplay::new(9)
                 .lessons(5, &mut stream(1, Purpose::Replay, 0))
                 .is_empty()
         );

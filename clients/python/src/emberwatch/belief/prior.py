@@ -24,7 +24,8 @@ def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> N
     same arguments, so it cannot be written to. The agents' beliefs begin with it, too, and it is
     kept for later processes where they keep theirs, in ``~/.cache/emberwatch``.
     """
-    height, width = as_count(height, "height", 1, 4096), as_count(width, "width", 1, 4096)
+    height = as_count(height, "height", 1, _native.MAX_SIDE)
+    width = as_count(width, "width", 1, _native.MAX_SIDE)
     burn_in = as_count(burn_in, "burn_in", 0, 2**64 - 1)
     prior = _native.simulated_prior(model.toml, height, width, burn_in)
     prior.flags.writeable = False

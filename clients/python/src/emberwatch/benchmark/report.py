@@ -10,9 +10,9 @@ from typing import TextIO
 
 import numpy as np
 
+from emberwatch._native import FIRST_TRAINING_SEED
 from emberwatch.benchmark.rows import Row
 from emberwatch.errors import invalid
-from emberwatch.model.tasks import FIRST_TRAINING_SEED
 
 
 class Progress:

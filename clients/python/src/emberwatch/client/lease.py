@@ -93,7 +93,8 @@ class Lease:
         """Flies one path with each robot, as `step`, however long teammates take.
 
         After each timeout it looks whether the worlds have moved, and if not, sends the paths
-        again. It waits as long as the server answers.
+        again. It waits as long as the server answers. If paths of another thread moved a world,
+        that world counts as moved on without these paths.
 
         Args:
             paths: As for `step`.

@@ -66,7 +66,7 @@ class ServerInfo:
     pid_namespace: int | None = None
     #: Where robots may fly and what they see.
     airspace: Airspace = Airspace()  # noqa: RUF009
-    #: Zones of land; None where all cells are alike, or learners are not told.
+    #: Zones of land; None where all cells are alike.
     zones: Zones | None = None
 
     @property

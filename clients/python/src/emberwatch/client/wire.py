@@ -10,9 +10,6 @@ from emberwatch._native import Answer
 from emberwatch.common.codes import N_MOVES as N_MOVES
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 
-#: The protocol version that this package speaks.
-VERSION: Final = 2
-
 #: Operations of `step`.
 STEP: Final = 1
 OBSERVE: Final = 2
@@ -22,16 +19,8 @@ RECALL: Final = 3
 FULL_COVERAGE: Final = 1
 TEAM_FRAMES: Final = 2
 
-#: Limits of section 1.
-MAX_CLIENTS: Final = 16
-MAX_ROBOTS: Final = 64
-MAX_OBSERVERS: Final = 16
-MAX_TRUTH_READERS: Final = 4
-MAX_AGENT_READERS: Final = 4
-FRAME_BUFFER: Final = 64
+#: Number of samples that a reader of hidden states may be behind.
 TRUTH_BUFFER: Final = 128
-AGENT_BUFFER: Final = 4
-MAX_NODES: Final = 64
 
 
 class WorldResult(NamedTuple):

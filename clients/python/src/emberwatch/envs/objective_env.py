@@ -54,13 +54,13 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     As `WildfireEnv` without `observation`, `reward` and `robot`, in worlds of one robot, and
 
-    * `estimator`: what keeps the belief. `"known_model"` is the paper's Bayes filter;
-      `"learned_filter"` one with learned parameters, which finds several times as many fires where
-      they are rare; `"learned_own_filter"` one that learned a kernel for each state of the cell
-      itself. Each of them has a spatial one, whose corrections reach neighbouring cells:
-      `"spatial_filter"`, `"learned_spatial_filter"`, `"learned_own_spatial_filter"`.
-      `"neural_belief"` is a network from what was seen in each cell. By default the checkpoint's,
-      without one the known model's filter.
+    * `estimator`: what keeps the belief; by default what `checkpoint` holds, without one
+      `"known_model"`. A learned one finds several times as many fires where these are rare.
+        * `"known_model"`: the Bayes filter of the true model
+        * `"spatial_filter"`: the same; what a cell shows corrects its neighbours, too
+        * `"learned_filter"`: a Bayes filter whose parameters were learned
+        * `"learned_spatial_filter"`: the same; what a cell shows corrects its neighbours, too
+        * `"neural_belief"`: a network that keeps space, learned from what was seen
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
       second), `"initial"` or `"uniform"`.

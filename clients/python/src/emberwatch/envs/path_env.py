@@ -109,21 +109,17 @@ class WildfireEnv(WorldEnv):
     * `robot`: with `instance`, which of the world's robots, if others fly the rest (None: the world
       has only one).
     * `takeover`: with `instance`, take the world from its holder (False).
-    * `task`: `"wildfire"`, `"small"`, `"sparse"`, `"latent"`, `"burnout"`, `"terrain"`,
-      `"road-ice"`, `"team"`, `"jacksboro"` or the path of a task file
-      (`docs/environments/index.md`), which decides all keywords from `model` to `states_offset`,
-      `robots` and the length of episodes: none of them may stand beside it. With `instance`: the
-      name of the running server's.
-    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
-      `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells), `"wildfire-burnout"` (what has
-      burnt doesn't burn again until it has regrown), `"wildfire-terrain"` (the same on real land),
-      `"road-ice"` or the path of a model file;
-      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (0 to 8; None:
-      as the model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of
-      worlds of its own. With `instance` they may be left out, or must agree with the server.
-    * `states`: recorded states instead of a model (a `.npz` or `.npy` file or a folder, see
-      `docs/recorded-worlds.md`, or `"jacksboro"`), which decide `height`, `width` and `burn_in`;
-      `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
+    * `task`: the name of a built-in task, such as `"small"`, or the path of a task file
+      (`docs/environments/index.md` lists tasks and models). It decides all keywords from `model` to
+      `states_offset`, `robots` and the length of episodes: none of them may stand beside it. With
+      `instance`: the name of the running server's.
+    * `model`: the name of a built-in model (`"wildfire"`) or the path of a model file;
+      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (None: as the
+      model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of worlds of its
+      own. With `instance` they may be left out, or must agree with the server.
+    * `states`: recorded states instead of a model (built-in ones by name, or a `.npz` or `.npy`
+      file or a folder, see `docs/recorded-worlds.md`), which decide `height`, `width` and
+      `burn_in`; `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
     * `truth`: reveal the hidden states in `info` and pictures (False).
     * `timeout`: how long to wait for a step of a running server, or until it is there, seconds (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.

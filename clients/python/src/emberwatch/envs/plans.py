@@ -22,8 +22,6 @@ Estimator: TypeAlias = Literal[
     "spatial_filter",
     "learned_filter",
     "learned_spatial_filter",
-    "learned_own_filter",
-    "learned_own_spatial_filter",
     "neural_belief",
 ]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]

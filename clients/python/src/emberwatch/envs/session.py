@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emberwatch._native import FIRST_TRAINING_SEED
 from emberwatch.client import wire
 from emberwatch.client.client import Client, connect, embed_settings
 from emberwatch.client.connection import RESET_TIMEOUT
@@ -35,7 +36,7 @@ from emberwatch.errors import (
     TrainingOnTestWorldsWarning,
     invalid,
 )
-from emberwatch.model.tasks import FIRST_TRAINING_SEED, Task
+from emberwatch.model.tasks import Task
 
 # Seconds after its last use that a lease on a running server ends: learners may think long, and
 # the server notices a dead holder at once anyway.

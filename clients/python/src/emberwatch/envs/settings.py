@@ -18,7 +18,7 @@ from emberwatch.common.arguments import as_setting, check_settings
 from emberwatch.common.paths import local, utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model
-from emberwatch.model.airspace import MAX_RADIUS, Airspace, Zones
+from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.model.tasks import Task, built_in_tasks
 
 #: Drawn seeds are below this: every JSON reader represents them exactly (PROTOCOL.md section 2).
@@ -104,8 +104,9 @@ class Settings:
         for name in ("task", "model", "states", "start"):
             if getattr(self, name) is not None:
                 utf8(name, getattr(self, name))
-        if self.sensor_radius is not None and not 0 <= self.sensor_radius <= MAX_RADIUS:
-            raise invalid("sensor_radius", f"0 to {MAX_RADIUS}, or None", self.sensor_radius)
+        if self.sensor_radius is not None and not 0 <= self.sensor_radius <= _native.MAX_RADIUS:
+            expected = f"0 to {_native.MAX_RADIUS}, or None"
+            raise invalid("sensor_radius", expected, self.sensor_radius)
         if self.robots is not None and self.robots < 1:
             raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:

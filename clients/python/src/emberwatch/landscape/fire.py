@@ -25,7 +25,7 @@ Kind = Literal["arrival", "mask", "burning", "states"]
 
 #: Parts of words for each state, in the order in which they are looked for.
 _WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
-_MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
+MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,9 +85,9 @@ def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]
             f"--resample: expected cells that burn on {shape[0]} x {shape[1]} cells, got none; "
             "use 'earliest'"
         )
-    if fire.n_steps * arrival.size > _MOST_STATES:
+    if fire.n_steps * arrival.size > MOST_STATES:
         raise InvalidArgumentError(
-            f"{fire.name}: expected at most {_MOST_STATES} bytes of states, got "
+            f"{fire.name}: expected at most {MOST_STATES} bytes of states, got "
             f"{fire.n_steps:.15g} steps of {shape[0]} x {shape[1]} cells; use a longer --step or "
             "--every, or a smaller grid"
         )

@@ -7,11 +7,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch._native import MAX_SIDE
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.ground import Ground, is_same, unit_cell
 
-MAX_SIDE: Final = 4096
-"""Most rows, and most columns, that the server takes."""
 LIKE: Final = 1e-3
 """Share of a cell by which places may differ."""
 

@@ -11,11 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch._native import MAX_SIDE
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
 from emberwatch.landscape.elevation import slopes
-from emberwatch.landscape.grid import MAX_SIDE, check_same
+from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice, Layer
 from emberwatch.landscape.lengths import METRES, side

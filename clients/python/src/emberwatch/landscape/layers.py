@@ -12,7 +12,7 @@ from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.schedule import Clock, Time
 
-_MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
+MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,5 +73,5 @@ def is_missing(stored: NDArray[Any], nodata: Sequence[float]) -> NDArray[np.bool
 
 def check_cells(file: Path, height: int, width: int) -> None:
     """Refuses layers that are too large, before they are read."""
-    if height * width > _MOST_CELLS:
-        raise invalid(file, f"at most {_MOST_CELLS} cells", f"{height} x {width}")
+    if height * width > MOST_CELLS:
+        raise invalid(file, f"at most {MOST_CELLS} cells", f"{height} x {width}")

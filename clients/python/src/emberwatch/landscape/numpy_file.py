@@ -21,7 +21,7 @@ from emberwatch.landscape.layers import (
     is_missing,
 )
 
-_MOST_BYTES: Final = 1 << 32  # of an array
+MOST_BYTES: Final = 1 << 32  # of an array
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
@@ -73,9 +73,7 @@ def _checked_array(file: Path, opened: IO[bytes]) -> NDArray[Any]:
         )
     check_cells(file, *shape[-2:])
     n_bytes = math.prod(shape) * dtype.itemsize
-    if n_bytes > _MOST_BYTES:
-        raise invalid(
-            file, f"at most {_MOST_BYTES} bytes of numbers", f"{n_bytes}: {dtype} {shape}"
-        )
+    if n_bytes > MOST_BYTES:
+        raise invalid(file, f"at most {MOST_BYTES} bytes of numbers", f"{n_bytes}: {dtype} {shape}")
     opened.seek(0)
     return read_array(opened, allow_pickle=False)

@@ -16,13 +16,10 @@ import emberwatch._native as _native
 from emberwatch.common.arguments import as_count, check_settings
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.model.airspace import MAX_RADIUS, Airspace, Zones
+from emberwatch.model.airspace import Airspace, Zones
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
-
-MAX_VALUES = 64
-"""Maximum number of states, and of observations, of a model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -68,7 +65,7 @@ class Description:
 
     def with_radius(self, radius: int) -> Self:
         """The same with a sensor that sees so many rows and columns beyond each cell of a path."""
-        radius = as_count(radius, "radius", 0, MAX_RADIUS)
+        radius = as_count(radius, "radius", 0, _native.MAX_RADIUS)
         if radius == self.airspace.radius:
             return self
         return self.from_toml(self._with_radius(self.toml, radius))

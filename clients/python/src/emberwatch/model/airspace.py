@@ -1,16 +1,14 @@
 """Where robots may fly, and what they see from there."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch._native import MAX_RADIUS
 from emberwatch.common.arguments import as_count, told
 from emberwatch.errors import invalid
-
-#: Most rows and columns that a robot sees beyond its cell.
-MAX_RADIUS: Final = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -21,7 +19,7 @@ class Airspace:
     """
 
     radius: int = 0
-    """Rows and columns that they see beyond each cell of their path, 0 to 8."""
+    """Rows and columns that they see beyond each cell of their path."""
     n_rings: int = 1
     """Observation matrices: of the path, then of each ring around it; the last holds beyond. What
     is observed by matrix m has the value ``m * O / n_rings`` plus that which it has on the path."""

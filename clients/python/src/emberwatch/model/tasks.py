@@ -4,14 +4,11 @@ import tomllib
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 import emberwatch._native as _native
 from emberwatch.common.arguments import check_settings
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
-
-#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
-FIRST_TRAINING_SEED: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +21,9 @@ class Task:
     #: Steps of an episode.
     max_steps: int
     test_seeds: range
+    #: What the ids of its environments begin with, as `WildfireSmall` in
+    #: `emberwatch/WildfireSmall-v0`; empty: it has none.
+    ids: str = ""
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
@@ -42,6 +42,7 @@ class Task:
             robots=file.get("robots", 1),
             max_steps=file["max_steps"],
             test_seeds=range(file["test_seeds"]["start"], file["test_seeds"]["end"]),
+            ids=file.get("listing", {}).get("ids", ""),
         )
 
 

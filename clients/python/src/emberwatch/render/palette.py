@@ -10,9 +10,10 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch._native import MAX_VALUES
 from emberwatch.common.codes import UNOBSERVED
 from emberwatch.errors import invalid
-from emberwatch.model import MAX_VALUES, Color, Description, color_from_hex
+from emberwatch.model import Color, Description, color_from_hex
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
 """Marks on light cells."""

@@ -31,26 +31,26 @@ impl Neighbours {
         }
     }
 
-    /// A world of so many cells begins, for the first time or again.
-    pub fn begin(&mut self, world: u32, n_cells: usize) {
-        self.ages.insert(world, Ages::new(n_cells));
+    /// A robot begins an episode in a world of so many cells.
+    pub fn begin(&mut self, robot: u32, n_cells: usize) {
+        self.ages.insert(robot, Ages::new(n_cells));
     }
 
     /// Forgets all worlds; what was learned in them stays.
-    pub fn forget_worlds(&mut self) {
+    pub fn forget_robots(&mut self) {
         self.ages.clear();
     }
 
-    /// A world's next frame, with the belief before it, unless it is the first.
+    /// A robot's next frame, with the belief before it, unless it is the first.
     pub fn see(
         &mut self,
-        world: u32,
+        robot: u32,
         frame: &Frame,
         predictor: Option<&Belief>,
         tables: &Tables,
         state: usize,
     ) {
-        let Some(ages) = self.ages.get_mut(&world) else {
+        let Some(ages) = self.ages.get_mut(&robot) else {
             return;
         };
         ages.grow();

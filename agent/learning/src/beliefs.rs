@@ -1,0 +1,84 @@
+//! Kinds of belief: what a policy believes about its world, and the facts that commands, tables and charts ask for.
+//!
+//! A kind is one file, with its constructor and its facts, and a line in [`BELIEFS`].
+
+pub mod autoencoder;
+pub mod first_belief;
+mod follower;
+mod kind;
+mod known;
+pub mod learned;
+pub mod neural;
+mod truth;
+mod world_form;
+
+pub use self::autoencoder::AUTOENCODER;
+pub use self::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, numbered_states};
+pub use self::known::{KNOWN, KNOWN_SPATIAL};
+pub use self::learned::{LEARNED, LEARNED_SPATIAL};
+pub use self::neural::NEURAL;
+pub use self::truth::{NEXT_TRUTH, NONE, TRUTH};
+pub use self::world_form::WorldForm;
+
+/// All kinds, from the least to the most informed.
+pub const BELIEFS: &[&BeliefKind] = &[
+    &NONE,
+    &KNOWN,
+    &KNOWN_SPATIAL,
+    &LEARNED,
+    &LEARNED_SPATIAL,
+    &NEURAL,
+    &AUTOENCODER,
+    &TRUTH,
+    &NEXT_TRUTH,
+];
+
+/// The kind of a name, or of a label.
+pub fn named(name: &str) -> Option<&'static BeliefKind> {
+    let mut kinds = BELIEFS.iter().copied();
+    kinds.find(|kind| kind.name == name || kind.label == name)
+}
+
+/// As [`named`], of those on which options can be learned: frames change them, and no network decides on their hidden
+/// vector.
+///
+/// # Errors
+/// Names them all.
+pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
+    let serves = |kind: &&BeliefKind| kind.input == Input::Frames && !kind.decides();
+    named(name).filter(serves).ok_or_else(|| {
+        let kinds = BELIEFS.iter().copied().filter(serves);
+        let names: Vec<&str> = kinds.map(|kind| kind.label).collect();
+        format!("expected one of {}, got {name:?}", names.join(", "))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_labels_are_of_one_kind_each() {
+        for &kind in BELIEFS {
+            assert_eq!(named(kind.name), Some(kind));
+            assert_eq!(named(kind.label), Some(kind));
+            let others = BELIEFS.iter().filter(|other| **other != kind);
+            for other in others {
+                assert!(![other.name, other.label].contains(&kind.name), "{kind:?}");
+                assert_ne!(other.label, kind.label);
+            }
+        }
+    }
+
+    #[test]
+    fn options_are_learned_on_what_frames_tell() {
+        let labels =
+            "known_model, spatial_filter, learned_filter, learned_spatial_filter, neural_belief";
+        let error = of_options("filter").expect_err("no name");
+        assert_eq!(error, format!("expected one of {labels}, got \"filter\""));
+        for label in labels.split(", ") {
+            assert_eq!(of_options(label).map(|kind| kind.label), Ok(label));
+        }
+        assert!(of_options("truth").is_err());
+    }
+}

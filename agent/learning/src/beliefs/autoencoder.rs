@@ -1,0 +1,142 @@
+//! The autoencoder as an estimator: a hidden vector that reads frames (paper eq. 9), and Bayes' rule at
+//! visited cells (eq. 10).
+
+pub use super::follower::Follower;
+
+use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
+use super::world_form::WorldForm;
+use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::bayes::correct;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
+use emberwatch_belief::planning::BasisKind;
+use emberwatch_model::Frame;
+use emberwatch_network::{Autoencoder, Dqn, NetworkError};
+use ndarray::Array2;
+use std::borrow::Cow;
+
+pub const AUTOENCODER: BeliefKind = BeliefKind {
+    name: "autoencoder",
+    label: "autoencoder",
+    about: "the paper's dynamic autoencoder",
+    input: Input::Frames,
+    knows_model: false,
+    learned_by: Some(LearnedBy {
+        learner: "autoencoder",
+        decides: true,
+        find: |learned| learned.get::<AutoencoderModel>().map(|model| model as _),
+    }),
+    chart: ("learned", [0x00, 0x9e, 0x73]),
+    handover: None,
+    build: |conditions| {
+        let model = conditions.learned.get::<AutoencoderModel>();
+        let model = model.context("checkpoint: expected one of an autoencoder, got none")?;
+        let estimator = AutoencoderEstimator::new(&model.autoencoder);
+        Ok(Box::new(estimator.context("checkpoint")?))
+    },
+};
+
+/// What Algorithm 1 learned: all that acting on it needs.
+#[derive(Debug)]
+pub struct AutoencoderModel {
+    pub autoencoder: Autoencoder,
+    /// Chooses an objective by the hidden vector (paper section III.E).
+    pub dqn: Dqn,
+    /// What the paths are planned on that the DQN values.
+    pub basis: BasisKind,
+    /// The state that pays most.
+    pub target: usize,
+}
+
+/// Two that were read are never taken for the same.
+impl PartialEq for AutoencoderModel {
+    fn eq(&self, _: &Self) -> bool {
+        false
+    }
+}
+
+impl LearnedBelief for AutoencoderModel {
+    fn target(&self) -> usize {
+        self.target
+    }
+
+    fn n_states(&self) -> usize {
+        self.autoencoder.shape().n_states
+    }
+
+    fn check_world(&self, world: &WorldForm) -> Result<()> {
+        let shape = self.autoencoder.shape();
+        world.check_observations(shape.n_observations, 1)?;
+        ensure!(
+            shape.grid == world.shape,
+            "checkpoint: expected a network for {} cells as the world's, got one for {}",
+            world.shape,
+            shape.grid
+        );
+        Ok(())
+    }
+}
+
+pub struct AutoencoderEstimator {
+    network: Autoencoder,
+    follower: Follower,
+    /// The estimate `p_k` or the predictor `u_{k+1}`.
+    belief: Belief,
+}
+
+impl AutoencoderEstimator {
+    /// Before the first frame.
+    pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
+        Ok(Self::at(network, Follower::new(network)?))
+    }
+
+    /// Where a follower of the network stands.
+    pub fn at(network: &Autoencoder, follower: Follower) -> Self {
+        Self {
+            network: network.clone(),
+            belief: follower.prediction().clone(),
+            follower,
+        }
+    }
+}
+
+impl Estimator for AutoencoderEstimator {
+    /// Bayes' rule with the learned `O` at visited cells (eq. 10); the predictor elsewhere.
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        let mut estimate = self.follower.prediction().clone();
+        let likelihood = likelihood(&self.network).map_err(failed)?;
+        correct(&mut estimate, &likelihood, frame)?;
+        self.follower = self.follower.after(&self.network, frame).map_err(failed)?;
+        self.belief = estimate;
+        Ok(())
+    }
+
+    fn predict(&mut self) {
+        self.belief.clone_from(self.follower.prediction());
+    }
+
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        likelihood(&self.network).ok().map(Cow::Owned)
+    }
+
+    fn hidden(&self) -> Option<&[f32]> {
+        Some(self.follower.hidden())
+    }
+}
+
+fn failed(error: NetworkError) -> EstimatorError {
+    EstimatorError::Network(error.into())
+}
+
+/// `P(y | x)` of a network, shape `[S, O]`.
+pub fn likelihood(autoencoder: &Autoencoder) -> Result<Array2<f64>, NetworkError> {
+    let shape = autoencoder.shape();
+    let matrix = autoencoder.observation_matrix()?;
+    let entry = |(state, value)| f64::from(matrix[value * shape.n_states + state]);
+    let dim = (shape.n_states, shape.n_observations);
+    Ok(Array2::from_shape_fn(dim, entry))
+}

@@ -1,0 +1,359 @@
+//! The neural belief as an estimator: what each cell showed and when, and what a network makes of it, alone or as a
+//! correction of a filter's belief.
+//!
+//! The belief is about observations, S = O: after a frame, visited cells are what they showed.
+
+use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
+use super::learned::{LearnedModel, SavedModel, check_target};
+use super::world_form::WorldForm;
+use crate::checkpoint::{Part, check};
+use anyhow::{Context, Result};
+use emberwatch_belief::estimation::bayes::{correct, observations};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
+use emberwatch_model::grid::Probabilities;
+use emberwatch_model::{Frame, MAX_VALUES, Shape};
+use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
+use ndarray::Array2;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
+
+/// Before the names of the tensors of the filter that a network corrects.
+const FILTER: &str = "filter.";
+
+pub const NEURAL: BeliefKind = BeliefKind {
+    name: "neural",
+    label: "neural_belief",
+    about: "a network that keeps space, learned from what was seen",
+    input: Input::Frames,
+    knows_model: false,
+    learned_by: Some(LearnedBy {
+        learner: "neural",
+        decides: false,
+        find: |learned| learned.get::<NeuralModel>().map(|model| model as _),
+    }),
+    chart: ("learned", [0x00, 0x9e, 0x73]),
+    handover: None,
+    build: |conditions| {
+        let model = conditions.learned.get::<NeuralModel>();
+        let model = model.context("checkpoint: expected one of a neural belief, got none")?;
+        let estimator = model.estimator(conditions.shape);
+        Ok(Box::new(estimator.context("checkpoint")?))
+    },
+};
+
+/// A neural belief that was learned: all that acting on it needs.
+#[derive(Debug, Clone)]
+pub struct NeuralModel {
+    pub network: NeuralBelief,
+    /// The filter that it corrects, if it does.
+    pub filter: Option<Box<LearnedModel>>,
+    /// The value that pays most.
+    pub target: usize,
+}
+
+/// Alike where they believe alike.
+impl PartialEq for NeuralModel {
+    fn eq(&self, other: &Self) -> bool {
+        let parameters = |model: &Self| model.network.parameters().ok();
+        self.target == other.target
+            && self.filter == other.filter
+            && parameters(self) == parameters(other)
+    }
+}
+
+impl NeuralModel {
+    /// Before the first frame.
+    pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
+        estimator(&self.network, self.filter.as_deref(), shape)
+    }
+
+    /// Its parameters by name.
+    pub fn tensors(&self) -> Result<Vec<NamedTensor>> {
+        let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
+        let parameters = self.network.parameters()?.into_iter();
+        Ok(parameters.chain(filter).collect())
+    }
+}
+
+impl LearnedBelief for NeuralModel {
+    fn target(&self) -> usize {
+        self.target
+    }
+
+    fn n_states(&self) -> usize {
+        self.network.n_observations()
+    }
+
+    fn check_world(&self, world: &WorldForm) -> Result<()> {
+        world.check_observations(self.network.n_observations(), 1)?;
+        let mut filters = self.filter.iter();
+        filters.try_for_each(|filter| filter.check_world(world))
+    }
+}
+
+/// Before the first frame; a filter that the network corrects reaches the neighbours of visited cells.
+pub fn estimator(
+    network: &NeuralBelief,
+    filter: Option<&LearnedModel>,
+    shape: Shape,
+) -> Result<NeuralEstimator> {
+    let filter = filter.map(|it| it.estimator(true, shape));
+    Ok(NeuralEstimator::new(network, filter, shape)?)
+}
+
+/// A network whose parameters are still to be read; refuses numbers of observations that no world has.
+pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelief> {
+    let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
+    let fits = fits.contains(&n_observations);
+    check(fits, "n_observations", expected, n_observations)?;
+    Ok(NeuralBelief::new(n_observations, 0, device)?)
+}
+
+/// The tensors of a filter that a network corrects.
+pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTensor> + use<> {
+    let named = |(name, shape, numbers)| (format!("{FILTER}{name}"), shape, numbers);
+    filter.tensors().into_iter().map(named)
+}
+
+/// A filter that a network corrects, about so many observations.
+pub fn read_corrected(
+    saved: &SavedModel,
+    n_observations: usize,
+    part: &Part<'_>,
+) -> Result<LearnedModel> {
+    let (name, got) = ("filter.n_observations", saved.n_observations());
+    check(got == n_observations, name, n_observations, got)?;
+    saved.read(&part.part(FILTER))
+}
+
+/// A neural belief, without its tensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedNeuralModel {
+    n_observations: usize,
+    target: usize,
+    /// The filter that it corrects.
+    filter: Option<Box<SavedModel>>,
+}
+
+impl SavedNeuralModel {
+    pub fn of(model: &NeuralModel) -> Self {
+        let filter = model.filter.as_deref();
+        Self {
+            n_observations: model.network.n_observations(),
+            target: model.target,
+            filter: filter.map(|it| Box::new(SavedModel::of(it))),
+        }
+    }
+
+    /// With its tensors; the network computes on `device`.
+    pub fn read(&self, part: &Part<'_>, device: &Device) -> Result<NeuralModel> {
+        check_target(self.target, self.n_observations)?;
+        let mut network = new_network(self.n_observations, device)?;
+        network.set_parameters(|name: &str, shape: &[usize]| part.tensor(name, shape))?;
+        let filter = self.filter.as_ref();
+        let filter = filter.map(|it| read_corrected(it, self.n_observations, part));
+        Ok(NeuralModel {
+            network,
+            filter: filter.transpose()?.map(Box::new),
+            target: self.target,
+        })
+    }
+}
+
+pub struct NeuralEstimator {
+    network: NeuralBelief,
+    /// Whose belief the network corrects.
+    filter: Option<Box<dyn Estimator>>,
+    /// What that predicts, `[O, H, W]`.
+    base: Option<Probabilities>,
+    sightings: Sightings,
+    /// What frames of the present step will show; after a frame, what it showed at visited cells.
+    belief: Belief,
+    /// `P(y | x)`: a cell shows what it is believed to show.
+    likelihood: Array2<f64>,
+    /// Why the last prediction failed, if it did.
+    failure: Option<NetworkError>,
+}
+
+impl NeuralEstimator {
+    /// Before the first frame; `filter`: whose belief the network corrects, if it was learned so.
+    pub fn new(
+        network: &NeuralBelief,
+        filter: Option<Box<dyn Estimator>>,
+        shape: Shape,
+    ) -> Result<Self, NetworkError> {
+        let sightings = Sightings::new(shape);
+        let base = filter.as_deref().and_then(predicted_observations);
+        Ok(Self {
+            belief: predicted(network, base.as_ref(), &sightings)?,
+            network: network.clone(),
+            filter,
+            base,
+            sightings,
+            likelihood: Array2::eye(network.n_observations()),
+            failure: None,
+        })
+    }
+}
+
+impl Estimator for NeuralEstimator {
+    /// # Errors
+    /// Also if the prediction before failed.
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        if let Some(failure) = self.failure.take() {
+            return Err(EstimatorError::Network(failure.into()));
+        }
+        if let Some(filter) = &mut self.filter {
+            filter.correct(frame)?;
+        }
+        correct(&mut self.belief, &self.likelihood, frame)?;
+        self.sightings.see(frame);
+        Ok(())
+    }
+
+    fn predict(&mut self) {
+        self.sightings.pass();
+        if let Some(filter) = &mut self.filter {
+            filter.predict();
+            self.base = predicted_observations(&**filter);
+        }
+        match predicted(&self.network, self.base.as_ref(), &self.sightings) {
+            Ok(belief) => self.belief = belief,
+            Err(failure) => self.failure = Some(failure),
+        }
+    }
+
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        Some(Cow::Borrowed(&self.likelihood))
+    }
+
+    fn base(&self) -> Option<&Probabilities> {
+        self.base.as_ref()
+    }
+
+    fn handover(&self) -> Option<&dyn Handover> {
+        Some(self)
+    }
+
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
+        Some(self)
+    }
+}
+
+impl Handover for NeuralEstimator {
+    fn kind(&self) -> String {
+        let numbers = self.network.parameters().unwrap_or_default();
+        let numbers = numbers.iter().flat_map(|(_, _, numbers)| numbers);
+        let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
+        let checksum = crc32fast::hash(&bytes);
+        let filter = self.filter.as_ref().and_then(|it| it.handover());
+        let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
+        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let filter = self.filter.as_ref().and_then(|it| it.handover());
+        let filter = filter.map_or(Vec::new(), Handover::to_bytes);
+        [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
+    }
+
+    fn restore(&mut self, bytes: &[u8]) -> bool {
+        let dim = self.belief.probabilities().dim();
+        let n_bytes = 4 * self.belief.as_slice().len();
+        let Some((belief, rest)) = bytes.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let n_bytes = self.sightings.to_bytes().len();
+        let Some((sightings, rest)) = rest.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let belief = Belief::from_bytes(belief, dim);
+        let sightings = Sightings::from_bytes(sightings, self.sightings.shape(), dim.0);
+        let Some((belief, sightings)) = belief.zip(sightings) else {
+            return false;
+        };
+        let filter = self.filter.as_mut().and_then(|it| it.handover_mut());
+        if !filter.map_or(rest.is_empty(), |filter| filter.restore(rest)) {
+            return false;
+        }
+        self.base = self.filter.as_deref().and_then(predicted_observations);
+        (self.belief, self.sightings, self.failure) = (belief, sightings, None);
+        true
+    }
+}
+
+fn predicted(
+    network: &NeuralBelief,
+    base: Option<&Probabilities>,
+    sightings: &Sightings,
+) -> Result<Belief, NetworkError> {
+    let probabilities = network.predict(sightings, base)?;
+    let belief = Belief::from_probabilities(probabilities);
+    Ok(belief.expect("invariant: a softmax is on the simplex"))
+}
+
+/// What an estimator whose belief is about X_{k+1} expects frames to show, `[O, H, W]`.
+fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
+    let likelihood = estimator.likelihood()?;
+    Some(observations(estimator.belief(), &likelihood))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_network::Device;
+
+    fn estimator() -> NeuralEstimator {
+        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+        NeuralEstimator::new(&network, None, shape()).expect("a belief")
+    }
+
+    fn shape() -> Shape {
+        Shape::new(2, 3).expect("test shape")
+    }
+
+    fn frame(values: &[u8]) -> Frame {
+        Frame::from_bytes(shape(), 3, values).expect("test frame")
+    }
+
+    #[test]
+    fn visited_cells_are_what_they_showed_until_the_next_step() {
+        let mut estimator = estimator();
+        let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
+        assert!(
+            value(&estimator, 1)
+                .iter()
+                .all(|p| (p - 1.0 / 3.0).abs() < 1e-6)
+        );
+        let seen = frame(&[255, 2, 255, 255, 255, 255]);
+        estimator.correct(&seen).expect("possible");
+        assert_eq!(value(&estimator, 1), [0.0, 0.0, 1.0]);
+        assert!((value(&estimator, 0)[2] - 1.0 / 3.0).abs() < 1e-6);
+        estimator.predict();
+        assert!(
+            (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
+            "nothing is learned"
+        );
+    }
+
+    #[test]
+    fn another_goes_on_from_its_bytes() {
+        let (mut first, mut second) = (estimator(), estimator());
+        for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
+            first.correct(&frame(&values)).expect("possible");
+            first.predict();
+        }
+        let bytes = first.to_bytes();
+        assert!(!second.restore(&bytes[1..]) && second.sightings == Sightings::new(shape()));
+        assert!(second.restore(&bytes));
+        assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
+        let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
+        let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
+        assert_ne!(other.kind(), first.kind());
+    }
+}

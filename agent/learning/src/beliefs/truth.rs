@@ -1,0 +1,38 @@
+//! Beliefs of policies that are told the hidden states, and of one that believes the same for ever.
+
+use super::kind::{BeliefKind, Input};
+use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
+
+pub const NONE: BeliefKind = BeliefKind {
+    name: "none",
+    label: "none",
+    about: "the first belief, for ever",
+    input: Input::Nothing,
+    knows_model: false,
+    learned_by: None,
+    chart: ("no belief", [0xa3, 0xa3, 0xa3]),
+    handover: None,
+    build: |conditions| Ok(Box::new(Unchanging(conditions.prior()?))),
+};
+
+pub const TRUTH: BeliefKind = BeliefKind {
+    name: "truth",
+    label: "truth",
+    about: "the hidden states, predicted one step ahead; needs a server with --publish-truth",
+    input: Input::States,
+    chart: ("fed with the truth", [0xe6, 0x9f, 0x00]),
+    build: |conditions| {
+        let oracle = Oracle::new(conditions.model()?, conditions.prior()?)?;
+        Ok(Box::new(oracle))
+    },
+    ..NONE
+};
+
+pub const NEXT_TRUTH: BeliefKind = BeliefKind {
+    name: "next_truth",
+    label: "next_truth",
+    about: "the hidden states that the path will meet; only in `compare`",
+    input: Input::NextStates,
+    build: |conditions| Ok(Box::new(Clairvoyant(conditions.prior()?))),
+    ..TRUTH
+};

@@ -1,0 +1,282 @@
+//! The operator `Phi_w` (paper eqs. 2 and 3, without bias) for dense kernels, and its derivatives.
+//!
+//! Forward, `v[m] = sum_n sum_a w[m, n, a] p[n, . + a]` and `u = v / sum_m v`. Backward, from
+//! `g = dL/du`: `h = dL/dv = (g - sum_m g[m] u[m]) / sum_m v`; `dL/dw[m, n, a] = sum_cells h[m]
+//! p[n, . + a]`; `dL/dp` is the correlation of `h` with the kernel turned and its states exchanged.
+//!
+//! Where each state `o` that a cell itself can be in has a kernel of its own, whose centre sees `o` itself:
+//! `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with `d[o] = sum_m g[m] q[o, m]`:
+//! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has `d[o]` too.
+
+use crate::gradient::convolution::{Base, Convolution, Region, load, store};
+use crate::gradient::layout::Layout;
+use pulp::Simd;
+use std::ops::Range;
+
+/// Weights `w[to, from, row, col]`, or `w[own, to, from, row, col]`, laid out for a grid.
+#[derive(Debug, Clone)]
+pub(super) struct Operator {
+    pub(super) layout: Layout,
+    forward: Convolution,
+    backward: Convolution,
+    /// Where kernels see the cell's own state: the weights of their centres, `[own, to]`.
+    centres: Option<Vec<f32>>,
+    mask: Vec<f32>,
+}
+
+impl Operator {
+    pub(super) fn new(layout: Layout, n_own: usize, weights: &[f32]) -> Self {
+        let mut weights = weights.to_vec();
+        let centres = (n_own > 1).then(|| take_centres(&layout, &mut weights));
+        let forward = Convolution::new(layout, layout.n_states, weights);
+        Self {
+            layout,
+            backward: forward.turned(),
+            forward,
+            centres,
+            mask: layout.mask(),
+        }
+    }
+
+    /// Planes of `v` and `h`.
+    pub(super) fn weighed_planes(&self) -> Vec<f32> {
+        vec![0.0; self.forward.n_to() * self.layout.plane]
+    }
+
+    /// `u = Phi_w(p)` in planes. Of a kernel of all cells `factors` (one plane) gets `1 / sum_m v`, 0 beside the
+    /// grid; of others `v` is room.
+    #[inline(always)]
+    pub(super) fn forward<S: Simd>(
+        &self,
+        simd: S,
+        p: &[f32],
+        u: &mut [f32],
+        factors: &mut [f32],
+        v: &mut [f32],
+    ) {
+        for row in 0..self.layout.shape.height() {
+            match &self.centres {
+                None => {
+                    self.forward.row(simd, p, u, Base::Zero, row);
+                    self.normalise(simd, u, factors, row);
+                }
+                Some(centres) => {
+                    self.forward.row(simd, p, v, Base::Biases(centres), row);
+                    self.mix(simd, p, v, u, row);
+                }
+            }
+        }
+    }
+
+    /// `h` from `g` in some rows and columns; `g` becomes `d`, and `u` is no more, where kernels see the cell's own state.
+    #[inline(always)]
+    pub(super) fn backward_normalise<S: Simd>(
+        &self,
+        simd: S,
+        p: &[f32],
+        u: &mut [f32],
+        factors: &[f32],
+        (g, h): (&mut [f32], &mut [f32]),
+        region: &Region,
+    ) {
+        for row in region.rows.clone() {
+            match &self.centres {
+                None => {
+                    for at in region.places::<S>(&self.layout, row) {
+                        self.unnormalise(simd, g, u, factors, h, at);
+                    }
+                }
+                Some(centres) => {
+                    // Whole rows: h is 0 where g is.
+                    self.forward.row(simd, p, h, Base::Biases(centres), row);
+                    self.unmix(simd, p, u, g, h, row);
+                }
+            }
+        }
+    }
+
+    /// Adds `dL/dw` of some rows and columns of `h` to `gradient`; [`Self::end_gradient`] is still to come.
+    #[inline(always)]
+    pub(super) fn add_weight_gradient<S: Simd>(
+        &self,
+        simd: S,
+        p: &[f32],
+        h: &[f32],
+        region: &Region,
+        gradient: &mut [f64],
+    ) {
+        self.forward
+            .add_weight_gradient(simd, p, h, region, gradient);
+    }
+
+    /// A centre that sees the cell's own state has the sum of `h` as its derivative. As beliefs sum to one, that is the sum
+    /// of what the states that it could see have.
+    pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
+        if self.centres.is_some() {
+            end_gradient(&self.layout, gradient);
+        }
+    }
+
+    /// `dL/dp` from `h`, and from `d` in `g`, in some rows.
+    #[inline(always)]
+    pub(super) fn backward_correlate<S: Simd>(
+        &self,
+        simd: S,
+        h: &[f32],
+        g: &mut [f32],
+        rows: Range<usize>,
+    ) {
+        let base = match self.centres {
+            None => Base::Zero,
+            Some(_) => Base::Planes,
+        };
+        for row in rows {
+            self.backward.row(simd, h, g, base, row);
+        }
+    }
+
+    /// One row of eq. 3.
+    #[inline(always)]
+    fn normalise<S: Simd>(&self, simd: S, u: &mut [f32], factors: &mut [f32], row: usize) {
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
+            let at = self.layout.row(row) + col;
+            let factor = self.factor(simd, u, 0, at, col);
+            store::<S>(factor, factors, at);
+            for state in 0..self.layout.n_states {
+                let at = state * self.layout.plane + at;
+                store::<S>(simd.mul_f32s(load::<S>(u, at), factor), u, at);
+            }
+        }
+    }
+
+    /// The reverse of [`Self::normalise`], for the cells from a place on: `h`.
+    #[inline(always)]
+    fn unnormalise<S: Simd>(
+        &self,
+        simd: S,
+        g: &[f32],
+        u: &[f32],
+        factors: &[f32],
+        h: &mut [f32],
+        at: usize,
+    ) {
+        let places = (0..self.layout.n_states).map(|state| state * self.layout.plane + at);
+        let mut mean = simd.splat_f32s(0.0);
+        for at in places.clone() {
+            mean = simd.mul_add_e_f32s(load::<S>(g, at), load::<S>(u, at), mean);
+        }
+        let factor = load::<S>(factors, at);
+        for at in places {
+            let over_mean = simd.sub_f32s(load::<S>(g, at), mean);
+            store::<S>(simd.mul_f32s(over_mean, factor), h, at);
+        }
+    }
+
+    /// One row of `u` from `v`, by the cell's own state.
+    #[inline(always)]
+    fn mix<S: Simd>(&self, simd: S, p: &[f32], v: &[f32], u: &mut [f32], row: usize) {
+        let Layout {
+            n_states, plane, ..
+        } = self.layout;
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
+            let at = self.layout.row(row) + col;
+            for state in 0..n_states {
+                store::<S>(simd.splat_f32s(0.0), u, state * plane + at);
+            }
+            for own in 0..n_states {
+                let first = own * n_states;
+                let p = load::<S>(p, own * plane + at);
+                let share = simd.mul_f32s(p, self.factor(simd, v, first, at, col));
+                for state in 0..n_states {
+                    let v = load::<S>(v, (first + state) * plane + at);
+                    let sum = load::<S>(u, state * plane + at);
+                    let sum = simd.mul_add_e_f32s(v, share, sum);
+                    store::<S>(sum, u, state * plane + at);
+                }
+            }
+        }
+    }
+
+    /// The reverse of [`Self::mix`]: `h` in the place of `v`, and `d` in that of `g`.
+    #[inline(always)]
+    fn unmix<S: Simd>(
+        &self,
+        simd: S,
+        p: &[f32],
+        d: &mut [f32],
+        g: &mut [f32],
+        h: &mut [f32],
+        row: usize,
+    ) {
+        let Layout {
+            n_states, plane, ..
+        } = self.layout;
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
+            let at = self.layout.row(row) + col;
+            for own in 0..n_states {
+                let first = own * n_states;
+                let factor = self.factor(simd, h, first, at, col);
+                let mut mean = simd.splat_f32s(0.0);
+                for state in 0..n_states {
+                    let g = load::<S>(g, state * plane + at);
+                    let v = load::<S>(h, (first + state) * plane + at);
+                    mean = simd.mul_add_e_f32s(g, simd.mul_f32s(v, factor), mean);
+                }
+                store::<S>(mean, d, own * plane + at);
+                let share = simd.mul_f32s(factor, load::<S>(p, own * plane + at));
+                for state in 0..n_states {
+                    let over_mean = simd.sub_f32s(load::<S>(g, state * plane + at), mean);
+                    let h_at = (first + state) * plane + at;
+                    store::<S>(simd.mul_f32s(over_mean, share), h, h_at);
+                }
+            }
+            for state in 0..n_states {
+                store::<S>(load::<S>(d, state * plane + at), g, state * plane + at);
+            }
+        }
+    }
+
+    /// `1 / sum_m v` of the planes from `first` on, 0 beside the grid.
+    #[inline(always)]
+    fn factor<S: Simd>(&self, simd: S, v: &[f32], first: usize, at: usize, col: usize) -> S::f32s {
+        let mask = load::<S>(&self.mask, col);
+        // Beside the grid the sum may be 0, where no factor is wanted.
+        let mut total = simd.sub_f32s(simd.splat_f32s(1.0), mask);
+        for state in first..first + self.layout.n_states {
+            total = simd.add_f32s(total, load::<S>(v, state * self.layout.plane + at));
+        }
+        simd.div_f32s(mask, total)
+    }
+}
+
+/// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
+/// all states that it could see.
+fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
+    let (n_states, n_taps) = (layout.n_states, layout.n_taps());
+    (0..n_states * n_states).map(move |weighed| {
+        let place = |from| (weighed * n_states + from) * n_taps + n_taps / 2;
+        (
+            place(weighed / n_states),
+            (0..n_states).map(place).collect(),
+        )
+    })
+}
+
+/// Takes the weights of centres that see the cell's own state out of kernels, `[own, to]`; zeros are left.
+fn take_centres(layout: &Layout, weights: &mut [f32]) -> Vec<f32> {
+    let take = |(own, all): (usize, Vec<usize>)| {
+        let weight = weights[own];
+        all.into_iter().for_each(|at| weights[at] = 0.0);
+        weight
+    };
+    centres(layout).map(take).collect()
+}
+
+/// [`Operator::end_gradient`] of kernels that see the cell's own state.
+fn end_gradient(layout: &Layout, gradient: &mut [f64]) {
+    for (own, all) in centres(layout) {
+        let sum: f64 = all.iter().map(|&at| gradient[at]).sum();
+        all.into_iter().for_each(|at| gradient[at] = 0.0);
+        gradient[own] = sum;
+    }
+}

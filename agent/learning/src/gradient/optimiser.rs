@@ -1,0 +1,316 @@
+//! Updates of the unknown parameters from what the replay holds.
+//!
+//! As many streams as there are windows in an update run through the replay's blocks in random
+//! order, each with the belief that it has come to; at the end of a block that belief is handed on
+//! to the block after it. So every window starts from a belief that knows the frames before it,
+//! though gradients only run back through the window.
+
+use crate::checkpoint::{check, check_counts, check_numbers};
+use crate::config::LearningConfig;
+use crate::gradient::adam::Adam;
+use crate::gradient::recursion::{Outcome, Recursion};
+use crate::replay::{Block, BlockReplay};
+use anyhow::{Result, anyhow};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_model::Shape;
+use emberwatch_model::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Parts that the streams are dealt into, each with its own work space: as many threads are of use.
+/// The parts do not depend on the number of threads, nor does the order in which gradients are added.
+const N_PARTS: usize = 8;
+
+/// Learns the parameters; holds all that a later update depends on but the replay.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Optimiser {
+    parameters: Parameters,
+    pub adam: Adam,
+    config: LearningConfig,
+    seed: u64,
+    pub shape: Shape,
+    pub(crate) streams: Vec<Stream>,
+    /// Blocks still to be run through in this lap.
+    lap: Vec<u64>,
+    n_laps: u64,
+    #[serde(skip)]
+    recursions: Vec<Recursion>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Update {
+    pub number: u64,
+    /// Minus the mean log-likelihood of a visited cell, before the update.
+    pub loss: f64,
+    pub rate: f64,
+}
+
+/// A place in the replay, and the belief before the frame there.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Stream {
+    block: Option<u64>,
+    n_done: usize,
+    belief: Vec<f32>,
+    /// Room for the belief after the next window.
+    #[serde(skip)]
+    end: Vec<f32>,
+}
+
+impl Optimiser {
+    /// Before the first update; the streams are not yet in any block.
+    pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
+        let tables = parameters.tables();
+        let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
+        let stream = Stream {
+            block: None,
+            n_done: 0,
+            belief: numbers.clone(),
+            end: numbers,
+        };
+        Self {
+            adam: Adam::new(parameters.dimensions),
+            parameters,
+            config,
+            seed,
+            shape,
+            streams: vec![stream; config.streams],
+            lap: Vec::new(),
+            n_laps: 0,
+            recursions: vec![Recursion::new(tables, shape, config.window); N_PARTS],
+        }
+    }
+
+    /// Goes on from another's parameters; where its streams were if it was cut the same way.
+    ///
+    /// # Errors
+    /// Names what no such streams have.
+    pub fn resume(&mut self, other: Self) -> Result<()> {
+        if self.cut() == other.cut() {
+            self.resume_streams(other.streams)?;
+            check_counts(&[("n_laps", other.n_laps)])?;
+            (self.lap, self.n_laps) = (other.lap, other.n_laps);
+        } else {
+            self.n_laps = other.adam.n_steps;
+        }
+        (self.parameters, self.adam) = (other.parameters, other.adam);
+        Ok(())
+    }
+
+    fn resume_streams(&mut self, mut streams: Vec<Stream>) -> Result<()> {
+        let (expected, got) = (self.streams.len(), streams.len());
+        check(got == expected, "streams", expected, got)?;
+        let length = self.dimensions().n_states * self.shape.n_cells();
+        for stream in &mut streams {
+            let (most, got) = (self.config.block_windows, stream.n_done);
+            let expected = format!("at most {most} windows of a block");
+            check(got <= most, "streams.n_done", expected, got)?;
+            check_numbers("streams.belief", &stream.belief, length)?;
+            stream.end = vec![0.0; length];
+        }
+        self.streams = streams;
+        Ok(())
+    }
+
+    /// Grid, window, windows of a block, streams: what places in a replay depend on.
+    pub fn cut(&self) -> (Shape, [usize; 3]) {
+        let config = &self.config;
+        let cut = [config.window, config.block_windows, config.streams];
+        (self.shape, cut)
+    }
+
+    pub fn config(&self) -> &LearningConfig {
+        &self.config
+    }
+
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    pub fn set_parameters(&mut self, parameters: Parameters) {
+        self.parameters = parameters;
+    }
+
+    pub fn dimensions(&self) -> Dimensions {
+        self.parameters.dimensions
+    }
+
+    /// One update; `None` while the replay has no block for each stream, or nothing was seen.
+    /// `sure`: the state to be seen almost surely.
+    ///
+    /// # Errors
+    /// For numbers that are not finite; the parameters are then as they were.
+    pub fn update(
+        &mut self,
+        replay: &mut BlockReplay,
+        sure: Option<usize>,
+    ) -> Result<Option<Update>> {
+        if replay.n_blocks() < self.streams.len() {
+            return Ok(None);
+        }
+        if let Some(tensor) = self.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a parameter that is not"));
+        }
+        self.place_streams(replay);
+        let outcomes = self.run_windows(replay);
+        let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
+        // Before a belief that is not finite gets into the replay.
+        if !log_likelihood.is_finite() {
+            return Err(self.wrong("loss", "a sum that is not"));
+        }
+        self.move_streams(replay);
+        if n_seen == 0 {
+            return Ok(None);
+        }
+        gradient
+            .iter_mut()
+            .flatten()
+            .for_each(|slope| *slope /= n_seen as f64);
+        if let Some(state) = sure {
+            self.add_anchor(state, &mut gradient[1]);
+        }
+        let loss = -log_likelihood / n_seen as f64;
+        self.step(loss, &gradient).map(Some)
+    }
+
+    /// Takes the streams out of their blocks: the replay is another.
+    pub fn leave_replay(&mut self) {
+        self.lap.clear();
+        self.streams
+            .iter_mut()
+            .for_each(|stream| stream.block = None);
+    }
+
+    /// Gives streams at the end of a block, or whose block is gone, another one.
+    fn place_streams(&mut self, replay: &BlockReplay) {
+        for index in 0..self.streams.len() {
+            let stream = &self.streams[index];
+            let block = stream.block.and_then(|number| replay.block(number));
+            if block.is_none_or(|block| stream.n_done >= self.n_windows(block)) {
+                let (number, block) = self.next_block(replay);
+                let stream = &mut self.streams[index];
+                (stream.block, stream.n_done) = (Some(number), 0);
+                if let Some(start) = &block.start {
+                    stream.belief.clone_from(start);
+                }
+            }
+        }
+    }
+
+    /// Windows of a block, the last of which may be shorter.
+    fn n_windows(&self, block: &Block) -> usize {
+        block.frames.len().div_ceil(self.config.window)
+    }
+
+    /// The next block of the lap, or the first of a new lap through all blocks.
+    fn next_block<'a>(&mut self, replay: &'a BlockReplay) -> (u64, &'a Block) {
+        loop {
+            match self.lap.pop() {
+                Some(number) => {
+                    if let Some(block) = replay.block(number) {
+                        return (number, block);
+                    }
+                }
+                None => {
+                    self.lap = replay.blocks().collect();
+                    shuffle(&mut self.lap, self.seed, self.n_laps);
+                    self.n_laps += 1;
+                }
+            }
+        }
+    }
+
+    fn run_windows(&mut self, replay: &BlockReplay) -> Vec<Outcome> {
+        let tables = self.parameters.tables();
+        let length = self.config.window;
+        let part = self.streams.len().div_ceil(N_PARTS);
+        let parts = self.streams.par_chunks_mut(part).zip(&mut self.recursions);
+        let outcomes = parts.flat_map_iter(|(streams, recursion)| {
+            recursion.set(&tables);
+            streams.iter_mut().filter_map(move |stream| {
+                let block = replay.block(stream.block?)?;
+                let first = stream.n_done * length;
+                let is_first = block.start.is_none() && first == 0;
+                let start = (!is_first).then_some(&*stream.belief);
+                let end = block.frames.len().min(first + length);
+                Some(recursion.run(start, &block.frames[first..end], &mut stream.end))
+            })
+        });
+        outcomes.collect()
+    }
+
+    fn move_streams(&mut self, replay: &mut BlockReplay) {
+        let length = self.config.window;
+        for stream in &mut self.streams {
+            std::mem::swap(&mut stream.belief, &mut stream.end);
+            stream.n_done += 1;
+            if let Some(number) = stream.block
+                && let Some(block) = replay.block(number)
+                && stream.n_done * length >= block.frames.len()
+            {
+                replay.hand_on(number, &stream.belief);
+            }
+        }
+    }
+
+    /// The prior `anchor * ln P(y | x)` on the observation that a state shows most: "there is a
+    /// state which is observable with negligible uncertainties" (paper section III.E, remark), from the path.
+    fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
+        let dimensions = self.dimensions();
+        let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());
+        let likelihood = self.parameters.likelihood();
+        let row = &likelihood[state * n_observations..][..n_of_matrix];
+        let shown = (0..n_of_matrix).max_by(|&a, &b| row[a].total_cmp(&row[b]));
+        if let Some(shown) = shown {
+            by_likelihood[state * n_observations + shown] -= self.config.anchor / row[shown];
+        }
+    }
+
+    fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update> {
+        let number = self.adam.n_steps + 1;
+        let gradient = self.parameters.chain(by_tables);
+        if let Some(tensor) = gradient.not_finite() {
+            return Err(self.wrong(tensor, "a gradient that is not"));
+        }
+        let rate = self.config.rate * self.config.rate_at(number - 1);
+        let observation_rate = rate * self.config.observation_rate;
+        let rates = [rate, observation_rate, observation_rate];
+        let betas = [self.config.beta1, self.config.beta2];
+        let (mut parameters, mut adam) = (self.parameters.clone(), self.adam.clone());
+        adam.step(&mut parameters, &gradient, rates, betas);
+        if let Some(tensor) = parameters.not_finite() {
+            return Err(self.wrong(tensor, "a step to a number that is not"));
+        }
+        parameters.bound();
+        (self.parameters, self.adam) = (parameters, adam);
+        Ok(Update { number, loss, rate })
+    }
+
+    /// What the update under way met.
+    fn wrong(&self, tensor: &str, what: &str) -> anyhow::Error {
+        let update = self.adam.n_steps + 1;
+        anyhow!("update {update}: {tensor}: expected finite numbers, got {what}")
+    }
+}
+
+/// Sums in the order of the streams.
+fn add_up(outcomes: &[Outcome], dimensions: Dimensions) -> (f64, usize, [Vec<f64>; 3]) {
+    let mut gradient = dimensions.lengths().map(|length| vec![0.0; length]);
+    let (mut log_likelihood, mut n_seen) = (0.0, 0);
+    for outcome in outcomes {
+        log_likelihood += outcome.log_likelihood;
+        n_seen += outcome.n_seen;
+        let slopes = outcome.gradient.iter().flatten();
+        let sums = gradient.iter_mut().flatten();
+        sums.zip(slopes).for_each(|(sum, slope)| *sum += slope);
+    }
+    (log_likelihood, n_seen, gradient)
+}
+
+fn shuffle(numbers: &mut [u64], seed: u64, lap: u64) {
+    let mut random = stream(seed, Purpose::Learner, lap);
+    for last in (1..numbers.len()).rev() {
+        let other = random.next_u64() % (last as u64 + 1);
+        numbers.swap(last, other as usize);
+    }
+}

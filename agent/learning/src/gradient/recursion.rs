@@ -1,0 +1,258 @@
+//! One stream through one window of frames: the filter's recursion forward, its derivatives backward.
+//!
+//! Forward, for each frame: `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then `u = Phi_w(p)`
+//! (eq. 6). The value is the sum of `ln b(y)' u` over visited cells: how well each frame was
+//! predicted. Backward runs the same steps in reverse and stops at the window's first predictor
+//! (truncated backpropagation). Gradients are zero far from the cells that later frames visit, and
+//! only the region where they are not is computed.
+
+use crate::gradient::convolution::Region;
+use crate::gradient::layout::Layout;
+use crate::gradient::operator::Operator;
+use crate::replay::Sighting;
+use emberwatch_belief::estimation::parameters::Tables;
+use emberwatch_model::Shape;
+use pulp::{Arch, Simd, WithSimd};
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome {
+    /// Derivatives of `-log_likelihood` by the kernel, the likelihood and the first belief.
+    pub gradient: [Vec<f64>; 3],
+    /// Sum of `ln P(y)` over visited cells.
+    pub log_likelihood: f64,
+    pub n_seen: usize,
+}
+
+/// The recursion with its work space: give each thread its own.
+#[derive(Debug, Clone)]
+pub struct Recursion {
+    operator: Operator,
+    tables: Tables,
+    /// Posteriors of each frame, and the predictor after the last.
+    planes: Vec<Vec<f32>>,
+    /// One over the weights' sums behind each of them.
+    factors: Vec<Vec<f32>>,
+    seen: Vec<Visit>,
+    /// Predictors of the seen cells before their correction, S of each.
+    predictors: Vec<f32>,
+    /// `dL/dp` or `dL/du`; `dL/dv`, and forward room for `v`.
+    by_belief: Vec<f32>,
+    by_weights: Vec<f32>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Visit {
+    frame: usize,
+    cell: usize,
+    place: usize,
+    value: usize,
+}
+
+impl Recursion {
+    /// For windows of up to `n_frames` frames.
+    pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
+        let dimensions = tables.dimensions;
+        let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
+        let operator = Operator::new(layout, dimensions.n_own(), &tables.kernel);
+        Self {
+            by_weights: operator.weighed_planes(),
+            operator,
+            tables,
+            planes: vec![layout.planes(); n_frames + 1],
+            factors: vec![vec![0.0; layout.plane]; n_frames + 1],
+            seen: Vec::new(),
+            predictors: Vec::new(),
+            by_belief: layout.planes(),
+        }
+    }
+
+    /// Takes other parameters of the same dimensions.
+    pub fn set(&mut self, tables: &Tables) {
+        let n_own = tables.dimensions.n_own();
+        self.operator = Operator::new(self.operator.layout, n_own, &tables.kernel);
+        self.tables.clone_from(tables);
+    }
+
+    /// Runs over frames from the belief `[S, H, W]` that an earlier window ended with, or from the first belief, which
+    /// learns too; `end` gets the predictor after the last.
+    ///
+    /// # Panics
+    /// If there are more frames than there is room for, or cells off the grid.
+    pub fn run(
+        &mut self,
+        start: Option<&[f32]>,
+        frames: &[Vec<Sighting>],
+        end: &mut [f32],
+    ) -> Outcome {
+        Arch::new().dispatch(Pass {
+            recursion: self,
+            start,
+            frames,
+            end,
+        })
+    }
+
+    fn begin(&mut self, start: Option<&[f32]>) {
+        let layout = self.operator.layout;
+        let first = || self.tables.prior(layout.shape).as_slice().to_vec();
+        let belief = start.map_or_else(first, <[f32]>::to_vec);
+        layout.load(&belief, &mut self.planes[0]);
+        self.seen.clear();
+        self.predictors.clear();
+    }
+
+    /// Eq. 5 on a frame's cells; returns the sum of `ln b(y)' u`.
+    fn correct(&mut self, frame: usize, sightings: &[Sighting]) -> f64 {
+        let layout = self.operator.layout;
+        let n_states = layout.n_states;
+        let n_observations = self.tables.dimensions.n_observations;
+        let planes = &mut self.planes[frame];
+        let mut log_likelihood = 0.0;
+        for sighting in sightings {
+            let (cell, value) = (sighting.cell as usize, usize::from(sighting.value));
+            let place = layout.place(cell);
+            let seen_as = |state: usize| self.tables.likelihood[state * n_observations + value];
+            let mut evidence = 0.0;
+            for state in 0..n_states {
+                let u = planes[state * layout.plane + place];
+                self.predictors.push(u);
+                evidence += u * seen_as(state);
+            }
+            for state in 0..n_states {
+                let p = &mut planes[state * layout.plane + place];
+                *p = *p * seen_as(state) / evidence;
+            }
+            log_likelihood += f64::from(evidence).ln();
+            self.seen.push(Visit {
+                frame,
+                cell,
+                place,
+                value,
+            });
+        }
+        log_likelihood
+    }
+
+    /// Eq. 6.
+    #[inline(always)]
+    fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
+        let (before, after) = self.planes.split_at_mut(frame + 1);
+        let factors = &mut self.factors[frame + 1];
+        let weights = &mut self.by_weights;
+        let (p, u) = (&before[frame], &mut after[0]);
+        self.operator.forward(simd, p, u, factors, weights);
+    }
+
+    #[inline(always)]
+    fn backward<S: Simd>(&mut self, simd: S, n_frames: usize, outcome: &mut Outcome) {
+        self.by_belief.fill(0.0);
+        self.by_weights.fill(0.0);
+        let mut region = Region::default();
+        for frame in (0..n_frames).rev() {
+            self.uncorrect(frame, outcome, &mut region);
+            if frame > 0 && !region.rows.is_empty() {
+                region = self.unpredict(simd, frame, &region, outcome);
+            }
+        }
+    }
+
+    /// Eq. 5 backward: `dL/dp` of a frame's cells becomes `dL/du`, and their predictors are put back.
+    fn uncorrect(&mut self, frame: usize, outcome: &mut Outcome, region: &mut Region) {
+        let layout = self.operator.layout;
+        let (n_states, width) = (layout.n_states, layout.shape.width());
+        let n_observations = self.tables.dimensions.n_observations;
+        let planes = &mut self.planes[frame];
+        while let Some(seen) = self.seen.pop_if(|seen| seen.frame == frame) {
+            region.add(seen.cell / width, seen.cell % width);
+            let first = self.predictors.len() - n_states;
+            let at = |state: usize| state * layout.plane + seen.place;
+            let entry = |state: usize| state * n_observations + seen.value;
+            let (mut evidence, mut mean) = (0.0, 0.0);
+            for state in 0..n_states {
+                evidence += self.predictors[first + state] * self.tables.likelihood[entry(state)];
+                mean += self.by_belief[at(state)] * planes[at(state)];
+            }
+            for state in 0..n_states {
+                let u = self.predictors[first + state];
+                // The 1 is of -ln(evidence) itself.
+                let by_joint = (self.by_belief[at(state)] - mean - 1.0) / evidence;
+                outcome.gradient[1][entry(state)] += f64::from(by_joint * u);
+                self.by_belief[at(state)] = by_joint * self.tables.likelihood[entry(state)];
+                planes[at(state)] = u;
+            }
+            self.predictors.truncate(first);
+        }
+    }
+
+    /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
+    #[inline(always)]
+    fn unpredict<S: Simd>(
+        &mut self,
+        simd: S,
+        frame: usize,
+        region: &Region,
+        outcome: &mut Outcome,
+    ) -> Region {
+        let (before, after) = self.planes.split_at_mut(frame);
+        let (p, u, factors) = (&before[frame - 1], &mut after[0], &self.factors[frame]);
+        let (g, h) = (&mut self.by_belief, &mut self.by_weights);
+        let operator = &self.operator;
+        operator.backward_normalise(simd, p, u, factors, (g, h), region);
+        operator.add_weight_gradient(simd, p, h, region, &mut outcome.gradient[0]);
+        let reached = region.reached(&operator.layout);
+        operator.backward_correlate(simd, h, g, reached.rows.clone());
+        reached
+    }
+
+    /// The gradient of the first belief, which is the same in every cell.
+    fn add_initial_gradient(&self, outcome: &mut Outcome) {
+        let layout = self.operator.layout;
+        for row in 0..layout.shape.height() {
+            for (state, sum) in outcome.gradient[2].iter_mut().enumerate() {
+                let at = state * layout.plane + layout.row(row);
+                let cells = &self.by_belief[at..][..layout.shape.width()];
+                *sum += cells.iter().map(|&x| f64::from(x)).sum::<f64>();
+            }
+        }
+    }
+}
+
+/// One call of [`Recursion::run`].
+struct Pass<'a> {
+    recursion: &'a mut Recursion,
+    start: Option<&'a [f32]>,
+    frames: &'a [Vec<Sighting>],
+    end: &'a mut [f32],
+}
+
+/// All of it is inlined, down to the innermost loop, to be compiled for the vectors of each kind of processor. Results
+/// may differ in the last bits between these kinds, never between runs or numbers of threads on one.
+impl WithSimd for Pass<'_> {
+    type Output = Outcome;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Outcome {
+        let (recursion, n_frames) = (self.recursion, self.frames.len());
+        let mut outcome = Outcome {
+            gradient: recursion.tables.dimensions.lengths().map(|n| vec![0.0; n]),
+            log_likelihood: 0.0,
+            n_seen: 0,
+        };
+        recursion.begin(self.start);
+        for (frame, sightings) in self.frames.iter().enumerate() {
+            outcome.log_likelihood += recursion.correct(frame, sightings);
+            outcome.n_seen += sightings.len();
+            recursion.predict(simd, frame);
+        }
+        recursion
+            .operator
+            .layout
+            .unload(&recursion.planes[n_frames], self.end);
+        recursion.backward(simd, n_frames, &mut outcome);
+        recursion.operator.end_gradient(&mut outcome.gradient[0]);
+        if self.start.is_none() {
+            recursion.add_initial_gradient(&mut outcome);
+        }
+        outcome
+    }
+}

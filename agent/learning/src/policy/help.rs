@@ -1,0 +1,62 @@
+//! What policies are made of, a line each, for `--help` and `--policies help`.
+
+use super::names::{GOALS, NAMED, OPTION_GOALS};
+use super::parts::Goal;
+use super::planners::PLANNERS;
+use crate::beliefs::BELIEFS;
+use emberwatch_belief::planning::options::OPTIONS;
+
+/// The parts of policies and what each means, then the names of some.
+pub fn help() -> String {
+    let goals = |goals: &'static [(Goal, &str, &str)]| {
+        let goals = goals.iter();
+        goals.map(|(_, name, about)| (*name, *about))
+    };
+    let state = ("STATE", "a state of the model, by its name");
+    let options = OPTIONS.iter().map(|option| (option.name, option.about));
+    let sections = [
+        section("BELIEF", BELIEFS.iter().map(|it| (it.name, it.about))),
+        section("PLANNER", PLANNERS.iter().map(|it| (it.name, it.about))),
+        section("GOAL", goals(GOALS).chain([state])),
+        section(
+            "GOAL of the planner options",
+            goals(OPTION_GOALS).chain(options),
+        ),
+        section("Names", NAMED.iter().copied()),
+    ];
+    format!(
+        "A policy is BELIEF/PLANNER/GOAL, such as learned+spatial/beam/exploit, or one of the names below.\n{}",
+        sections.concat()
+    )
+}
+
+/// `lines`: what each is about, by its name.
+fn section(title: &str, lines: impl Iterator<Item = (&'static str, &'static str)>) -> String {
+    let lines: Vec<_> = lines.collect();
+    let width = lines.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    let lines = lines.iter();
+    let lines = lines.map(|(name, about)| format!("  {name:width$}  {about}\n"));
+    format!("{title}:\n{}", lines.collect::<String>())
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn each_part_has_a_line() {
+        let help = super::help();
+        let names: Vec<&str> = help
+            .lines()
+            .filter_map(|line| line.split_whitespace().next())
+            .collect();
+        for name in [
+            "known+spatial",
+            "ahead",
+            "exploit_only",
+            "best_region",
+            "oracle_policy",
+        ] {
+            assert!(names.contains(&name), "{help}");
+        }
+        assert!(help.lines().all(|line| line.len() <= 120), "{help}");
+    }
+}

@@ -1,0 +1,99 @@
+//! Policies that are compared unless others are named.
+
+use super::decisions::LearnedDecisions;
+use super::parts::{Goal, Policy};
+use super::planners::{self, AHEAD, BEAM, RANDOM, SHOOTING};
+use crate::beliefs::{BELIEFS, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, NEXT_TRUTH, NONE, TRUTH};
+use crate::learned::Learned;
+use emberwatch_belief::planning::options::OPTIONS;
+use emberwatch_model::Model;
+
+/// The benchmark's ladder under a model, from the least to the most informed.
+pub fn ladder(model: &Model) -> Vec<Policy> {
+    use Goal::{Coverage, Exploit, ExploitOnly, Explore, Rule, State};
+    let states = (0..model.n_states()).filter(|state| *state != model.target_state());
+    let states = states.map(|state| (&KNOWN, &SHOOTING, State(state)));
+    let first = [
+        (&NONE, &RANDOM, Coverage),
+        (&NONE, &SHOOTING, Coverage),
+        (&KNOWN, &SHOOTING, Explore),
+    ];
+    let rest = [
+        (&KNOWN, &SHOOTING, Exploit),
+        (&KNOWN, &SHOOTING, ExploitOnly),
+        (&KNOWN, &BEAM, Exploit),
+        (&KNOWN_SPATIAL, &SHOOTING, Exploit),
+        (&KNOWN_SPATIAL, &BEAM, Exploit),
+        (&TRUTH, &SHOOTING, Exploit),
+        (&TRUTH, &BEAM, Exploit),
+        (&TRUTH, &AHEAD, Exploit),
+        (&TRUTH, &planners::BY_OPTIONS, Rule),
+        (&NEXT_TRUTH, &BEAM, Exploit),
+    ];
+    let all = first.into_iter().chain(states).chain(rest);
+    all.map(|(belief, planner, goal)| Policy::new(belief, planner, goal, model))
+        .collect()
+}
+
+/// The policies that act on what was learned: shooting and beam search on each belief, and what a DQN decides.
+pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
+    use Goal::{Exploit, Explore};
+    let policy = |belief, planner, goal| Policy::new(belief, planner, goal, model);
+    let mut policies = Vec::new();
+    let kinds = BELIEFS.iter().copied();
+    for belief in kinds.filter(|belief| belief.learned_by.is_some()) {
+        if belief.decides() {
+            policies.push(policy(belief, &SHOOTING, Explore));
+        }
+        policies.push(policy(belief, &SHOOTING, Exploit));
+        if belief.decides() {
+            policies.push(policy(belief, &SHOOTING, Goal::Learned));
+        }
+        policies.push(policy(belief, &BEAM, Exploit));
+    }
+    if let Some(decisions) = learned.get::<LearnedDecisions>() {
+        policies.push(policy(
+            decisions.belief,
+            &planners::BY_OPTIONS,
+            Goal::Learned,
+        ));
+    }
+    policies.retain(|policy| policy.check(learned).is_ok());
+    policies
+}
+
+/// What is read off one table: random moves, then each option on a belief, the rule, and the learned choice unless the
+/// belief is told the states.
+pub fn options_table(belief: &'static BeliefKind, model: &Model) -> Vec<Policy> {
+    let options = OPTIONS.iter().map(Goal::Option).chain([Goal::Rule]);
+    let learned = (belief.input == Input::Frames).then_some(Goal::Learned);
+    let goals = options.chain(learned);
+    let first = Policy::new(&NONE, &RANDOM, Goal::Coverage, model);
+    let rest = goals.map(|goal| Policy::new(belief, &planners::BY_OPTIONS, goal, model));
+    std::iter::once(first).chain(rest).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_wildfires_ladder_is_this() {
+        let policies = ladder(&Model::wildfire());
+        let names: Vec<&str> = policies.iter().map(|policy| &*policy.name).collect();
+        let expected = "random_walk coverage shooting_explore shooting_normal shooting_latent shooting_exploit \
+             shooting_exploit_only beam_exploit spatial_shooting spatial_beam oracle_shooting oracle_beam oracle_ahead \
+             oracle_policy clairvoyant_beam";
+        assert_eq!(names.join(" "), expected);
+    }
+
+    #[test]
+    fn options_have_a_policy_each_on_every_belief() {
+        let model = Model::wildfire();
+        for (belief, n_chosen) in [(&KNOWN, 2), (&TRUTH, 1)] {
+            let table = options_table(belief, &model);
+            assert_eq!(table.len(), 1 + OPTIONS.len() + n_chosen);
+            assert!(table[1..].iter().all(|policy| policy.belief == belief));
+        }
+    }
+}

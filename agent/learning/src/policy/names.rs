@@ -1,0 +1,411 @@
+//! How policies are named: by their parts, `BELIEF/PLANNER/GOAL`, and a few by a name of their own.
+
+use super::parts::{Goal, Policy};
+use super::planners::{BY_OPTIONS, PLANNERS, PlannerKind};
+use crate::beliefs::{BELIEFS, BeliefKind, numbered_states};
+use anyhow::{Result, bail};
+use emberwatch_belief::planning::options;
+use emberwatch_model::Model;
+use emberwatch_model::built_in::listed;
+
+/// Names of policies and their parts: those of the benchmark and of what is learned by default.
+pub(super) const NAMED: &[(&str, &str)] = &[
+    ("random_walk", "none/random"),
+    ("coverage", "none/shooting/coverage"),
+    ("shooting_explore", "known/shooting/explore"),
+    ("shooting_exploit", "known/shooting/exploit"),
+    ("shooting_exploit_only", "known/shooting/exploit_only"),
+    ("beam_exploit", "known/beam/exploit"),
+    ("spatial_shooting", "known+spatial/shooting/exploit"),
+    ("spatial_beam", "known+spatial/beam/exploit"),
+    ("learned_beam", "learned/beam/exploit"),
+    ("learned_spatial_beam", "learned+spatial/beam/exploit"),
+    ("learned_policy", "learned/options/learned"),
+    ("neural_beam", "neural/beam/exploit"),
+    ("neural_policy", "neural/options/learned"),
+    ("autoencoder_exploit", "autoencoder/shooting/exploit"),
+    ("autoencoder_policy", "autoencoder/shooting/learned"),
+    ("oracle_shooting", "truth/shooting/exploit"),
+    ("oracle_beam", "truth/beam/exploit"),
+    ("oracle_ahead", "truth/ahead/exploit"),
+    ("oracle_policy", "truth/options/rule"),
+    ("clairvoyant_beam", "next_truth/beam/exploit"),
+];
+
+/// Begins the names of the ladder's policies for single states: `shooting_STATE` is `known/shooting/STATE`.
+const OF_STATE: (&str, &str) = ("shooting_", "known/shooting/");
+
+/// Goals of planners other than options, besides the states of the model.
+pub(super) const GOALS: &[(Goal, &str, &str)] = &[
+    (Goal::Coverage, "coverage", "new cells, and nothing else"),
+    (Goal::Explore, "explore", "the belief's entropy"),
+    (
+        Goal::Exploit,
+        "exploit",
+        "what pays most, and a little for each new cell",
+    ),
+    (
+        Goal::ExploitOnly,
+        "exploit_only",
+        "what pays most, and nothing else",
+    ),
+    (
+        Goal::Learned,
+        "learned",
+        "what a DQN chooses; of the autoencoder",
+    ),
+];
+
+/// Goals of options, besides each option.
+pub(super) const OPTION_GOALS: &[(Goal, &str, &str)] = &[
+    (
+        Goal::Rule,
+        "rule",
+        "the best region if it promises more than here, else exploit",
+    ),
+    (
+        Goal::Learned,
+        "learned",
+        "the option that a DQN values most; needs --checkpoint",
+    ),
+];
+
+/// The name of a policy of these parts.
+fn name(belief: &BeliefKind, planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
+    let mut parts = format!("{}/{}", belief.name, planner.name);
+    if planner.has_goal {
+        parts = format!("{parts}/{}", goal_name(planner, goal, model));
+    }
+    if let Some((name, _)) = NAMED.iter().find(|(_, named)| *named == parts) {
+        return (*name).into();
+    }
+    match (parts.strip_prefix(OF_STATE.1), goal) {
+        (Some(state), Goal::State(_)) => format!("{}{state}", OF_STATE.0),
+        _ => parts,
+    }
+}
+
+fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
+    let goals = if *planner == BY_OPTIONS {
+        OPTION_GOALS
+    } else {
+        GOALS
+    };
+    match goal {
+        Goal::Option(option) => option.name.into(),
+        Goal::State(state) => {
+            let names = model.state_names().into_iter();
+            let mut names = names.chain(
+                numbered_states(state + 1)
+                    .into_iter()
+                    .skip(model.n_states()),
+            );
+            names
+                .nth(state)
+                .expect("invariant: names go on after the model's states")
+        }
+        _ => {
+            let found = goals.iter().find(|(other, ..)| *other == goal);
+            let (_, name, _) = found.expect("invariant: each goal has a name");
+            (*name).into()
+        }
+    }
+}
+
+impl Policy {
+    /// A policy of these parts, by its name if it has one, else by the names of its parts.
+    pub fn new(
+        belief: &'static BeliefKind,
+        planner: &'static PlannerKind,
+        goal: Goal,
+        model: &Model,
+    ) -> Self {
+        Self {
+            name: name(belief, planner, goal, model),
+            belief,
+            planner,
+            goal,
+        }
+    }
+
+    /// The policy of a name, or of parts.
+    ///
+    /// # Errors
+    /// Names the part that is wrong, and what it may be.
+    pub fn named(name: &str, model: &Model) -> Result<Self> {
+        let states = model.state_names().join(", ");
+        let parts = parse(name, &|state| model.state_named(state), &states);
+        parts.map(|(belief, planner, goal)| Self::new(belief, planner, goal, model))
+    }
+}
+
+/// Checks a policy's name before the model is known, whose states are goals.
+///
+/// # Errors
+/// As [`Policy::named`], if it is a policy's under no model.
+pub fn check_name(name: &str) -> Result<()> {
+    // Any word may be a state's.
+    let is_word = |state: &str| (!state.is_empty()).then_some(0);
+    parse(name, &is_word, "a state of the model").map(drop)
+}
+
+/// How a policy finds paths, by its name; `None` of a name that is none of ours.
+pub fn planner_of(name: &str) -> Option<&'static PlannerKind> {
+    parse(name, &|_| Some(0), "").ok().map(|parts| parts.1)
+}
+
+/// What a policy plans on, by its name; `None` of a name that is none of ours.
+pub fn belief_of(name: &str) -> Option<&'static BeliefKind> {
+    parse(name, &|_| Some(0), "").ok().map(|parts| parts.0)
+}
+
+/// The parts of a policy by the name that it had before policies were named by their parts: `BELIEF_PLANNER`,
+/// `BELIEF_OPTION`, `beam_GOAL` or `autoencoder_explore`. Tables and leaderboards have such names.
+fn former(name: &str) -> Option<String> {
+    const BEGINNINGS: [(&str, &str); 10] = [
+        ("known_", "known"),
+        ("spatial_", "known+spatial"),
+        ("learned_own_spatial_", "learned+spatial"),
+        ("learned_own_", "learned"),
+        ("learned_spatial_", "learned+spatial"),
+        ("learned_", "learned"),
+        ("neural_", "neural"),
+        ("autoencoder_", "autoencoder"),
+        ("oracle_", "truth"),
+        ("clairvoyant_", "next_truth"),
+    ];
+    if let Some(goal) = name.strip_prefix("beam_") {
+        return Some(format!("known/beam/{goal}"));
+    }
+    let mut beginnings = BEGINNINGS.iter();
+    let (rest, belief) =
+        beginnings.find_map(|(first, belief)| Some((name.strip_prefix(first)?, belief)))?;
+    let is_option = |name| options::OPTIONS.iter().any(|option| option.name == name);
+    Some(match rest {
+        "shooting" | "beam" | "ahead" => format!("{belief}/{rest}/exploit"),
+        "explore" => format!("{belief}/shooting/explore"),
+        "policy" => format!("{belief}/options/learned"),
+        "rule" => format!("{belief}/options/rule"),
+        option if is_option(option) => format!("{belief}/options/{option}"),
+        _ => return None,
+    })
+}
+
+type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
+
+/// The parts of a policy. `state`: the number of a state by its name; `states`: what these names may be.
+fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
+    let mut table = NAMED.iter();
+    let parts = match table.find(|(known, _)| *known == name) {
+        Some((_, parts)) => (*parts).to_owned(),
+        None => match name.strip_prefix(OF_STATE.0) {
+            Some(of) if state(of).is_some() => format!("{}{of}", OF_STATE.1),
+            _ => former(name).unwrap_or_else(|| name.to_owned()),
+        },
+    };
+    let wrong = |what: &str, expected: &str, got: &str| {
+        anyhow::anyhow!("policy {name:?}: {what}: expected one of {expected}, got {got:?}")
+    };
+    let words: Vec<&str> = parts.split('/').collect();
+    let (belief, planner, goal) = match words.as_slice() {
+        [belief, planner] => (*belief, *planner, None),
+        [belief, planner, goal] => (*belief, *planner, Some(*goal)),
+        _ => bail!(
+            "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
+             --policies help`), got {name:?}",
+            listed(NAMED.iter().map(|(name, _)| *name))
+        ),
+    };
+    let mut kinds = BELIEFS.iter().copied();
+    let found = kinds.find(|kind| kind.name == belief);
+    let names = listed(BELIEFS.iter().map(|kind| kind.name));
+    let belief = found.ok_or_else(|| wrong("belief", &names, belief))?;
+    let mut planners = PLANNERS.iter().copied();
+    let found = planners.find(|kind| kind.name == planner);
+    let names = listed(PLANNERS.iter().map(|kind| kind.name));
+    let planner = found.ok_or_else(|| wrong("planner", &names, planner))?;
+    let found = goal_of(belief, planner, goal, state);
+    let goals = goals_of(belief, planner, states);
+    let goal = found.ok_or_else(|| wrong("goal", &goals, goal.unwrap_or_default()))?;
+    Ok((belief, planner, goal))
+}
+
+/// Goals of a planner other than options, besides the states of the model.
+fn goals(belief: &BeliefKind) -> impl Iterator<Item = &'static (Goal, &'static str, &'static str)> {
+    let decides = belief.decides();
+    let goals = GOALS.iter();
+    goals.filter(move |(goal, ..)| *goal != Goal::Learned || decides)
+}
+
+fn goal_of(
+    belief: &BeliefKind,
+    planner: &'static PlannerKind,
+    name: Option<&str>,
+    state: &dyn Fn(&str) -> Option<usize>,
+) -> Option<Goal> {
+    let is_named = |(_, known, _): &&(Goal, &str, &str)| Some(*known) == name;
+    if !planner.has_goal {
+        return name.is_none().then_some(Goal::Coverage);
+    }
+    let found = if *planner == BY_OPTIONS {
+        OPTION_GOALS.iter().find(is_named)
+    } else {
+        goals(belief).find(is_named)
+    };
+    if let Some((goal, ..)) = found {
+        return Some(*goal);
+    }
+    if *planner == BY_OPTIONS {
+        let mut options = options::OPTIONS.iter();
+        let option = options.find(|option| Some(option.name) == name);
+        return option.map(Goal::Option);
+    }
+    // States that were learned have no names.
+    let state = (belief.learned_by.is_none()).then(|| name.and_then(state));
+    state.flatten().map(Goal::State)
+}
+
+/// What [`goal_of`] knows.
+fn goals_of(belief: &BeliefKind, planner: &'static PlannerKind, states: &str) -> String {
+    if !planner.has_goal {
+        return "no goal".into();
+    }
+    let mut names: Vec<&str> = Vec::new();
+    if *planner == BY_OPTIONS {
+        names.extend(OPTION_GOALS.iter().map(|(_, name, _)| name));
+        names.extend(options::OPTIONS.map(|option| option.name));
+    } else {
+        names.extend(goals(belief).map(|(_, name, _)| *name));
+        names.extend(belief.learned_by.is_none().then_some(states));
+    }
+    names.join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_name_is_of_its_parts_and_of_no_other_policy() {
+        let model = Model::wildfire();
+        for &(name, parts) in NAMED {
+            let policy = Policy::named(name, &model).expect("a policy");
+            assert_eq!(policy.name, name);
+            assert_eq!(Policy::named(parts, &model).expect("the same"), policy);
+        }
+        let latent = Policy::named("known/shooting/latent", &model).expect("a policy");
+        assert_eq!(
+            (&*latent.name, latent.goal),
+            ("shooting_latent", Goal::State(1))
+        );
+        assert_eq!(
+            Policy::named("shooting_latent", &model).expect("the same"),
+            latent
+        );
+    }
+
+    #[test]
+    fn each_combination_of_parts_is_a_policy_by_its_name() {
+        let model = Model::wildfire();
+        let mut n_policies = 0;
+        for &belief in BELIEFS {
+            for &planner in PLANNERS {
+                let goals = goals_of(belief, planner, &model.state_names().join(", "));
+                for goal in goals.split(", ") {
+                    let parts = if !planner.has_goal {
+                        format!("{}/random", belief.name)
+                    } else {
+                        format!("{}/{}/{goal}", belief.name, planner.name)
+                    };
+                    let policy = Policy::named(&parts, &model).expect("a policy");
+                    assert_eq!(Policy::named(&policy.name, &model).expect(&parts), policy);
+                    check_name(&policy.name).expect("known before its model");
+                    assert_eq!(planner_of(&policy.name), Some(planner));
+                    n_policies += 1;
+                }
+            }
+        }
+        assert!(n_policies > 200, "{n_policies}");
+    }
+
+    #[test]
+    fn names_of_earlier_releases_are_those_of_the_same_policies() {
+        let model = Model::wildfire();
+        for (name, expected) in [
+            ("beam_explore", "known/beam/explore"),
+            ("beam_exploit_only", "known/beam/exploit_only"),
+            ("beam_latent", "known/beam/latent"),
+            ("learned_shooting", "learned/shooting/exploit"),
+            ("learned_own_spatial_beam", "learned_spatial_beam"),
+            ("learned_own_policy", "learned_policy"),
+            ("learned_spatial_policy", "learned+spatial/options/learned"),
+            ("neural_shooting", "neural/shooting/exploit"),
+            ("autoencoder_explore", "autoencoder/shooting/explore"),
+            ("autoencoder_beam", "autoencoder/beam/exploit"),
+            ("known_rule", "known/options/rule"),
+            ("spatial_best_region", "known+spatial/options/best_region"),
+            ("oracle_exploit", "truth/options/exploit"),
+            ("clairvoyant_ahead", "next_truth/ahead/exploit"),
+        ] {
+            let policy = Policy::named(name, &model).expect(name);
+            assert_eq!(policy.name, expected);
+            check_name(name).expect("known before its model");
+        }
+    }
+
+    #[test]
+    fn no_state_has_the_name_of_a_goal() {
+        let mut files = Model::built_in_files();
+        let (_, text) = files
+            .find(|(name, _)| *name == "wildfire")
+            .expect("built in");
+        for &(_, goal, _) in GOALS {
+            let error = Model::from_toml(&text.replace("normal", goal));
+            let error = error.expect_err(goal).to_string();
+            assert!(error.contains("state name"), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_name_is_told() {
+        let model = Model::wildfire();
+        for (name, words) in [
+            ("", "expected one of random_walk, coverage, "),
+            (
+                "beam",
+                "or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit",
+            ),
+            (
+                "knwon/beam/exploit",
+                "belief: expected one of none, known, ",
+            ),
+            (
+                "known/beem/exploit",
+                "planner: expected one of random, shooting, ",
+            ),
+            ("known/beam/ash", ", normal, latent, fire, got \"ash\""),
+            (
+                "known/options/fire",
+                "goal: expected one of rule, learned, exploit, ",
+            ),
+            (
+                "none/random/exploit",
+                "goal: expected one of no goal, got \"exploit\"",
+            ),
+            (
+                "known/beam/learned",
+                ", normal, latent, fire, got \"learned\"",
+            ),
+            ("learned/beam/fire", "goal: expected one of coverage, "),
+            ("shooting_ash", "got \"shooting_ash\""),
+            ("learned_", "got \"learned_\""),
+            ("beam_ash", "policy \"beam_ash\": goal: expected one of "),
+        ] {
+            let error = Policy::named(name, &model).expect_err(name).to_string();
+            assert!(error.contains(words), "{error}");
+        }
+        check_name("known/beam/ash").expect("a state of some model");
+        check_name("shooting_ash").expect("a state of some model");
+        assert!(check_name("bem_exploit").is_err());
+    }
+}

@@ -1,0 +1,177 @@
+//! The parts of a policy, and what they mean to an agent.
+
+use super::decisions::LearnedDecisions;
+use super::planners::{BEAM, BY_OPTIONS, PlannerKind, SHOOTING};
+use crate::beliefs::{AUTOENCODER, BeliefKind};
+use crate::config::AgentConfig;
+use crate::learned::Learned;
+use anyhow::{Context, Result, ensure};
+use emberwatch_belief::planning::options::PathOption;
+use emberwatch_belief::planning::{Objective, Target};
+
+/// What a policy plans on, how, and what for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Policy {
+    /// Its name in commands, tables and files.
+    pub name: String,
+    pub belief: &'static BeliefKind,
+    pub planner: &'static PlannerKind,
+    pub goal: Goal,
+}
+
+/// What a policy plans for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Goal {
+    /// New cells, and nothing else.
+    Coverage,
+    /// The belief's entropy.
+    Explore,
+    /// What pays most, and a little for each new cell.
+    Exploit,
+    /// What pays most, and nothing else.
+    ExploitOnly,
+    /// A state of the model.
+    State(usize),
+    /// What a DQN chooses: an option, or on an autoencoder's hidden vector an objective.
+    Learned,
+    /// The option that a rule by hand chooses.
+    Rule,
+    /// One option, always.
+    Option(&'static PathOption),
+}
+
+impl Policy {
+    /// Beam search for what pays most on a belief, by the names of its parts: what learners act on.
+    pub fn exploiting(belief: &'static BeliefKind) -> Self {
+        Self {
+            name: format!("{}/beam/exploit", belief.name),
+            belief,
+            planner: &BEAM,
+            goal: Goal::Exploit,
+        }
+    }
+
+    /// Whether a DQN decides among options.
+    pub fn chooses_options(&self) -> bool {
+        self.goal == Goal::Learned && *self.planner == BY_OPTIONS
+    }
+
+    /// Whether it acts on what `train` learned.
+    pub fn needs_checkpoint(&self) -> bool {
+        self.goal == Goal::Learned || self.belief.learned_by.is_some()
+    }
+
+    /// Refuses a checkpoint that lacks what it acts on; no checkpoint has to hold anything for some.
+    ///
+    /// # Errors
+    /// Says what `train` has to learn.
+    pub fn check(&self, learned: &Learned) -> Result<()> {
+        let of_policy = || format!("policy {:?} needs --checkpoint FILE", self.name);
+        self.belief.learned(learned).with_context(of_policy)?;
+        if self.chooses_options() {
+            self.decisions(learned).with_context(of_policy)?;
+        }
+        Ok(())
+    }
+
+    /// The decisions that were learned on its belief.
+    ///
+    /// # Errors
+    /// If there are none, or on another belief.
+    pub fn decisions<'a>(&self, learned: &'a Learned) -> Result<&'a LearnedDecisions> {
+        let decisions = learned.get::<LearnedDecisions>();
+        let decisions =
+            decisions.context("expected a checkpoint of `train --learner decisions`, got none")?;
+        let [expected, got] = [self.belief, decisions.belief].map(|belief| belief.name);
+        ensure!(
+            got == expected,
+            "expected decisions on the belief {expected}, got some on {got}"
+        );
+        Ok(decisions)
+    }
+
+    /// What it maximises under these settings; `target`: what the belief calls the state that pays most.
+    pub fn objective(&self, target: usize, config: &AgentConfig) -> Objective {
+        let settings = &config.objective;
+        let target = match self.goal {
+            Goal::Coverage => Target::Coverage,
+            Goal::Explore => Target::Entropy,
+            Goal::State(state) => Target::State(state),
+            Goal::Exploit | Goal::ExploitOnly | Goal::Learned | Goal::Rule | Goal::Option(_) => {
+                Target::State(target)
+            }
+        };
+        let coverage_bonus = match self.goal {
+            Goal::Coverage => 1.0,
+            Goal::ExploitOnly => 0.0,
+            _ => (self.planner.bonus)(settings),
+        };
+        Objective {
+            target,
+            coverage_bonus,
+            entropy: settings.entropy,
+            revisits: settings.revisits,
+        }
+    }
+}
+
+/// What the DQN of Algorithm 1 chooses among (paper section IV, the actions `a_k`): the probability of each state, then
+/// the belief's entropy.
+pub fn network_choices(n_states: usize) -> Vec<Policy> {
+    let states = (0..n_states).map(Goal::State);
+    let goals = states.chain([Goal::Explore]);
+    let choice = |goal| Policy {
+        name: "choice".into(),
+        belief: &AUTOENCODER,
+        planner: &SHOOTING,
+        goal,
+    };
+    goals.map(choice).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_belief::planning::objective::BEAM_BONUS;
+    use emberwatch_model::Model;
+
+    #[test]
+    fn by_default_shooting_has_the_authors_objective_and_beam_search_a_small_bonus() {
+        let (model, config) = (Model::wildfire(), AgentConfig::default());
+        let objective = |name: &str| {
+            let policy = Policy::named(name, &model).expect("a known name");
+            policy.objective(2, &config)
+        };
+        let (fire, entropy) = (Target::State(2), Target::Entropy);
+        assert_eq!(objective("shooting_exploit"), Objective::paper(fire));
+        assert_eq!(objective("shooting_explore"), Objective::paper(entropy));
+        assert_eq!(objective("beam_exploit").coverage_bonus, BEAM_BONUS);
+        let choices = network_choices(3);
+        assert_eq!(choices[2].objective(0, &config), Objective::paper(fire));
+        assert_eq!(choices[3].objective(0, &config), Objective::paper(entropy));
+    }
+
+    #[test]
+    fn settings_of_the_objective_reach_the_policies() {
+        let model = Model::wildfire();
+        let mut config = AgentConfig::default();
+        config.objective.shooting_bonus = 3.0;
+        config.objective.revisits = true;
+        let objective = |name: &str| {
+            let policy = Policy::named(name, &model).expect("a known name");
+            policy.objective(2, &config)
+        };
+        let bonus = |name| objective(name).coverage_bonus;
+        assert_eq!(
+            [bonus("shooting_explore"), bonus("beam_exploit")],
+            [3.0, 0.02]
+        );
+        assert_eq!(
+            [bonus("shooting_exploit_only"), bonus("coverage")],
+            [0.0, 1.0]
+        );
+        assert!(objective("beam_exploit").revisits);
+        assert_eq!(objective("beam_exploit").target, Target::State(2));
+        assert_eq!(objective("shooting_latent").target, Target::State(1));
+    }
+}

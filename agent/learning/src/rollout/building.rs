@@ -1,0 +1,102 @@
+//! How a policy's agent is put together: its belief, its planner, and what decides.
+
+use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
+use crate::beliefs::autoencoder::AutoencoderModel;
+use crate::beliefs::{Conditions, Input, WorldForm};
+use crate::config::AgentConfig;
+use crate::learned::Learned;
+use crate::policy::{BY_OPTIONS, Goal, Policy, network_choices};
+use anyhow::{Context, Result};
+use emberwatch_belief::planning::{BasisKind, Objective};
+use std::sync::Arc;
+
+/// Refuses a policy in worlds where it cannot act, from settings and checkpoints alone.
+///
+/// # Errors
+/// If a checkpoint lacks what it acts on, or is of worlds of another form.
+pub fn check(policy: &Policy, learned: &Learned, world: &WorldForm) -> Result<()> {
+    policy.check(learned)?;
+    policy.belief.check(learned, world)
+}
+
+/// A policy's agent before its first frame. `seed`: of its planner, from its own and the world's.
+///
+/// # Errors
+/// As [`check`]; also if its network cannot be computed.
+pub fn agent(
+    policy: &Policy,
+    config: &AgentConfig,
+    conditions: &Conditions<'_>,
+    n_moves: usize,
+    seed: u64,
+) -> Result<Agent> {
+    let (belief, learned) = (policy.belief, conditions.learned);
+    let (model, shape) = (conditions.model()?, conditions.shape);
+    check(policy, learned, &WorldForm::of(model, shape))?;
+    let estimator = (belief.build)(conditions)?;
+    let target = belief.target(conditions)?;
+    let setup = Setup {
+        airspace: model.airspace(shape)?,
+        chooser: chooser(policy, config, learned, target)?,
+        basis: basis(policy, config, learned)?,
+        beam_width: match policy.chooses_options() {
+            true => policy.decisions(learned)?.beam_width,
+            false => config.decisions.beam_width,
+        },
+        state_names: belief.state_names(conditions)?,
+        n_moves,
+        seed,
+        target,
+    };
+    Ok(Agent::new(estimator, policy, config, setup))
+}
+
+/// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as its values are of
+/// such paths. A policy that is told the state that its path will meet plans on that.
+fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
+    Ok(match policy.goal {
+        Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,
+        Goal::Learned => network(learned)?.basis,
+        _ if policy.belief.input == Input::NextStates => BasisKind::Predictor,
+        _ => config.objective.belief,
+    })
+}
+
+fn chooser(
+    policy: &Policy,
+    config: &AgentConfig,
+    learned: &Learned,
+    target: usize,
+) -> Result<Chooser> {
+    if *policy.planner == BY_OPTIONS {
+        return Ok(Chooser::Options(match policy.goal {
+            Goal::Option(option) => OptionChooser::Always(option),
+            Goal::Learned => OptionChooser::Scorer(policy.decisions(learned)?.scorer.clone()),
+            _ => OptionChooser::Rule,
+        }));
+    }
+    Ok(match policy.goal {
+        Goal::Learned => Chooser::Network(decider(config, network(learned)?)),
+        _ => Chooser::Objective(policy.objective(target, config)),
+    })
+}
+
+fn network(learned: &Learned) -> Result<Arc<AutoencoderModel>> {
+    let network = learned.shared::<AutoencoderModel>();
+    network.context("checkpoint: expected one of an autoencoder, got none")
+}
+
+/// The DQN learned beside an autoencoder.
+fn decider(config: &AgentConfig, network: Arc<AutoencoderModel>) -> Decider {
+    let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
+    let objectives = choices.map(|choice| choice.objective(network.target, config));
+    let objectives: Vec<Objective> = objectives.collect();
+    Box::new(move |estimator| {
+        let hidden = estimator.hidden();
+        let hidden = hidden.expect("invariant: it decides for an autoencoder");
+        objectives[network.dqn.best(hidden)]
+    })
+}
+
+#[cfg(test)]
+mod tests;

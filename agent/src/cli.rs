@@ -1,0 +1,72 @@
+//! The command line: subcommands, logging, threads, exit codes.
+
+use crate::commands;
+use crate::process::set_up_process;
+use clap::{Parser, Subcommand};
+use emberwatch_learning::policy;
+use emberwatch_protocol::limits::threads::NoThreads;
+use rayon::ThreadPoolBuilder;
+use std::process::ExitCode;
+
+/// Estimates, plans and acts on an Emberwatch server.
+#[derive(Parser)]
+#[command(name = "emberwatch-agent", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Act on one world of a running server
+    #[command(after_long_help = policy::help())]
+    Run(commands::RunCommand),
+    /// Write a filter's first belief to a file
+    Prior(commands::PriorCommand),
+    /// Compare policies on the same worlds: table, CSV and figures
+    #[command(after_long_help = policy::help())]
+    Compare(commands::CompareCommand),
+    /// Run policies on the test worlds of tasks: one score for each
+    #[command(after_long_help = policy::help())]
+    Suite(commands::SuiteCommand),
+    /// Add an entry to the leaderboard, and make its page
+    Leaderboard(commands::LeaderboardCommand),
+    /// Learn a model while acting: checkpoint and metrics
+    Train(commands::TrainCommand),
+    /// Score a checkpoint beside the known model
+    Evaluate(commands::EvaluateCommand),
+}
+
+/// Runs the command that the arguments say.
+pub fn main() -> ExitCode {
+    set_up_process();
+    emberwatch_protocol::program::start_logging();
+    let command = Cli::parse().command;
+    if let Err(error) = start_threads() {
+        tracing::error!("{error}");
+        return ExitCode::FAILURE;
+    }
+    let result = match &command {
+        Command::Run(command) => command.run(),
+        Command::Prior(command) => command.run(),
+        Command::Compare(command) => command.run(),
+        Command::Suite(command) => command.run(),
+        Command::Leaderboard(command) => command.run(),
+        Command::Train(command) => command.run(),
+        Command::Evaluate(command) => command.run(),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            commands::exit_code(&error)
+        }
+    }
+}
+
+/// Starts the threads that all commands share: they would start at their first work, where a failure is a panic.
+fn start_threads() -> Result<(), NoThreads> {
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let started = ThreadPoolBuilder::new().build_global();
+    started.map_err(|error| NoThreads::new(n_threads, &error))
+}

@@ -1,0 +1,71 @@
+//! A learner that acts and is watched: its beliefs go to observers.
+
+use crate::client::view::view;
+use anyhow::Result;
+use emberwatch_learning::learners::{Learner, LearnerKind};
+use emberwatch_learning::rollout::{Actor, Seen, StepRecord};
+use emberwatch_protocol::feed::Feed;
+use emberwatch_protocol::{Client, Move};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+/// A learner that acts, and is watched.
+pub struct Acting<'a> {
+    learner: &'a mut dyn Learner,
+    kind: &'static LearnerKind,
+    feed: &'a mut Feed,
+    robots: Range<u32>,
+    /// Robots of each world.
+    team: u32,
+    /// Time that the last plans took.
+    pub planning: Duration,
+}
+
+impl<'a> Acting<'a> {
+    pub fn new(
+        learner: &'a mut dyn Learner,
+        kind: &'static LearnerKind,
+        feed: &'a mut Feed,
+        client: &Client,
+    ) -> Self {
+        Self {
+            learner,
+            kind,
+            feed,
+            robots: client.robots(),
+            team: client.info().n_robots,
+            planning: Duration::ZERO,
+        }
+    }
+
+    /// Shows the posteriors of the robots whose turn it is.
+    fn show(&mut self) {
+        let planning = self.planning / self.robots.len().max(1) as u32;
+        for index in self.feed.due(self.robots.len()) {
+            let number = self.robots.start + index as u32;
+            let rollout = self.learner.rollout(index);
+            let mut view = view(rollout, number / self.team, number..number + 1, planning);
+            view.intent.policy = format!("train {}", self.kind.name);
+            self.feed.show(&view);
+        }
+    }
+}
+
+impl Actor for Acting<'_> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let paths = self.learner.plan();
+        self.planning = start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        let records = self.learner.see(seen)?;
+        self.show();
+        Ok(records)
+    }
+
+    fn predict(&mut self) {
+        self.learner.predict();
+    }
+}

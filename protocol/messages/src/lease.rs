@@ -1,0 +1,279 @@
+//! A lease on robots: for which step k of its world each path is meant, and whether the path was flown.
+
+use crate::backend::{Backend, StepAnswer};
+use crate::control::{ServerInfo, WorldInfo};
+use crate::errors::{ConnectionError, refused};
+use crate::message::{FLAG_TEAM_FRAMES, Operation, Status, StepRequest, WorldResult, worlds_of};
+use crate::payload::{WORLD_BYTES, write_step_body};
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// The right to fly consecutive robots, and the step of each of their worlds.
+///
+/// Threads may share it, if one at a time calls [`Self::send`].
+#[derive(Debug)]
+pub struct Lease {
+    number: u64,
+    /// Robots of each world.
+    team: u32,
+    n_moves: u32,
+    /// How long a step waits for teammates.
+    deadline: Duration,
+    worlds: Range<u32>,
+    known: Vec<Known>,
+    /// Number of times that paths were sent.
+    n_sent: AtomicU64,
+}
+
+/// What a lease knows of a world.
+#[derive(Debug, Default)]
+struct Known {
+    /// Step at which it was last seen.
+    step: AtomicU64,
+    /// The last paths for it that were not refused, counted as `n_sent` does: only these may have moved it.
+    sent: AtomicU64,
+}
+
+/// A step request of a lease. Sent again, its paths are for the same steps.
+#[derive(Debug)]
+pub struct Call<'a> {
+    request: StepRequest,
+    /// The moves of all paths.
+    moves: &'a [u8],
+    /// The step of each world for which the paths are meant; empty until they are first sent.
+    steps: Vec<u64>,
+    timeout: Duration,
+    /// When the paths were last sent, as `n_sent` counts; of an observation, those that it is to show.
+    sent: u64,
+    /// Whether an observation may show a step of other paths of the lease instead.
+    shows_others: bool,
+}
+
+impl<'a> Call<'a> {
+    /// A request of [`Lease::request`], with the moves of all paths.
+    pub fn new(request: StepRequest, moves: &'a [u8], timeout: Duration) -> Self {
+        Self {
+            request,
+            moves,
+            steps: Vec::new(),
+            timeout,
+            sent: 0,
+            shows_others: false,
+        }
+    }
+
+    /// A request about these steps of the worlds.
+    pub fn of_past(request: StepRequest, steps: Vec<u64>, timeout: Duration) -> Self {
+        let call = Self::new(request, &[], timeout);
+        Self { steps, ..call }
+    }
+
+    /// The request, without what [`Backend::step`] fills in.
+    pub fn request(&self) -> &StepRequest {
+        &self.request
+    }
+}
+
+impl Lease {
+    /// The lease of this number, on robots of a server.
+    pub fn new(info: &ServerInfo, number: u64, robots: &Range<u32>) -> Self {
+        let worlds = worlds_of(robots.start, robots.len() as u32, info.n_robots);
+        Self {
+            number,
+            team: info.n_robots.max(1),
+            n_moves: info.n_moves as u32,
+            deadline: Duration::from_millis(info.deadline_millis),
+            known: worlds.clone().map(|_| Known::default()).collect(),
+            worlds,
+            n_sent: AtomicU64::new(0),
+        }
+    }
+
+    /// The server's number of the lease.
+    pub fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// The worlds that its robots are in.
+    pub fn worlds(&self) -> Range<u32> {
+        self.worlds.clone()
+    }
+
+    /// The step of each world.
+    pub fn steps(&self) -> Vec<u64> {
+        self.steps_of(self.worlds()).collect()
+    }
+
+    /// Notes the step of a world after a reset or the like; ignores other leases' worlds.
+    pub fn note(&self, world: u32, step: u64) {
+        if let Some(known) = self.known(world) {
+            known.step.store(step, Ordering::Relaxed);
+        }
+    }
+
+    /// As [`Self::note`], for each world.
+    pub fn note_all(&self, worlds: &[WorldInfo]) {
+        for world in worlds {
+            self.note(world.world, world.step);
+        }
+    }
+
+    /// A request for robots of the server.
+    pub fn request(&self, operation: Operation, robots: &Range<u32>, flags: u32) -> StepRequest {
+        let flies = operation == Operation::Step;
+        StepRequest {
+            operation: operation as u32,
+            lease: self.number,
+            first_robot: robots.start,
+            n_robots: robots.len() as u32,
+            n_moves: if flies { self.n_moves } else { 0 },
+            flags,
+            ..StepRequest::default()
+        }
+    }
+
+    /// Sends a request once, and notes the steps that its answer shows. Paths are for the steps at which their worlds
+    /// were seen last before the call was first sent.
+    ///
+    /// # Errors
+    /// As [`Backend::step`].
+    pub fn send(
+        &self,
+        backend: &mut dyn Backend,
+        call: &mut Call<'_>,
+    ) -> Result<StepAnswer, ConnectionError> {
+        let request = call.request;
+        let worlds = worlds_of(request.first_robot, request.n_robots, self.team);
+        let flies = request.operation == Operation::Step as u32;
+        if flies {
+            call.sent = self.n_sent.fetch_add(1, Ordering::Relaxed) + 1;
+            if call.steps.is_empty() {
+                call.steps.extend(self.steps_of(worlds.clone()));
+            }
+        }
+        let mut body = Vec::new();
+        write_step_body(&call.steps, call.moves, &mut body);
+        let answer = backend.step(request, &body, call.timeout);
+        if flies && !matches!(answer, Err(ConnectionError::Refused { .. })) {
+            self.note_sent(worlds.clone(), call);
+        } else {
+            // Robots outside the lease may be observed, too.
+            let known = worlds.clone().filter_map(|world| self.known(world));
+            let mut sent = known.map(|known| known.sent.load(Ordering::Relaxed));
+            call.shows_others = sent.any(|sent| sent != call.sent);
+        }
+        let answer = answer?;
+        if request.operation != Operation::Recall as u32 {
+            for (world, result) in worlds.zip(results(&answer)) {
+                self.note(world, result.step);
+            }
+        }
+        Ok(answer)
+    }
+
+    /// Sends paths until their worlds have moved: after each timeout it looks whether they have, and if not, sends the
+    /// paths again. A slow teammate is waited for, a silent server is not. Returns the answer, and how many steps passed
+    /// unseen before the one that it shows; `None` if `gives_up` after a look.
+    ///
+    /// `send` is [`Self::send`] with the backend. With `accepts_late` the answer shows how the worlds stand, even where
+    /// they moved on without the paths.
+    ///
+    /// # Errors
+    /// As of `send` and `gives_up`; a refusal as `Late` if worlds have moved on without the paths.
+    pub fn fly<'a>(
+        &self,
+        mut paths: Call<'a>,
+        accepts_late: bool,
+        mut send: impl FnMut(&mut Call<'a>) -> Result<StepAnswer, ConnectionError>,
+        mut gives_up: impl FnMut() -> Result<bool, ConnectionError>,
+    ) -> Result<Option<(StepAnswer, u64)>, ConnectionError> {
+        let mut look = self.look(&paths);
+        // Sooner would take back the path with which the deadline began.
+        paths.timeout = paths.timeout.saturating_add(self.deadline);
+        loop {
+            match send(&mut paths) {
+                Err(ConnectionError::Timeout { .. }) => {}
+                Err(ConnectionError::Refused { status, .. })
+                    if accepts_late && status == Status::Late => {}
+                answer => return answer.map(|answer| Some((answer, 0))),
+            }
+            look.sent = paths.sent;
+            let seen = send(&mut look)?;
+            let steps = results(&seen).map(|result| result.step).zip(&paths.steps);
+            let n_moved = steps
+                .map(|(step, before)| step.saturating_sub(*before))
+                .max();
+            if let Some(n_moved @ 1..) = n_moved {
+                if !accepts_late {
+                    self.check_flown(&paths, &seen, look.shows_others)?;
+                }
+                return Ok(Some((seen, n_moved - 1)));
+            }
+            if gives_up()? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Notes paths that were not refused, unless their worlds are known to have moved before: a refusal may be lost.
+    fn note_sent(&self, worlds: Range<u32>, paths: &Call<'_>) {
+        for (world, step) in worlds.zip(&paths.steps) {
+            let known = self.known(world);
+            if let Some(known) = known.filter(|it| it.step.load(Ordering::Relaxed) == *step) {
+                known.sent.store(paths.sent, Ordering::Relaxed);
+            }
+        }
+    }
+
+    /// The observation of the robots of paths.
+    fn look<'a>(&self, paths: &Call<'a>) -> Call<'a> {
+        let request = StepRequest {
+            operation: Operation::Observe as u32,
+            n_moves: 0,
+            flags: paths.request.flags & FLAG_TEAM_FRAMES,
+            ..paths.request
+        };
+        Call::new(request, &[], paths.timeout)
+    }
+
+    /// Checks that these very paths took their worlds from the steps that they are meant for to those seen.
+    fn check_flown(
+        &self,
+        paths: &Call<'_>,
+        seen: &StepAnswer,
+        shows_others: bool,
+    ) -> Result<(), ConnectionError> {
+        let (first, n_robots) = (paths.request.first_robot, paths.request.n_robots);
+        let worlds: Vec<WorldResult> = results(seen).collect();
+        let index = |robot: u32| (robot / self.team - first / self.team) as usize;
+        let missed = (first..first + n_robots).map(|robot| (robot % self.team, index(robot)));
+        let mut missed = missed.filter(|&(member, index)| {
+            let (world, before) = (&worlds[index], paths.steps[index]);
+            let stayed = (world.hovered | world.late) >> member & 1 == 1;
+            shows_others || stayed || world.step.checked_sub(before) != Some(1)
+        });
+        missed.next().map_or(Ok(()), |(_, index)| {
+            Err(refused(Status::Late, worlds[index].step))
+        })
+    }
+
+    fn steps_of(&self, worlds: Range<u32>) -> impl Iterator<Item = u64> {
+        // The server refuses robots that are not the lease's.
+        let step = |known: &Known| known.step.load(Ordering::Relaxed);
+        worlds.map(move |world| self.known(world).map_or(0, step))
+    }
+
+    fn known(&self, world: u32) -> Option<&Known> {
+        let index = world.checked_sub(self.worlds.start)?;
+        self.known.get(index as usize)
+    }
+}
+
+/// The results of the worlds of an answer.
+fn results((reply, payload): &StepAnswer) -> impl Iterator<Item = WorldResult> {
+    let results = payload
+        .chunks_exact(WORLD_BYTES)
+        .take(reply.n_worlds as usize);
+    results.map(bytemuck::pod_read_unaligned)
+}

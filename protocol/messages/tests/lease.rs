@@ -1,0 +1,213 @@
+//! Paths of a lease, on a backend that answers what a test says.
+
+use emberwatch_messages::backend::{Backend, StepAnswer};
+use emberwatch_messages::control::ServerInfo;
+use emberwatch_messages::errors::{ConnectionError, refused};
+use emberwatch_messages::lease::{Call, Lease};
+use emberwatch_messages::message::{Operation, Status, StepReply, StepRequest, WorldResult};
+use std::collections::VecDeque;
+use std::time::Duration;
+
+/// What is asked, and for which step.
+type Asked = (Operation, Option<u64>);
+
+/// What the backend answers.
+#[derive(Clone, Copy)]
+enum Say {
+    Nothing,
+    Late,
+    Step(u64),
+    /// A step, and the robots that hovered and were late.
+    Stayed(u64, u64, u64),
+}
+use Say::{Late, Nothing, Stayed, Step};
+
+/// A world of two robots.
+struct Script {
+    info: ServerInfo,
+    says: VecDeque<Say>,
+    asked: Vec<Asked>,
+}
+
+impl Backend for Script {
+    fn info(&self) -> &ServerInfo {
+        &self.info
+    }
+
+    fn step(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+        timeout: Duration,
+    ) -> Result<StepAnswer, ConnectionError> {
+        let operation = Operation::try_from(request.operation).expect("an operation");
+        let step = body.first_chunk().map(|step| u64::from_ne_bytes(*step));
+        self.asked.push((operation, step));
+        let (step, hovered, late) = match self.says.pop_front().expect("no more requests") {
+            Nothing => {
+                let (what, instance) = ("step", String::new());
+                return Err(ConnectionError::Timeout {
+                    what,
+                    instance,
+                    timeout,
+                });
+            }
+            Late => return Err(refused(Status::Late, 9)),
+            Step(step) => (step, 0, 0),
+            Stayed(step, hovered, late) => (step, hovered, late),
+        };
+        let result = WorldResult {
+            step,
+            hovered,
+            late,
+            ..WorldResult::default()
+        };
+        let reply = StepReply {
+            n_worlds: 1,
+            n_robots: 1,
+            ..StepReply::default()
+        };
+        Ok((reply, bytemuck::bytes_of(&result).to_vec()))
+    }
+
+    fn control_text(&mut self, _: &[u8], _: Duration) -> Result<Vec<u8>, ConnectionError> {
+        unreachable!("a lease sends steps alone")
+    }
+}
+
+/// A lease on robot 1, whose world is at step 4, and what its backend answers.
+fn lease(says: &[Say]) -> (Lease, Script) {
+    let info: ServerInfo = serde_json::from_str(
+        r#"{"protocol": 2, "build": "", "pid": 1, "height": 1, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 2,
+        "n_observations": 3, "observations": [], "model": null, "burn_in": 0, "max_steps": 0, "max_clients": 16,
+        "coverage": "path", "publish_truth": false, "lease_millis": 1, "deadline_millis": 0, "recorded_world": null,
+        "task": null}"#,
+    )
+    .expect("what a server says of itself");
+    let lease = Lease::new(&info, 7, &(1..2));
+    lease.note(0, 4);
+    let says = says.iter().copied().collect();
+    let asked = Vec::new();
+    (lease, Script { info, says, asked })
+}
+
+fn call(lease: &Lease, operation: Operation) -> Call<'static> {
+    let moves: &[u8] = if operation == Operation::Step {
+        &[3]
+    } else {
+        &[]
+    };
+    let request = lease.request(operation, &(1..2), 0);
+    Call::new(request, moves, Duration::ZERO)
+}
+
+/// Flies until the worlds have moved or `patience` looks have passed; returns the step seen and how many passed unseen.
+fn fly(
+    lease: &Lease,
+    script: &mut Script,
+    accepts_late: bool,
+) -> Result<Option<(u64, u64)>, Status> {
+    let paths = call(lease, Operation::Step);
+    let send = |call: &mut Call<'_>| lease.send(script, call);
+    let mut patience = 2;
+    let gives_up = || {
+        patience -= 1;
+        Ok(patience == 0)
+    };
+    match lease.fly(paths, accepts_late, send, gives_up) {
+        Ok(flown) => Ok(flown.map(|(_, n_skipped)| (lease.steps()[0], n_skipped))),
+        Err(ConnectionError::Refused { status, .. }) => Err(status),
+        Err(other) => panic!("expected a refusal, got {other}"),
+    }
+}
+
+fn check(
+    says: &[Say],
+    accepts_late: bool,
+    expected: Result<Option<(u64, u64)>, Status>,
+) -> Vec<Asked> {
+    let (lease, mut script) = lease(says);
+    assert_eq!(fly(&lease, &mut script, accepts_late), expected);
+    assert!(script.says.is_empty(), "{} left", script.says.len());
+    script.asked
+}
+
+#[test]
+fn an_answer_ends_it() {
+    let asked = check(&[Step(5)], false, Ok(Some((5, 0))));
+    assert_eq!(asked, [(Operation::Step, Some(4))]);
+}
+
+#[test]
+fn paths_are_sent_again_for_the_same_step() {
+    let asked = check(&[Nothing, Step(4), Step(5)], false, Ok(Some((5, 0))));
+    let (sent, look) = ((Operation::Step, Some(4)), (Operation::Observe, None));
+    assert_eq!(asked, [sent, look, sent]);
+}
+
+#[test]
+fn moved_worlds_end_it_without_another_send() {
+    check(&[Nothing, Step(5)], false, Ok(Some((5, 0))));
+    check(&[Nothing, Stayed(5, 0b01, 0)], false, Ok(Some((5, 0))));
+}
+
+#[test]
+fn it_can_be_given_up() {
+    check(&[Nothing, Step(4), Nothing, Step(4)], false, Ok(None));
+}
+
+#[test]
+fn paths_that_did_not_move_the_world_are_late() {
+    for seen in [Step(6), Stayed(5, 0b10, 0), Stayed(5, 0, 0b10)] {
+        check(&[Nothing, seen], false, Err(Status::Late));
+    }
+    check(&[Late], false, Err(Status::Late));
+}
+
+#[test]
+fn who_accepts_that_sees_how_the_world_stands() {
+    check(&[Late, Step(7)], true, Ok(Some((7, 2))));
+    check(&[Nothing, Step(6)], true, Ok(Some((6, 1))));
+    check(&[Nothing, Stayed(5, 0, 0b10)], true, Ok(Some((5, 0))));
+}
+
+/// Flies while another thread sends a request after so many of the first one's.
+fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status> {
+    let (lease, mut script) = lease(says);
+    let mut others = call(&lease, other);
+    let mut n_sent = 0;
+    let send = |call: &mut Call<'_>| {
+        let answer = lease.send(&mut script, call);
+        n_sent += 1;
+        if n_sent == after {
+            drop(lease.send(&mut script, &mut others));
+        }
+        answer
+    };
+    match lease.fly(call(&lease, Operation::Step), false, send, || Ok(false)) {
+        Err(ConnectionError::Refused { status, .. }) => Err(status),
+        flown => {
+            assert!(flown.expect("an answer").is_some());
+            Ok(())
+        }
+    }
+}
+
+#[test]
+fn a_step_with_paths_of_another_thread_is_not_its_own() {
+    let beside = |says: &[Say]| fly_beside(Operation::Step, 1, says);
+    assert_eq!(beside(&[Nothing, Step(5), Step(5)]), Err(Status::Late));
+    // The other's answer is lost.
+    assert_eq!(beside(&[Nothing, Nothing, Step(5)]), Err(Status::Late));
+    assert_eq!(beside(&[Nothing, Late, Step(5)]), Ok(()));
+    // Its own refusal is lost.
+    let says = [Nothing, Step(4), Step(5), Nothing, Step(5)];
+    let refused = fly_beside(Operation::Step, 2, &says);
+    assert_eq!(refused, Err(Status::Late));
+}
+
+#[test]
+fn what_another_thread_observes_may_be_its_own_step() {
+    let seen = fly_beside(Operation::Observe, 1, &[Nothing, Step(5), Step(5)]);
+    assert_eq!(seen, Ok(()));
+}

@@ -1,0 +1,118 @@
+//! A belief of one's own acts in worlds in this process, beside policies of the benchmark.
+//!
+//! A cell is believed to be what it showed last, and less surely each step. Run it with
+//! `cargo run --release -p tests --example own_belief`.
+
+use anyhow::Result;
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::bayes::correct;
+use emberwatch_belief::estimation::{Estimator, EstimatorError};
+use emberwatch_learning::beliefs::{BeliefKind, Conditions, Input};
+use emberwatch_learning::config::AgentConfig;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::policy::{BEAM, Goal, Policy};
+use emberwatch_learning::rollout::{Rollout, building, step};
+use emberwatch_learning::served::Served;
+use emberwatch_protocol::client::{Claim, Client};
+use emberwatch_protocol::{Frame, Model};
+use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::embedded::Embedded;
+use ndarray::Array2;
+
+/// Share of what a cell showed that is still believed a step later.
+const KEPT: f32 = 0.95;
+
+const WORLDS: u32 = 4;
+const STEPS: u64 = 100;
+
+/// What each cell showed last, fading to what is believed of any cell.
+struct LastSeen {
+    belief: Belief,
+    first: Belief,
+    likelihood: Array2<f64>,
+}
+
+/// Its constructor and its facts: what a policy asks for.
+const LAST_SEEN: BeliefKind = BeliefKind {
+    name: "last_seen",
+    label: "last_seen",
+    about: "what each cell showed last, and less surely each step",
+    input: Input::Frames,
+    knows_model: true,
+    learned_by: None,
+    chart: ("last seen", [0x88, 0x22, 0x55]),
+    handover: None,
+    build: |conditions| {
+        let first = conditions.prior()?;
+        Ok(Box::new(LastSeen {
+            belief: first.clone(),
+            first,
+            likelihood: conditions.model()?.likelihood().clone(),
+        }))
+    },
+};
+
+impl Estimator for LastSeen {
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
+        Ok(correct(&mut self.belief, &self.likelihood, frame)?)
+    }
+
+    fn predict(&mut self) {
+        let faded = self.belief.probabilities() * KEPT + self.first.probabilities() * (1.0 - KEPT);
+        self.belief = Belief::from_probabilities(faded).expect("a mean of two beliefs");
+    }
+
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+}
+
+#[expect(clippy::print_stdout, reason = "an example")]
+fn main() -> Result<()> {
+    let model = Model::wildfire();
+    let mut policies = vec![Policy::new(&LAST_SEEN, &BEAM, Goal::Exploit, &model)];
+    for name in ["random_walk", "coverage", "beam_exploit"] {
+        policies.push(Policy::named(name, &model)?);
+    }
+    for policy in policies {
+        println!("{:24} {:.2}", policy.name, mean_reward(&policy, &model)?);
+    }
+    Ok(())
+}
+
+/// Mean reward of a step, on the same worlds for every policy.
+fn mean_reward(policy: &Policy, model: &Model) -> Result<f64> {
+    let settings = ServerConfig {
+        worlds: WORLDS,
+        height: 32,
+        width: 32,
+        moves: 32,
+        burn_in: 5000,
+        seed: 1000,
+        ..ServerConfig::default()
+    };
+    let mut client = Client::acquire(Embedded::new(settings.check()?)?, &Claim::new(0..WORLDS))?;
+    let (config, shape, n_moves) = (
+        AgentConfig::default(),
+        client.shape(),
+        client.info().n_moves,
+    );
+    let conditions = Conditions {
+        shape,
+        model: Some(model),
+        prior: Some(&Belief::uniform(model.n_states(), shape)),
+        learned: &Learned::default(),
+    };
+    let mut agents = Vec::new();
+    for seen in Served::new(&mut client, false).observe()? {
+        let seed = config.planner_seed(seen.observation.world.seed);
+        let agent = building::agent(policy, &config, &conditions, n_moves, seed)?;
+        agents.push(Rollout::begun(agent, seen)?);
+    }
+    let mut sum = 0.0;
+    for _ in 0..STEPS {
+        let records = step(&mut agents, &mut Served::new(&mut client, false))?;
+        sum += records.iter().flatten().map(|it| it.reward).sum::<f64>();
+    }
+    Ok(sum / (STEPS * u64::from(WORLDS)) as f64)
+}
