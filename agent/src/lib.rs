@@ -5,7 +5,7 @@
 //! - [`cli`] and `commands` -- flags in, words out
 //! - [`benchmark`] -- policies on the same worlds, scored
 //! - [`acting`] -- one world of a running server
-//! - [`training`] -- the loop that learns while acting, its metrics and events
+//! - `training` -- the loop that learns while acting, its metrics and events
 //! - [`client`] -- the ends of the wire
 //! - `flags` -- settings as flags
 //! - [`process`] -- the allocator and candle's threads
