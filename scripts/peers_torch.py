@@ -15,6 +15,7 @@ import statistics
 import subprocess
 import sys
 import time
+from functools import partial
 
 import torch
 from torch import nn
@@ -165,8 +166,8 @@ def neural_update():
     return update
 
 
-def neural_prediction():
-    network, features = UNet(), torch.rand(1, 4 * N_STATES + 4, SIDE, SIDE)
+def neural_prediction(n_grids=1):
+    network, features = UNet(), torch.rand(n_grids, 4 * N_STATES + 4, SIDE, SIDE)
 
     @torch.no_grad()
     def predict():
@@ -247,7 +248,9 @@ def measure(quick):
         report("dqn: update", dqn_update, 9, 50, threads)
         report("dqn: act", dqn_act, 9, 500, threads)
         report("neural belief: update", neural_update, 9, 5, threads)
-        report("neural belief: prediction", neural_prediction, 9, 50, threads)
+        for n_grids in (1, 16, 64):
+            prediction = partial(neural_prediction, n_grids)
+            report(f"neural belief: prediction of {n_grids}", prediction, 9, 50 // n_grids + 1, threads)
 
 
 def main():

@@ -139,8 +139,9 @@ impl Planned {
         Ok(())
     }
 
-    pub fn predict(&mut self) {
-        self.agent.predict();
+    /// Moves the beliefs about some worlds to the next step.
+    pub fn predict_all<'a>(all: impl IntoIterator<Item = &'a mut Self>) {
+        Agent::predict_all(all.into_iter().map(|planned| &mut planned.agent));
     }
 
     /// Plans all options from the robot's cell.

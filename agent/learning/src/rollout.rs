@@ -197,7 +197,7 @@ pub fn see_all<'a>(
 
 /// Moves all beliefs to the next step.
 pub fn predict_all<'a>(rollouts: impl IntoIterator<Item = &'a mut Rollout>) {
-    in_parallel(rollouts, |rollout| rollout.agent.predict());
+    Agent::predict_all(rollouts.into_iter().map(|rollout| &mut rollout.agent));
 }
 
 /// The results in order. One task alone is done here: handing it to another thread costs more than it gains.

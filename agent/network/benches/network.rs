@@ -119,13 +119,30 @@ fn dqn(c: &mut Criterion) {
     });
 }
 
-/// 16 whole grids an update, as paths of 64 moves need them.
+/// What a flight of 32 moves along rows and 32 along columns sees, one way or the other.
+fn flight_frame(step: u64) -> Frame {
+    let directions = match step % 4 {
+        0 => [Move::Right, Move::Down],
+        1 => [Move::Up, Move::Left],
+        2 => [Move::Left, Move::Down],
+        _ => [Move::Up, Move::Right],
+    };
+    let moves = directions.map(|direction| [direction; 32]).concat();
+    let start = shape().cell((split_mix(step, 1000) % 4096) as usize);
+    let mut frame = Frame::empty(shape());
+    for index in fly(shape(), start, &moves).visited {
+        frame.observe(index, (split_mix(index as u64 / 5, step / 50) % 3) as u8);
+    }
+    frame
+}
+
+/// As in a training (`neural.batch`): 64 lessons, of which 16 fill a batch, as flights need whole grids.
 fn neural_belief(c: &mut Criterion) {
     let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());
     for step in 0..200 {
-        let frame: Vec<_> = path_frame(step).observed().collect();
-        if step >= 184 {
+        let frame: Vec<_> = flight_frame(step).observed().collect();
+        if step >= 136 {
             lessons.push(Lesson {
                 before: before.clone(),
                 frame: frame.clone(),
@@ -142,9 +159,12 @@ fn neural_belief(c: &mut Criterion) {
     group.bench_function("update", |b| {
         b.iter(|| network.update(2e-3, &lessons).expect("finite"));
     });
-    group.bench_function("prediction", |b| {
-        b.iter(|| network.predict(&before, None).expect("a prediction"));
-    });
+    for n in [1, 16, 64] {
+        let worlds = vec![(&before, None); n];
+        group.bench_function(format!("prediction of {n}"), |b| {
+            b.iter(|| network.predict_all(&worlds).expect("predictions"));
+        });
+    }
     group.finish();
 }
 

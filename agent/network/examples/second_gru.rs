@@ -9,7 +9,7 @@ use emberwatch_model::{Frame, Shape};
 use emberwatch_network::variables::build;
 use emberwatch_network::{
     Adam, AdamSettings, Decoder, Device, Dropout, Encoder, Gru, NetworkShape, ObservationMatrix,
-    Pass, Window,
+    Operators, Pass, Window,
 };
 
 struct TwoGrus {
@@ -24,10 +24,10 @@ impl TwoGrus {
     fn new(vb: &VarBuilder<'_>, shape: &NetworkShape) -> Result<Self> {
         let n = shape.hidden;
         Ok(Self {
-            encoder: Encoder::new(&vb.pp("encoder"), shape, false)?,
-            first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, false)?,
-            second: Gru::new(&vb.pp("second_rnn_layer"), n, n, false)?,
-            decoder: Decoder::new(&vb.pp("decoder"), shape, false)?,
+            encoder: Encoder::new(&vb.pp("encoder"), shape, Operators::Own)?,
+            first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, Operators::Own)?,
+            second: Gru::new(&vb.pp("second_rnn_layer"), n, n, Operators::Own)?,
+            decoder: Decoder::new(&vb.pp("decoder"), shape, Operators::Own)?,
             observation: ObservationMatrix::new(vb, shape.n_observations, shape.n_states)?,
         })
     }

@@ -1,7 +1,7 @@
 //! Adam over candle variables, as PyTorch has it, with moments that can be saved.
 
 use crate::error::{NetworkError, NotFinite};
-use crate::tensors::{Change, first_not_finite, named, set};
+use crate::tensors::{Change, copied, named, set, zero_if_finite};
 use crate::variables::{Variables, is_statistic};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
@@ -82,34 +82,50 @@ impl Adam {
         prefix: &'static str,
     ) -> std::result::Result<f32, NetworkError> {
         let gradients = loss.backward()?;
-        let loss = loss.to_scalar::<f32>()?;
         let groups = [(prefix, &self.variables)];
         let of_variables = named(&groups).zip(self.variables.values());
         let of_variables = of_variables.filter_map(|((name, _), var)| {
             let gradient = gradients.get(var)?;
             Some((format!("gradient of {name}"), gradient))
         });
-        self.check(named(&groups).chain(of_variables))?;
-        if !loss.is_finite() {
-            return Err(self.not_finite("loss".into()));
-        }
         let mut changes = statistics;
         changes.extend(self.changes(settings, &gradients)?);
         let after = changes.iter();
-        self.check(after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor)))?;
+        let after = after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor));
+        // In the order of computation.
+        let all = named(&groups).chain(of_variables);
+        let all: Vec<_> = all.chain([("loss".into(), loss)]).chain(after).collect();
+        let zeros = all.iter().map(|(_, tensor)| zero_if_finite(tensor));
+        let numbers = zeros
+            .chain([Ok(loss.clone())])
+            .collect::<Result<Vec<_>>>()?;
+        let numbers = copied(&numbers)?;
+        let first = all.iter().zip(&numbers).find(|(_, zero)| **zero != 0.0);
+        if let Some(((name, _), _)) = first {
+            return Err(self.not_finite(name.clone()));
+        }
+        let loss = numbers[all.len()];
         set(&changes)?;
         self.steps += 1;
         Ok(loss)
     }
 
-    /// An error for the first tensor with a number that is not finite.
-    pub(crate) fn check<'a>(
+    /// The number of a scalar, copied with what tells whether all numbers of some tensors are finite.
+    ///
+    /// # Errors
+    /// Names the first tensor with a number that is not.
+    pub(crate) fn checked(
         &self,
-        tensors: impl Iterator<Item = (String, &'a Tensor)>,
-    ) -> std::result::Result<(), NetworkError> {
-        match first_not_finite(tensors)? {
-            None => Ok(()),
-            Some(tensor) => Err(self.not_finite(tensor)),
+        tensors: &[(String, &Tensor)],
+        scalar: &Tensor,
+    ) -> std::result::Result<f32, NetworkError> {
+        let zeros = tensors.iter().map(|(_, tensor)| zero_if_finite(tensor));
+        let numbers = zeros.chain([Ok(scalar.clone())]);
+        let numbers = copied(&numbers.collect::<Result<Vec<_>>>()?)?;
+        let first = tensors.iter().zip(&numbers).find(|(_, zero)| **zero != 0.0);
+        match first {
+            Some(((name, _), _)) => Err(self.not_finite(name.clone())),
+            None => Ok(numbers[tensors.len()]),
         }
     }
 
@@ -155,9 +171,9 @@ impl Adam {
     /// The root of the sum of all gradients' squares.
     fn norm(&self, gradients: &GradStore) -> Result<f64> {
         let gradients = self.variables.values().filter_map(|var| gradients.get(var));
-        let squares = gradients.map(|it| it.sqr()?.sum_all()?.to_scalar::<f32>());
-        let squares = squares.map(|square| square.map(f64::from));
-        Ok(squares.sum::<Result<f64>>()?.sqrt())
+        let squares = gradients.map(|it| it.sqr()?.sum_all());
+        let squares = copied(&squares.collect::<Result<Vec<_>>>()?)?.into_iter();
+        Ok(squares.map(f64::from).sum::<f64>().sqrt())
     }
 
     /// What is learned.

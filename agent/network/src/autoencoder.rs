@@ -4,7 +4,8 @@ use crate::adam::{Adam, AdamSettings};
 use crate::batch_norm::moved_statistics;
 use crate::dropout::Dropout;
 use crate::error::NetworkError;
-use crate::model::{Network, Stock};
+use crate::model::Network;
+use crate::operators::Operators;
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
 use crate::tensors::{NamedTensor, found, named_numbers, numbers_of, set};
@@ -77,7 +78,8 @@ impl Autoencoder {
         seed: u64,
         device: &Device,
     ) -> Result<Self, NetworkError> {
-        let network = |vb| Network::new(&vb, &shape, Stock::default());
+        let operators = Operators::on(device, DType::F32);
+        let network = |vb| Network::new(&vb, &shape, operators);
         let (network, variables) = build(seed, DType::F32, device, network)?;
         Ok(Self {
             adam: Adam::new(variables)?,

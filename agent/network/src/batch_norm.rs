@@ -1,10 +1,10 @@
 //! Batch normalisation: moments of the window in training, running ones otherwise.
 
 use crate::ops::norm::{EPSILON, Moments};
-use crate::pass::Pass;
+use crate::pass::{KeptMoments, Pass};
 use crate::tensors::Change;
 use crate::variables::Variables;
-use candle_core::{DType, Result, Tensor};
+use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
 /// Share of a new window in the running statistics, as in PyTorch.
@@ -46,7 +46,10 @@ impl BatchNorm {
                 count: f64::INFINITY,
             });
         }
-        pass.keep_moments(&self.name, &of_window);
+        let tensor = |numbers: &[f64]| Tensor::new(numbers, &Device::Cpu);
+        let moments = [&of_window.mean, &of_window.variance].map(|numbers| tensor(numbers));
+        let [mean, variance] = moments;
+        pass.keep_moments(&self.name, [mean?, variance?], of_window.count);
         Ok(of_window)
     }
 
@@ -58,12 +61,8 @@ impl BatchNorm {
             let flat = u.transpose(0, 1)?.flatten_from(1)?;
             let mean = flat.mean_keepdim(1)?;
             let variance = flat.broadcast_sub(&mean)?.sqr()?.mean_keepdim(1)?;
-            let moments = Moments {
-                mean: exact(&mean)?,
-                variance: exact(&variance)?,
-                count: flat.dim(1)? as f64,
-            };
-            pass.keep_moments(&self.name, &moments);
+            let moments = [mean.flatten_all()?, variance.flatten_all()?];
+            pass.keep_moments(&self.name, moments, flat.dim(1)? as f64);
             (mean, variance)
         } else {
             (self.mean.clone(), self.variance.clone())
@@ -83,20 +82,17 @@ fn exact(tensor: &Tensor) -> Result<Vec<f64>> {
 /// What the running statistics become after a window.
 pub(crate) fn moved_statistics(
     variables: &Variables,
-    moments: &[(String, Moments)],
+    moments: &[KeptMoments],
 ) -> Result<Vec<Change>> {
     let mut moved = Vec::with_capacity(2 * moments.len());
-    for (norm, moments) in moments {
+    for kept in moments {
+        let [mean, variance] = &kept.moments;
         // PyTorch keeps the variance of the sample, divided by the number of values less one.
-        let sample = moments.count / (moments.count - 1.0).max(1.0);
-        let variance = moments.variance.iter().map(|v| v * sample).collect();
-        for (what, new) in [
-            ("running_mean", moments.mean.clone()),
-            ("running_var", variance),
-        ] {
-            let name = format!("{norm}.{what}");
+        let variance = (variance * (kept.count / (kept.count - 1.0).max(1.0)))?;
+        for (what, new) in [("running_mean", mean), ("running_var", &variance)] {
+            let name = format!("{}.{what}", kept.norm);
             let old = &variables[&name];
-            let new = Tensor::new(new, old.device())?.to_dtype(old.dtype())?;
+            let new = new.to_dtype(old.dtype())?;
             let now = ((old.as_detached_tensor() * (1.0 - MOMENTUM))? + (new * MOMENTUM)?)?;
             moved.push((format!("{name} after the update"), old.clone(), now));
         }

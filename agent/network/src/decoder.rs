@@ -4,11 +4,15 @@
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
 use crate::observation_matrix::ObservationMatrix;
-use crate::ops::decoder::Layers;
+use crate::operators::Operators;
+use crate::ops::cell_loss::window_loss;
+use crate::ops::chain::{Chain, Layer, Order};
+use crate::ops::conv::{Conv, Sizes};
+use crate::ops::cpu::{Frames, derived, numbers};
 use crate::pass::Pass;
 use crate::shape::{DECODER_CHANNELS, NetworkShape};
 use crate::variables::uniform_init;
-use candle_core::{Result, Tensor};
+use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 
 /// Places of the transposed convolutions and of the normalisations after them in the authors' list of layers.
@@ -24,7 +28,7 @@ pub struct Decoder {
     /// `[hidden, channels, rows, cols]`: on a single cell, a transposed convolution is a matrix.
     seed: Tensor,
     levels: Vec<Level>,
-    is_stock: bool,
+    operators: Operators,
 }
 
 /// A normalisation, and the doubling behind it.
@@ -35,8 +39,8 @@ struct Level {
 }
 
 impl Decoder {
-    /// A decoder of stock operators or ours.
-    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, is_stock: bool) -> Result<Self> {
+    /// A decoder of these operators.
+    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let [rows, cols] = shape.seed();
         let channels = DECODER_CHANNELS[0];
         let dims = (shape.hidden, channels, rows, cols);
@@ -65,19 +69,25 @@ impl Decoder {
             levels: (0..DECODER_CHANNELS.len())
                 .map(level)
                 .collect::<Result<_>>()?,
-            is_stock,
+            operators,
         })
     }
 
     /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`, for predictions: through our
-    /// operator goes no gradient.
+    /// operators goes no gradient.
     pub fn forward(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        if self.is_stock {
-            return self.stock(hidden, pass);
+        let z = self.seed(hidden)?;
+        match self.operators {
+            Operators::Stock => self.stock(z, pass),
+            Operators::Own => {
+                let all = Mask::all(pass.window.len(), self.n_states()?);
+                let layers = self.layers(pass, &all)?;
+                let [states, rows, cols] = last_map(&layers);
+                let (_, logits) = self.chain(&z, &layers, pass)?;
+                let dims = (pass.window.len(), states, rows, cols);
+                Tensor::from_vec(logits.concat(), dims, &Device::Cpu)
+            }
         }
-        let behind = Mask::all(pass.window.len(), self.n_states()?);
-        let layers = self.layers(hidden, pass, &behind);
-        layers.logits(|level, of_window| self.levels[level].norm.moments(pass, of_window))
     }
 
     /// The loss of what hidden vectors predict (eqs. 8 and 11): that of the window's targets.
@@ -87,13 +97,34 @@ impl Decoder {
         observation: &ObservationMatrix,
         pass: &Pass<'_>,
     ) -> Result<Tensor> {
-        if self.is_stock {
-            return observation.loss(&self.stock(hidden, pass)?, pass.window);
+        let z = self.seed(hidden)?;
+        match self.operators {
+            Operators::Stock => observation.loss(&self.stock(z, pass)?, pass.window),
+            Operators::Own => self.own_loss(&z, &observation.matrix()?.contiguous()?, pass),
         }
-        let behind = Mask::all(pass.window.len(), self.n_states()?);
-        let (layers, matrix) = (self.layers(hidden, pass, &behind), observation.matrix()?);
+    }
+
+    /// The loss is one number, so its gradients are computed with it, and the logits are no tensor.
+    fn own_loss(&self, z: &Tensor, observation: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
+        let all = Mask::all(pass.window.len(), self.n_states()?);
+        let layers = self.layers(pass, &all)?;
+        let (chain, logits) = self.chain(z, &layers, pass)?;
+        let matrix = numbers(observation)?;
+        let loss = window_loss(pass.window, &logits, &matrix, last_map(&layers));
+        drop(matrix);
+        let mut gradients = chain.backward(loss.d_logits)?;
+        gradients.extend(loss.d_observation);
+        let mut from = vec![z];
+        from.extend(layers.iter().flat_map(Layer::tensors));
+        from.push(observation);
+        derived(&from, (), vec![loss.loss as f32], move |d_loss| {
+            gradients.iter().map(|d| d * d_loss[0]).collect()
+        })
+    }
+
+    fn chain(&self, z: &Tensor, layers: &[Layer<'_>], pass: &Pass<'_>) -> Result<(Chain, Frames)> {
         let moments = |level: usize, of_window| self.levels[level].norm.moments(pass, of_window);
-        layers.loss(pass.window, &matrix.contiguous()?, moments)
+        Chain::forward((z, pass.decoder_mask(0)), layers, Order::NormFirst, moments)
     }
 
     fn n_states(&self) -> Result<usize> {
@@ -101,29 +132,47 @@ impl Decoder {
         last.kernels.dim(1)
     }
 
-    fn layers<'a>(
-        &'a self,
-        hidden: &'a Tensor,
-        pass: &'a Pass<'_>,
-        behind: &'a Mask,
-    ) -> Layers<'a> {
-        let masks = (0..self.levels.len()).map(|level| pass.decoder_mask(level));
-        let levels = self.levels.iter().map(|Level { norm, kernels }| {
-            let [gamma, beta] = norm.weights();
-            [gamma, beta, kernels]
-        });
-        Layers {
-            hidden,
-            seed: &self.seed,
-            levels: levels.collect(),
-            masks: masks.chain([behind]).collect(),
-        }
+    /// The doublings; `all` is the dropout behind the last.
+    fn layers<'a>(&'a self, pass: &'a Pass<'_>, all: &'a Mask) -> Result<Vec<Layer<'a>>> {
+        let (_, _, mut rows, mut cols) = self.seed.dims4()?;
+        let levels = self.levels.iter().enumerate();
+        levels
+            .map(|(index, Level { norm, kernels })| {
+                let (from, to, ..) = kernels.dims4()?;
+                let sizes = Sizes {
+                    small: [from, rows, cols],
+                    large: [to, 2 * rows, 2 * cols],
+                    kernel: [KERNEL; 2],
+                    stride: 2,
+                    padding: 1,
+                    dilation: 1,
+                };
+                (rows, cols) = (2 * rows, 2 * cols);
+                let is_last = index + 1 == self.levels.len();
+                Ok(Layer {
+                    conv: Conv::new(sizes),
+                    transposed: true,
+                    weights: Layer::weights_of(kernels)?,
+                    bias: None,
+                    norm: Some(norm.weights()),
+                    output: if is_last {
+                        all
+                    } else {
+                        pass.decoder_mask(index + 1)
+                    },
+                })
+            })
+            .collect()
     }
 
-    fn stock(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
+    /// The first maps, `[frames, channels, rows, cols]`.
+    fn seed(&self, hidden: &Tensor) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
-        let mut z = seed.reshape(((), channels, rows, cols))?;
+        seed.reshape(((), channels, rows, cols))
+    }
+
+    fn stock(&self, mut z: Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         for (level, Level { norm, kernels }) in self.levels.iter().enumerate() {
             let mask = pass.decoder_mask(level).tensor(z.dtype(), z.device())?;
             let kept = z.broadcast_mul(&mask.unsqueeze(2)?.unsqueeze(3)?)?;
@@ -132,4 +181,10 @@ impl Decoder {
         }
         Ok(z)
     }
+}
+
+/// Channels, rows and columns of the last result.
+fn last_map(layers: &[Layer<'_>]) -> [usize; 3] {
+    let last = layers.last().expect("invariant: four levels");
+    last.conv.sizes.large
 }

@@ -2,11 +2,15 @@
 //! layer.
 
 use crate::batch_norm::BatchNorm;
-use crate::ops::encoder::{Layer, encode};
+use crate::dropout::Mask;
+use crate::operators::Operators;
+use crate::ops::chain::{Chain, Layer, Order};
+use crate::ops::conv::{Conv, Sizes};
+use crate::ops::cpu::{Frames, derived};
 use crate::pass::Pass;
 use crate::shape::{ConvShape, NetworkShape};
 use crate::variables::uniform_init;
-use candle_core::{Result, Tensor};
+use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::{Linear, Module, VarBuilder};
 
 /// Places of the convolutions and of the normalisations in the authors' list of layers.
@@ -18,7 +22,7 @@ const LINEAR: usize = 13;
 pub struct Encoder {
     stages: Vec<Stage>,
     linear: Linear,
-    is_stock: bool,
+    operators: Operators,
 }
 
 #[derive(Debug)]
@@ -30,8 +34,8 @@ struct Stage {
 }
 
 impl Encoder {
-    /// An encoder of stock operators or ours.
-    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, is_stock: bool) -> Result<Self> {
+    /// An encoder of these operators.
+    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let stages = STAGES.iter().zip(shape.convolutions());
         let stages = stages.map(|(places, shape)| Stage::new(vb, *places, shape));
         let init = uniform_init(shape.features());
@@ -41,18 +45,16 @@ impl Encoder {
         Ok(Self {
             stages: stages.collect::<Result<_>>()?,
             linear: Linear::new(weight, Some(bias)),
-            is_stock,
+            operators,
         })
     }
 
     /// The encodings of all frames, `[frames, encoding]`.
     pub fn forward(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let features = if self.is_stock {
-            self.stock(pass)?
-        } else {
-            self.ours(pass)?
-        };
-        self.linear.forward(&features)
+        match self.operators {
+            Operators::Stock => self.linear.forward(&self.stock(pass)?),
+            Operators::Own => self.ours(pass),
+        }
     }
 
     /// Maps are `[frames, channels, rows, cols]`.
@@ -72,25 +74,83 @@ impl Encoder {
         x.flatten_from(1)
     }
 
+    /// The same, with the linear layer as one more convolution, whose kernel is as large as the map.
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let layers = self
-            .stages
-            .iter()
-            .enumerate()
-            .map(|(index, stage)| {
-                Ok(Layer {
-                    shape: stage.shape,
-                    kernels: stage.kernels(index == 0)?,
-                    bias: &stage.bias,
-                    norm: stage.norm.weights(),
-                    mask: pass.encoder_mask(index),
-                })
-            })
-            .collect::<Result<Vec<_>>>()?;
-        encode(pass.window, &layers, pass.trains(), |index, of_window| {
-            self.stages[index].norm.moments(pass, of_window)
+        let (n_frames, encoding) = (pass.window.len(), self.linear.weight().dim(0)?);
+        let all = Mask::all(n_frames, encoding);
+        let mut layers = Vec::with_capacity(self.stages.len() + 1);
+        let mut norm = None;
+        for (index, stage) in self.stages.iter().enumerate() {
+            let ConvShape {
+                channels_in,
+                channels_out,
+                kernel,
+                stride,
+                input,
+                output,
+            } = stage.shape;
+            let sizes = Sizes {
+                large: [channels_in, input[0], input[1]],
+                small: [channels_out, output[0], output[1]],
+                kernel,
+                stride,
+                padding: 0,
+                dilation: 1,
+            };
+            let mask = pass.encoder_mask(index);
+            layers.push(layer(sizes, &stage.weight, &stage.bias, norm, mask)?);
+            norm = Some(stage.norm.weights());
+        }
+        let large = layers[self.stages.len() - 1].conv.sizes.small;
+        let sizes = Sizes {
+            large,
+            small: [encoding, 1, 1],
+            kernel: [large[1], large[2]],
+            stride: 1,
+            padding: 0,
+            dilation: 1,
+        };
+        let [channels, rows, cols] = large;
+        let weight = self.linear.weight();
+        let weight = weight.reshape((encoding, channels, rows, cols))?;
+        let bias = self.linear.bias().expect("invariant: made with a bias");
+        layers.push(layer(sizes, &weight, bias, norm, &all)?);
+        let moments =
+            |index: usize, of_window| self.stages[index - 1].norm.moments(pass, of_window);
+        let first = &self.stages[0].shape;
+        let seen = Mask::all(n_frames, first.channels_in);
+        let maps =
+            (pass.window).one_hot(first.channels_in, first.input, DType::F32, &Device::Cpu)?;
+        let input = (&maps, &seen);
+        let (chain, encodings) = Chain::forward(input, &layers, Order::ReluFirst, moments)?;
+        let (dims, encodings) = ((n_frames, encoding), encodings.concat());
+        if !pass.trains() {
+            return Tensor::from_vec(encodings, dims, &Device::Cpu);
+        }
+        let from: Vec<_> = layers.iter().flat_map(Layer::tensors).collect();
+        derived(&from, dims, encodings, move |d| {
+            let gradients = chain.backward(Frames::of(n_frames, d));
+            gradients.expect("invariant: the forward pass has read the same tensors")
         })
     }
+}
+
+/// A convolution with `weight [channels out, channels in, rows, cols]`.
+fn layer<'a>(
+    sizes: Sizes,
+    weight: &Tensor,
+    bias: &'a Tensor,
+    norm: Option<[&'a Tensor; 2]>,
+    output: &'a Mask,
+) -> Result<Layer<'a>> {
+    Ok(Layer {
+        conv: Conv::new(sizes),
+        transposed: false,
+        weights: Layer::weights_of(weight)?,
+        bias: Some(bias),
+        norm,
+        output,
+    })
 }
 
 impl Stage {
@@ -105,13 +165,6 @@ impl Stage {
             bias: of_conv.get_with_hints(n, "bias", init)?,
             norm: BatchNorm::new(&vb.pp(norm), n)?,
         })
-    }
-
-    /// The weights as our operator takes them: of the first layer, `[channels in, rows, cols, channels out]`;
-    /// of others, the channels in come third.
-    fn kernels(&self, is_first: bool) -> Result<Tensor> {
-        let order = if is_first { (1, 2, 3, 0) } else { (2, 3, 1, 0) };
-        self.weight.permute(order)?.flatten(0, 2)?.contiguous()
     }
 
     fn stock_conv(&self, x: &Tensor) -> Result<Tensor> {

@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 /// A number that is not finite: training must stop.
-#[derive(Debug, Error, PartialEq)]
+#[derive(Debug, Clone, Error, PartialEq)]
 #[error("update {update}: expected finite numbers, got one that is not in {tensor}")]
 pub struct NotFinite {
     /// Updates before this one.
@@ -13,7 +13,7 @@ pub struct NotFinite {
 }
 
 /// Why a step or an update failed; nothing has changed then.
-#[derive(Debug, Error, PartialEq)]
+#[derive(Debug, Clone, Error, PartialEq)]
 pub enum NetworkError {
     /// The numbers.
     #[error(transparent)]

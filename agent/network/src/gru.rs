@@ -1,8 +1,9 @@
 //! The recurrence of paper eq. 9 over a window.
 
+use crate::operators::Operators;
 use crate::ops::gru_sequence::gru_sequence;
 use crate::variables::uniform_init;
-use candle_core::{Device, Result, Tensor};
+use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::sigmoid;
 
@@ -13,19 +14,24 @@ pub struct Gru {
     w_hh: Tensor,
     b_ih: Tensor,
     b_hh: Tensor,
-    is_stock: bool,
+    operators: Operators,
 }
 
 impl Gru {
-    /// A GRU from so many inputs to a hidden vector of some length, of stock operators or ours.
-    pub fn new(vb: &VarBuilder<'_>, inputs: usize, hidden: usize, is_stock: bool) -> Result<Self> {
+    /// A GRU from so many inputs to a hidden vector of some length, of these operators.
+    pub fn new(
+        vb: &VarBuilder<'_>,
+        inputs: usize,
+        hidden: usize,
+        operators: Operators,
+    ) -> Result<Self> {
         let (gates, init) = (3 * hidden, uniform_init(hidden));
         Ok(Self {
             w_ih: vb.get_with_hints((gates, inputs), "weight_ih_l0", init)?,
             w_hh: vb.get_with_hints((gates, hidden), "weight_hh_l0", init)?,
             b_ih: vb.get_with_hints(gates, "bias_ih_l0", init)?,
             b_hh: vb.get_with_hints(gates, "bias_hh_l0", init)?,
-            is_stock,
+            operators,
         })
     }
 
@@ -33,16 +39,29 @@ impl Gru {
     /// before them.
     pub fn forward(&self, x: &Tensor, first: &[f32]) -> Result<Tensor> {
         let inputs = x.matmul(&self.w_ih.t()?)?.broadcast_add(&self.b_ih)?;
-        if self.is_stock {
-            return self.stock(&inputs, first);
+        match (self.operators, inputs.dtype()) {
+            (Operators::Own, _) => gru_sequence(&inputs, &self.w_hh, &self.b_hh, first),
+            (Operators::Stock, DType::F32) => self.through_the_cpu(&inputs, first),
+            (Operators::Stock, _) => self.step_by_step(&inputs, first),
         }
-        // On other devices too: a thousand steps of a few numbers are a thousand times a dozen launches.
-        let cpu = |tensor: &Tensor| tensor.to_device(&Device::Cpu);
-        let (w, b) = (cpu(&self.w_hh)?, cpu(&self.b_hh)?);
-        gru_sequence(&cpu(&inputs)?, &w, &b, first)?.to_device(x.device())
     }
 
-    fn stock(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
+    /// One copy there, one back.
+    fn through_the_cpu(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
+        let all = [inputs, &self.w_hh, &self.b_hh];
+        let flat = all.map(|tensor| tensor.flatten_all());
+        let flat = flat.into_iter().collect::<Result<Vec<_>>>()?;
+        let flat = Tensor::cat(&flat, 0)?.to_device(&Device::Cpu)?;
+        let mut start = 0;
+        let [inputs, w, b] = all.map(|like| {
+            let part = flat.narrow(0, start, like.elem_count())?;
+            start += like.elem_count();
+            part.reshape(like.shape())
+        });
+        gru_sequence(&inputs?, &w?, &b?, first)?.to_device(self.w_hh.device())
+    }
+
+    fn step_by_step(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
         let n = first.len();
         let h = Tensor::from_slice(first, (1, n), inputs.device())?;
         let (mut h, mut all) = (h.to_dtype(inputs.dtype())?, Vec::new());

@@ -4,46 +4,13 @@ use crate::decoder::Decoder;
 use crate::encoder::Encoder;
 use crate::gru::Gru;
 use crate::observation_matrix::ObservationMatrix;
+use crate::operators::Operators;
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
 use crate::variables::count_numbers;
-use candle_core::{DType, Result, Tensor};
+use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::softmax;
-
-/// Which layers use candle's stock operators instead of ours.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Stock {
-    /// The encoder.
-    pub encoder: bool,
-    /// The recurrence.
-    pub gru: bool,
-    /// The decoder with the loss.
-    pub decoder: bool,
-}
-
-impl Stock {
-    /// All of them.
-    pub const ALL: Self = Self {
-        encoder: true,
-        gru: true,
-        decoder: true,
-    };
-
-    /// What is needed where the variables are: ours are for 32-bit floats on the CPU. The recurrence moves
-    /// there.
-    fn at_least(self, vb: &VarBuilder<'_>) -> Self {
-        let must = !vb.device().is_cpu();
-        match vb.dtype() {
-            DType::F32 => Self {
-                encoder: self.encoder || must,
-                gru: self.gru,
-                decoder: self.decoder || must,
-            },
-            _ => Self::ALL,
-        }
-    }
-}
 
 /// Encoder, recurrence, decoder and observation matrix, by the authors' names.
 #[derive(Debug)]
@@ -56,13 +23,13 @@ pub struct Network {
 
 impl Network {
     /// A network whose layers ask `vb` for their variables.
-    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, stock: Stock) -> Result<Self> {
-        let (stock, gru) = (stock.at_least(vb), vb.pp("rnn_layer"));
+    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let (n_observations, n_states) = (shape.n_observations, shape.n_states);
+        let gru = vb.pp("rnn_layer");
         Ok(Self {
-            encoder: Encoder::new(&vb.pp("encoder"), shape, stock.encoder)?,
-            gru: Gru::new(&gru, shape.encoding, shape.hidden, stock.gru)?,
-            decoder: Decoder::new(&vb.pp("decoder"), shape, stock.decoder)?,
+            encoder: Encoder::new(&vb.pp("encoder"), shape, operators)?,
+            gru: Gru::new(&gru, shape.encoding, shape.hidden, operators)?,
+            decoder: Decoder::new(&vb.pp("decoder"), shape, operators)?,
             observation: ObservationMatrix::new(vb, n_observations, n_states)?,
         })
     }
@@ -94,7 +61,7 @@ impl Network {
 impl NetworkShape {
     /// How many numbers the network's parameters and statistics have; none of them is made.
     pub fn n_numbers(&self) -> usize {
-        count_numbers(|vb| Network::new(&vb, self, Default::default()))
+        count_numbers(|vb| Network::new(&vb, self, Operators::Own))
     }
 }
 

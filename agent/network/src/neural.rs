@@ -7,13 +7,15 @@
 use crate::adam::{Adam, AdamSettings};
 use crate::crop::{Crop, extent};
 use crate::error::NetworkError;
+use crate::operators::Operators;
 use crate::sightings::{Features, Sightings};
 use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::unet::UNet;
 use crate::variables::{Variables, build};
-use candle_core::{D, DType, Device, Shape, Tensor};
+use candle_core::{D, DType, Device, Result as CandleResult, Shape, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
 use emberwatch_model::grid::Probabilities;
+use rayon::prelude::*;
 use std::fmt;
 use std::sync::Arc;
 
@@ -31,12 +33,19 @@ const LEAST: f64 = 1e-6;
 /// Cells of a batch: 16 grids of 64 x 64, or 40 crops of 40 x 40.
 const BATCH_CELLS: usize = 65_536;
 
+/// Cells of one pass of predictions on a device other than the CPU: 64 grids of 64 x 64.
+const PASS_CELLS: usize = 262_144;
+
+/// What was seen in a world, and what the filter that is corrected predicts there, `[O, H, W]`.
+pub type Seen<'a> = (&'a Sightings, Option<&'a Probabilities>);
+
 /// The network, its variables and its optimiser. Clones share the variables: each sees the updates that another makes.
 #[derive(Clone)]
 pub struct NeuralBelief {
     n_observations: usize,
     features: Arc<Features>,
     device: Device,
+    operators: Operators,
     unet: Arc<UNet>,
     adam: Adam,
 }
@@ -55,16 +64,33 @@ pub struct Lesson {
 impl NeuralBelief {
     /// A new network of a seed, for worlds with so many observations.
     pub fn new(n_observations: usize, seed: u64, device: &Device) -> Result<Self, NetworkError> {
+        let operators = Operators::on(device, DType::F32);
+        Self::with_operators(n_observations, seed, device, operators)
+    }
+
+    /// As [`Self::new`], of these operators. Candle's also compute on the CPU.
+    pub fn with_operators(
+        n_observations: usize,
+        seed: u64,
+        device: &Device,
+        operators: Operators,
+    ) -> Result<Self, NetworkError> {
         let n_features = Features::n_channels(n_observations);
-        let unet = |vb| UNet::new(&vb, n_features, n_observations, false);
+        let unet = |vb| UNet::new(&vb, n_features, n_observations, operators);
         let (unet, variables) = build(seed, DType::F32, device, unet)?;
         Ok(Self {
             n_observations,
             features: Arc::new(Features::new(n_observations)),
             device: device.clone(),
+            operators,
             unet: Arc::new(unet),
             adam: Adam::new(variables)?,
         })
+    }
+
+    /// Whether it is a clone of another, and shares its variables.
+    pub fn is_same(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.unet, &other.unet)
     }
 
     /// Number of values that a cell may show.
@@ -109,31 +135,67 @@ impl NeuralBelief {
         sightings: &Sightings,
         base: Option<&Probabilities>,
     ) -> Result<Probabilities, NetworkError> {
-        let crop = Crop::whole(sightings.shape());
-        let mut features = Vec::new();
-        self.features.add(sightings, &crop, &mut features);
-        let logits = self.unet.logits(&self.tensor(features, 1, crop.sides)?)?;
-        let (height, width) = sightings.shape().dim();
-        let logits = logits
-            .squeeze(0)?
-            .narrow(0, 0, height)?
-            .narrow(1, 0, width)?;
-        let logits = match base {
-            Some(base) => {
-                let base = base.view().permuted_axes([1, 2, 0]);
-                (logits + self.logarithms(base.iter(), (height, width, self.n_observations))?)?
-            }
-            None => logits,
+        let mut all = self.predict_in_one_pass(&[(sightings, base)])?;
+        Ok(all.swap_remove(0))
+    }
+
+    /// [`Self::predict`] of several worlds of one grid, of which all have a base or none has: on the CPU each on a thread
+    /// of its own, on other devices many in one pass.
+    ///
+    /// # Errors
+    /// As of [`Self::predict`].
+    pub fn predict_all(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
+        let Some((first, _)) = worlds.first() else {
+            return Ok(Vec::new());
         };
-        let probabilities = softmax(&logits.contiguous()?, D::Minus1)?;
-        let n = self.n_observations;
-        let probabilities = probabilities.affine(1.0 - n as f64 * LEAST, LEAST)?;
-        let numbers: Vec<f32> = probabilities.permute((2, 0, 1))?.flatten_all()?.to_vec1()?;
+        let passes = match self.operators {
+            // Handing it to another thread costs more than it gains.
+            Operators::Own if worlds.len() == 1 => {
+                vec![self.predict_in_one_pass(worlds)].into_iter().collect()
+            }
+            Operators::Own => {
+                let worlds = worlds.par_iter().with_max_len(1);
+                worlds
+                    .map(|world| self.predict_in_one_pass(&[*world]))
+                    .collect()
+            }
+            Operators::Stock => {
+                let most = (PASS_CELLS / first.shape().n_cells()).max(1);
+                let passes = worlds.chunks(most);
+                passes
+                    .map(|worlds| self.predict_in_one_pass(worlds))
+                    .collect()
+            }
+        };
+        let passes: Result<Vec<_>, NetworkError> = passes;
+        Ok(passes?.into_iter().flatten().collect())
+    }
+
+    fn predict_in_one_pass(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
+        let (n, shape) = (worlds.len(), worlds[0].0.shape());
+        let (crop, (height, width)) = (Crop::whole(shape), shape.dim());
+        let images = worlds.iter().map(|(sightings, _)| (*sightings, &crop));
+        let logits = self.unet.logits(&self.images(images, crop.sides)?)?;
+        let logits = logits.narrow(2, 0, height)?.narrow(3, 0, width)?;
+        let bases: Vec<_> = worlds.iter().filter_map(|(_, base)| *base).collect();
+        let (o, logits) = (self.n_observations, logits.contiguous()?);
+        let logits = if bases.is_empty() {
+            logits
+        } else {
+            let bases = bases.into_iter().flatten();
+            (logits + self.logarithms(bases, (n, o, height, width))?)?
+        };
+        let probabilities = softmax(&logits, 1)?.affine(1.0 - o as f64 * LEAST, LEAST)?;
+        let numbers: Vec<f32> = probabilities.flatten_all()?.to_vec1()?;
         if !numbers.iter().all(|number| number.is_finite()) {
             return Err(self.adam.not_finite("the prediction".into()));
         }
-        let numbers = Probabilities::from_shape_vec((n, height, width), numbers);
-        Ok(numbers.expect("invariant: one number per observation and cell"))
+        let worlds = numbers.chunks_exact(o * height * width);
+        let world = |numbers: &[f32]| {
+            let numbers = Probabilities::from_shape_vec((o, height, width), numbers.to_vec());
+            numbers.expect("invariant: one number per observation and cell")
+        };
+        Ok(worlds.map(world).collect())
     }
 
     /// The mean cross-entropy of what the cells of lessons of one grid show (paper eqs. 8 and 11). The network reads crops
@@ -147,10 +209,13 @@ impl NeuralBelief {
         let extents: Vec<_> = extents.collect();
         let sides = Crop::sides(shape, &extents);
         let n = (BATCH_CELLS / (sides[0] * sides[1])).clamp(1, lessons.len());
-        let (mut features, mut cells, mut values) = (Vec::new(), Vec::new(), Vec::new());
-        for (image, lesson) in lessons[..n].iter().enumerate() {
-            let crop = Crop::around(shape, sides, &extents[image]);
-            self.features.add(&lesson.before, &crop, &mut features);
+        let (mut cells, mut values) = (Vec::new(), Vec::new());
+        let crops: Vec<Crop> = extents[..n]
+            .iter()
+            .map(|it| Crop::around(shape, sides, it))
+            .collect();
+        let images = self.images(lessons.iter().map(|it| &it.before).zip(&crops), sides)?;
+        for (image, (lesson, crop)) in lessons.iter().zip(&crops).enumerate() {
             for &(cell, value) in &lesson.frame {
                 let cell = shape.cell(cell);
                 let [top, left] = crop.first;
@@ -158,18 +223,66 @@ impl NeuralBelief {
                 values.push(u32::from(value));
             }
         }
-        let logits = self
-            .unet
-            .logits_at(&self.tensor(features, n, sides)?, &cells)?;
-        let base = lessons[..n].iter().flat_map(|lesson| &lesson.base);
-        let logits = if lessons[0].base.is_empty() {
+        let base: Vec<f32> = lessons[..n]
+            .iter()
+            .flat_map(|it| &it.base)
+            .copied()
+            .collect();
+        Ok(match self.operators {
+            Operators::Own => self.loss_at(&images, &cells, values, &base)?,
+            Operators::Stock => self.loss_of_all(&images, &cells, &values, &base)?,
+        })
+    }
+
+    /// The last layers compute the cells that are seen.
+    fn loss_at(
+        &self,
+        images: &Tensor,
+        cells: &[[usize; 3]],
+        values: Vec<u32>,
+        base: &[f32],
+    ) -> CandleResult<Tensor> {
+        let logits = self.unet.logits_at(images, cells)?;
+        let logits = if base.is_empty() {
             logits
         } else {
-            (logits + self.logarithms(base, (cells.len(), self.n_observations))?)?
+            (logits + self.logarithms(base.iter(), (cells.len(), self.n_observations))?)?
         };
         let values = Tensor::new(values, &self.device)?.unsqueeze(1)?;
         let log_p = log_softmax(&logits, D::Minus1)?.gather(&values, 1)?;
-        Ok(log_p.mean_all()?.neg()?)
+        log_p.mean_all()?.neg()
+    }
+
+    /// The same with all cells, and a weight for each: nothing is gathered or scattered.
+    fn loss_of_all(
+        &self,
+        images: &Tensor,
+        cells: &[[usize; 3]],
+        values: &[u32],
+        base: &[f32],
+    ) -> CandleResult<Tensor> {
+        let logits = self.unet.logits(images)?;
+        let (_, n, rows, cols) = logits.dims4()?;
+        let at = |[image, row, col]: &[usize; 3], value: usize| {
+            ((image * n + value) * rows + row) * cols + col
+        };
+        let mut weights = vec![0.0_f32; logits.elem_count()];
+        for (cell, value) in cells.iter().zip(values) {
+            weights[at(cell, *value as usize)] -= 1.0 / cells.len() as f32;
+        }
+        let weights = Tensor::from_vec(weights, logits.shape(), &self.device)?;
+        let logits = if base.is_empty() {
+            logits
+        } else {
+            let mut of_all = vec![1.0_f32; logits.elem_count()];
+            for (cell, base) in cells.iter().zip(base.chunks(n)) {
+                for (value, base) in base.iter().enumerate() {
+                    of_all[at(cell, value)] = *base;
+                }
+            }
+            (&logits + self.logarithms(of_all.iter(), logits.shape())?)?
+        };
+        (log_softmax(&logits, 1)? * weights)?.sum_all()
     }
 
     /// One step of Adam on lessons; the loss before it. Nothing has changed after an error.
@@ -211,19 +324,26 @@ impl NeuralBelief {
         &self,
         probabilities: impl Iterator<Item = &'a f32>,
         shape: impl Into<Shape>,
-    ) -> candle_core::Result<Tensor> {
+    ) -> CandleResult<Tensor> {
         let logarithms = probabilities.map(|p| p.max(LEAST as f32).ln());
         Tensor::from_vec(logarithms.collect(), shape.into(), &self.device)
     }
 
-    fn tensor(
+    /// What the network reads of crops of these sides, `[crops, features, rows, cols]`.
+    fn images<'a>(
         &self,
-        features: Vec<f32>,
-        n: usize,
+        crops: impl Iterator<Item = (&'a Sightings, &'a Crop)>,
         [rows, cols]: [usize; 2],
-    ) -> candle_core::Result<Tensor> {
-        let channels = Features::n_channels(self.n_observations);
-        Tensor::from_vec(features, (n, rows, cols, channels), &self.device)
+    ) -> CandleResult<Tensor> {
+        let (crops, n) = (
+            crops.collect::<Vec<_>>(),
+            Features::n_channels(self.n_observations),
+        );
+        let image = rows * cols * n;
+        let mut features = vec![0.0; crops.len() * image];
+        let images = features.par_chunks_mut(image).zip(&crops);
+        images.for_each(|(image, (sightings, crop))| self.features.write(sightings, crop, image));
+        Tensor::from_vec(features, (crops.len(), n, rows, cols), &self.device)
     }
 }
 

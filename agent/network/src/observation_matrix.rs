@@ -28,44 +28,35 @@ impl ObservationMatrix {
     }
 
     /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[frames, states,
-    /// rows, cols]`, by stock operators.
+    /// rows, cols]`, by stock operators: the sum over all cells with a weight each, so that nothing is gathered or
+    /// scattered.
     pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
-        let (matrix, targets) = (self.matrix()?, window.all_targets());
-        let u = softmax(&at_targets(logits, window)?, 1)?;
-        let q = u.matmul(&matrix.t()?)?;
-        let y = one_hot(window, &q)?;
-        let hit = (&y * (&q + LOG_FLOOR)?.log()?)?;
+        let matrix = self.matrix()?;
+        let u = softmax(logits, 1)?.permute((0, 2, 3, 1))?;
+        let q = u.reshape(((), matrix.dim(1)?))?.matmul(&matrix.t()?)?;
+        let [hits, misses] = weights(logits, window, &q)?;
+        let hit = (hits * (&q + LOG_FLOOR)?.log()?)?;
         // Rounding may take q above one.
-        let miss = ((1.0 - &y)? * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
-        (hit + miss)?.sum_all()?.neg()? / targets.len() as f64
+        let miss = (misses * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
+        (hit + miss)?.sum_all()
     }
 }
 
-/// The logits of the targets, `[targets, states]`.
-fn at_targets(logits: &Tensor, window: &Window) -> Result<Tensor> {
-    let (_, n_states, rows, cols) = logits.dims4()?;
-    let cells = (0..window.len()).flat_map(|frame| {
-        let targets = window.targets(frame).iter();
-        targets.map(move |visit| {
-            let (row, col) = (usize::from(visit.row), usize::from(visit.col));
-            ((frame * rows + row) * cols + col) as u32
-        })
-    });
-    let cells = Tensor::new(cells.collect::<Vec<u32>>(), logits.device())?;
-    let by_cell = logits.permute((0, 2, 3, 1))?.reshape(((), n_states))?;
-    by_cell.index_select(&cells, 0)
-}
-
-/// What the targets showed, as rows like those of `q`.
-fn one_hot(window: &Window, q: &Tensor) -> Result<Tensor> {
-    let mut rows = vec![0.0_f32; q.elem_count()];
-    let n_observations = q.dim(1)?;
-    for (row, visit) in rows
-        .chunks_exact_mut(n_observations)
-        .zip(window.all_targets())
-    {
-        row[usize::from(visit.value)] = 1.0;
+/// What the logarithms of each cell's observations count in the loss, if they were seen and if they were not,
+/// `[cells, observations]` as `q`.
+fn weights(logits: &Tensor, window: &Window, q: &Tensor) -> Result<[Tensor; 2]> {
+    let (_, _, rows, cols) = logits.dims4()?;
+    let (n, weight) = (q.dim(1)?, -1.0 / window.all_targets().len() as f32);
+    let mut hits = vec![0.0_f32; q.elem_count()];
+    let mut misses = hits.clone();
+    for frame in 0..window.len() {
+        for visit in window.targets(frame) {
+            let cell = (frame * rows + usize::from(visit.row)) * cols + usize::from(visit.col);
+            misses[cell * n..][..n].fill(weight);
+            misses[cell * n + usize::from(visit.value)] = 0.0;
+            hits[cell * n + usize::from(visit.value)] = weight;
+        }
     }
-    let rows = Tensor::from_vec(rows, q.shape(), q.device())?;
-    rows.to_dtype(q.dtype())
+    let tensor = |numbers| Tensor::from_vec(numbers, q.shape(), q.device())?.to_dtype(q.dtype());
+    Ok([tensor(hits)?, tensor(misses)?])
 }

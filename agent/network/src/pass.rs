@@ -1,8 +1,8 @@
 //! What the layers are told about one pass over a window.
 
 use crate::dropout::{Dropout, Mask};
-use crate::ops::norm::Moments;
 use crate::window::Window;
+use candle_core::Tensor;
 use std::cell::RefCell;
 
 /// One pass: the frames, and either the dropout of training or none.
@@ -15,7 +15,18 @@ pub struct Pass<'a> {
     pub window: &'a Window,
     dropout: Dropout,
     trains: bool,
-    moments: RefCell<Vec<(String, Moments)>>,
+    moments: RefCell<Vec<KeptMoments>>,
+}
+
+/// The moments of a window behind one normalisation.
+#[derive(Debug)]
+pub(crate) struct KeptMoments {
+    /// The name of the normalisation.
+    pub(crate) norm: String,
+    /// Mean and variance of each channel; the variance is the population's.
+    pub(crate) moments: [Tensor; 2],
+    /// Values per channel.
+    pub(crate) count: f64,
 }
 
 impl<'a> Pass<'a> {
@@ -59,13 +70,17 @@ impl<'a> Pass<'a> {
         &self.dropout.decoder[level]
     }
 
-    pub(crate) fn keep_moments(&self, norm: &str, moments: &Moments) {
-        let mut kept = self.moments.borrow_mut();
-        kept.push((norm.to_owned(), moments.clone()));
+    pub(crate) fn keep_moments(&self, norm: &str, moments: [Tensor; 2], count: f64) {
+        self.moments.borrow_mut().push(KeptMoments {
+            norm: norm.into(),
+            // No gradient goes through them.
+            moments: moments.map(|tensor| tensor.detach()),
+            count,
+        });
     }
 
-    /// The window's moments, by the names of the normalisations.
-    pub(crate) fn into_moments(self) -> Vec<(String, Moments)> {
+    /// The window's moments.
+    pub(crate) fn into_moments(self) -> Vec<KeptMoments> {
         self.moments.into_inner()
     }
 }

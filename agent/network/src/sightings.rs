@@ -160,44 +160,42 @@ impl Features {
         4 * n_observations + 4
     }
 
-    /// Adds the features of a crop's cells, row-major.
-    pub fn add(&self, sightings: &Sightings, crop: &Crop, to: &mut Vec<f32>) {
-        let ([height, width], n) = (crop.sides, Self::n_channels(self.n_observations));
+    /// Writes the features of a crop's cells, `[features, rows, cols]`, over zeros.
+    pub fn write(&self, sightings: &Sightings, crop: &Crop, to: &mut [f32]) {
+        let [height, width] = crop.sides;
         let (rows, cols) = sightings.shape.dim();
-        let start = to.len();
-        to.resize(start + height * width * n, 0.0);
-        let mut cells = to[start..].chunks_exact_mut(n);
-        for row in (0..height).map(|row| crop.first[0] + row) {
-            for col in (0..width).map(|col| crop.first[1] + col) {
-                let Some(to) = cells.next().filter(|_| row < rows && col < cols) else {
-                    continue;
-                };
-                self.write(sightings, row * cols + col, to);
+        for row in 0..height.min(rows - crop.first[0]) {
+            for col in 0..width.min(cols - crop.first[1]) {
+                let cell = (crop.first[0] + row) * cols + crop.first[1] + col;
+                let at = row * width + col;
+                self.write_cell(sightings, cell, |feature, number| {
+                    to[feature * height * width + at] = number;
+                });
             }
         }
     }
 
-    fn write(&self, sightings: &Sightings, cell: usize, to: &mut [f32]) {
+    /// Calls `to(feature, number)` for those that are not zero.
+    fn write_cell(&self, sightings: &Sightings, cell: usize, mut to: impl FnMut(usize, f32)) {
         let n = self.n_observations;
         let [last, before] = sightings.cells[cell].map(|seen| {
             let age = ((sightings.step - seen.step) as usize).min(OLDEST);
             let is_seen = seen.value != UNOBSERVED;
             is_seen.then(|| (usize::from(seen.value), self.ages[age]))
         });
-        let (of_values, of_cell) = to.split_at_mut(4 * n);
         if let Some((value, age)) = last {
             for (at, freshness) in age.freshness.into_iter().enumerate() {
-                of_values[at * n + value] = freshness;
+                to(at * n + value, freshness);
             }
         }
         if let Some((value, age)) = before {
-            of_values[3 * n + value] = age.freshness[1];
-            of_cell[3] = age.freshness[2];
+            to(3 * n + value, age.freshness[1]);
+            to(4 * n + 3, age.freshness[2]);
         }
         let age = last.map_or(self.ages[OLDEST], |(_, age)| age);
-        of_cell[0] = f32::from(last.is_none());
-        of_cell[1] = age.logarithm;
-        of_cell[2] = 1.0;
+        to(4 * n, f32::from(last.is_none()));
+        to(4 * n + 1, age.logarithm);
+        to(4 * n + 2, 1.0);
     }
 }
 
@@ -224,10 +222,16 @@ mod tests {
     fn features_tell_what_was_seen_when_and_what_lies_inside() {
         let crop = Crop::whole(shape());
         assert_eq!((crop.sides, Features::n_channels(3)), ([4, 4], 16));
-        let mut features = vec![7.0];
-        Features::new(3).add(&sightings(), &crop, &mut features);
-        assert_eq!(features.len(), 1 + 16 * 16);
-        let cell = |cell: usize| &features[1 + 16 * cell..][..16];
+        let mut features = vec![0.0; 16 * 16];
+        Features::new(3).write(&sightings(), &crop, &mut features);
+        let cell = |cell: usize| {
+            features
+                .iter()
+                .skip(cell)
+                .step_by(16)
+                .copied()
+                .collect::<Vec<_>>()
+        };
         let fresh = |age: f32, steps: f32| (-age / steps).exp();
         let [a, b, c] = FADING_STEPS.map(|steps| fresh(10.0, steps));
         let log = |age: f32| age.ln_1p() / 8.0;
@@ -273,7 +277,8 @@ mod tests {
         let mut never = [0.0; 16];
         (never[12], never[13], never[14]) = (1.0, log(4000.0), 1.0);
         assert_eq!(cell(2), never);
-        assert!(features[1 + 3 * 16..].iter().all(|&number| number == 0.0));
+        let outside = (3..16).flat_map(cell);
+        assert!(outside.into_iter().all(|number| number == 0.0));
     }
 
     #[test]

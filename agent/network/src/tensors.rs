@@ -53,21 +53,13 @@ pub(crate) fn set(changes: &[Change]) -> Result<()> {
         .try_for_each(|(_, var, tensor)| var.set(tensor))
 }
 
-/// The name of the first tensor that has a number that is not finite.
-pub(crate) fn first_not_finite<'a>(
-    mut tensors: impl Iterator<Item = (String, &'a Tensor)>,
-) -> Result<Option<String>> {
-    tensors
-        .find_map(|(name, tensor)| match is_finite(tensor) {
-            Ok(true) => None,
-            Ok(false) => Some(Ok(name)),
-            Err(error) => Some(Err(error)),
-        })
-        .transpose()
+/// One number of each tensor, zero if all of its own are finite: a finite number times zero is zero, any other is not.
+pub(crate) fn zero_if_finite(tensor: &Tensor) -> Result<Tensor> {
+    (tensor * 0.0)?.sum_all()
 }
 
-/// On any device, with one number copied back: a finite number times zero is zero, any other is not.
-fn is_finite(tensor: &Tensor) -> Result<bool> {
-    let sum = (tensor * 0.0)?.sum_all()?.to_dtype(DType::F32)?;
-    Ok(sum.to_scalar::<f32>()? == 0.0)
+/// Scalars as numbers, with one copy from their device: each copy waits for all that was asked of it.
+pub(crate) fn copied(scalars: &[Tensor]) -> Result<Vec<f32>> {
+    let scalars = scalars.iter().map(|scalar| scalar.to_dtype(DType::F32));
+    Tensor::stack(&scalars.collect::<Result<Vec<_>>>()?, 0)?.to_vec1()
 }

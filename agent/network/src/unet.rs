@@ -1,12 +1,14 @@
 //! A small U-Net: from the features of cells to the logits of what will be seen there.
 //!
-//! Images are `[batch, rows, cols, channels]`, with sides that [`ALIGNMENT`] divides. Two strides of 2, and back by nearest
+//! Images are `[batch, channels, rows, cols]`, with sides that [`ALIGNMENT`] divides. Two strides of 2, and back by nearest
 //! doubling with what was there before; residual layers, no normalisation. The head begins at zero: all observations
 //! alike.
 
+use crate::operators::Operators;
+use crate::ops::doubled_sum::DoubledSum;
 use crate::ops::image_conv::ImageConv;
 use crate::variables::uniform_init;
-use candle_core::{DType, Result, Tensor};
+use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
 /// What sides of images are multiples of: two strides of 2.
@@ -28,26 +30,24 @@ pub struct UNet {
     head: Layer,
 }
 
-/// A convolution with bias, by candle's layers or our operator.
+/// A convolution with bias.
 #[derive(Debug)]
 struct Layer {
     conv: ImageConv,
     /// `[kernel * kernel * channels in, channels out]`.
     weight: Tensor,
     bias: Tensor,
-    is_stock: bool,
+    operators: Operators,
 }
 
 impl UNet {
-    /// A network whose layers ask `vb` for their variables. Stock layers compute everywhere, ours with 32-bit floats on the
-    /// CPU.
+    /// A network whose layers ask `vb` for their variables.
     pub fn new(
         vb: &VarBuilder<'_>,
         n_features: usize,
         n_observations: usize,
-        is_stock: bool,
+        operators: Operators,
     ) -> Result<Self> {
-        let is_stock = is_stock || !vb.device().is_cpu() || vb.dtype() != DType::F32;
         let [full, half, quarter] = CHANNELS;
         let layer = |name: &str, channels: [usize; 2], [kernel, stride, dilation]: [usize; 3]| {
             let conv = ImageConv {
@@ -56,7 +56,7 @@ impl UNet {
                 dilation,
                 relu: kernel > 1,
             };
-            Layer::new(&vb.pp(name), channels, conv, is_stock, name == "head")
+            Layer::new(&vb.pp(name), channels, conv, operators, name == "head")
         };
         let (same, strided, point) = ([3, 1, 1], [3, 2, 1], [1, 1, 1]);
         let pair = |name: &str, from: usize, to: usize, first| -> Result<[Layer; 2]> {
@@ -80,11 +80,11 @@ impl UNet {
         })
     }
 
-    /// The logits of all cells, `[batch, rows, cols, observations]`.
+    /// The logits of all cells, `[batch, observations, rows, cols]`.
     pub fn logits(&self, x: &Tensor) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
-        let full = (doubled(&point.forward(&half)?)? + full)?.relu()?;
+        let full = self.doubled_sum(&point.forward(&half)?, &full)?;
         self.head.forward(&last.residual(&full)?)
     }
 
@@ -93,12 +93,14 @@ impl UNet {
     pub fn logits_at(&self, x: &Tensor, cells: &[[usize; 3]]) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
-        let around = Around::of(cells, [full.dim(1)?, full.dim(2)?]);
-        let index = |rows: Vec<u32>| Tensor::new(rows, x.device());
-        let channels = full.dim(3)?;
-        let full = full.flatten_to(2)?.index_select(&index(around.full)?, 0)?;
-        let half = point.forward(&half)?.flatten_to(2)?;
-        let half = half.index_select(&index(around.half)?, 0)?;
+        let (_, channels, rows, cols) = full.dims4()?;
+        let around = Around::of(cells, [rows, cols]);
+        let gather = |image: &Tensor, cells: Vec<u32>| {
+            let image = image.permute((0, 2, 3, 1))?.contiguous()?.flatten_to(2)?;
+            image.index_select(&Tensor::new(cells, x.device())?, 0)
+        };
+        let full = gather(&full, around.full)?;
+        let half = gather(&point.forward(&half)?, around.half)?;
         let is_inside = Tensor::new(around.is_inside, x.device())?.to_dtype(x.dtype())?;
         let patches = (full + half)?
             .relu()?
@@ -117,8 +119,22 @@ impl UNet {
         let quarter = same.residual(&strided.forward(&half)?)?;
         let quarter = self.wide.residual(&quarter)?;
         let [point, same] = &self.up[0];
-        let half = (doubled(&point.forward(&quarter)?)? + half)?.relu()?;
+        let half = self.doubled_sum(&point.forward(&quarter)?, &half)?;
         Ok([full, same.residual(&half)?])
+    }
+
+    /// An image whose cells are repeated, the sum with one of twice its size, and ReLU.
+    fn doubled_sum(&self, small: &Tensor, large: &Tensor) -> Result<Tensor> {
+        if self.head.operators == Operators::Own {
+            return small.apply_op2(large, DoubledSum);
+        }
+        let (batch, channels, rows, cols) = small.dims4()?;
+        // On a GPU, the gradient of `index_select` has one thread for each channel.
+        let x = small.reshape((batch * channels, rows, 1, cols))?;
+        let x = x.broadcast_as((batch * channels, rows, 2, cols))?;
+        let x = x.reshape((batch * channels * 2 * rows, cols, 1))?;
+        let x = x.broadcast_as((batch * channels * 2 * rows, cols, 2))?;
+        (x.reshape(large.shape())? + large)?.relu()
     }
 }
 
@@ -127,7 +143,7 @@ impl Layer {
         vb: &VarBuilder<'_>,
         [channels, n]: [usize; 2],
         conv: ImageConv,
-        is_stock: bool,
+        operators: Operators,
         is_head: bool,
     ) -> Result<Self> {
         let patch = conv.kernel * conv.kernel * channels;
@@ -140,20 +156,18 @@ impl Layer {
             conv,
             weight: vb.get_with_hints((patch, n), "weight", init)?,
             bias: vb.get_with_hints(n, "bias", init)?,
-            is_stock,
+            operators,
         })
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        if self.is_stock {
-            self.stock(x)
-        } else {
-            x.contiguous()?
-                .apply_op3(&self.weight, &self.bias, self.conv)
+        match self.operators {
+            Operators::Own => self.conv.apply(x, &self.weight, &self.bias),
+            Operators::Stock => self.stock(x),
         }
     }
 
-    /// The same by candle's layers, whose channels come second.
+    /// The same by candle's layers.
     fn stock(&self, x: &Tensor) -> Result<Tensor> {
         let ImageConv {
             kernel,
@@ -161,33 +175,24 @@ impl Layer {
             dilation,
             relu,
         } = self.conv;
-        let kernels = self.weight.reshape((kernel, kernel, x.dim(3)?, ()))?;
+        let kernels = self.weight.reshape((kernel, kernel, x.dim(1)?, ()))?;
         let kernels = kernels.permute((3, 2, 0, 1))?.contiguous()?;
-        let z = x.permute((0, 3, 1, 2))?.contiguous()?;
-        let z = z.conv2d(&kernels, dilation * (kernel / 2), stride, dilation, 1)?;
-        let z = z.permute((0, 2, 3, 1))?.broadcast_add(&self.bias)?;
+        let z = x.conv2d(&kernels, dilation * (kernel / 2), stride, dilation, 1)?;
+        let z = z.broadcast_add(&self.bias.reshape((1, (), 1, 1))?)?;
         if relu { z.relu() } else { Ok(z) }
     }
 
     fn residual(&self, x: &Tensor) -> Result<Tensor> {
-        self.forward(x)? + x
+        match self.operators {
+            Operators::Own => self.conv.residual(x, &self.weight, &self.bias),
+            Operators::Stock => self.stock(x)? + x,
+        }
     }
 
     /// Of patches as rows, before ReLU.
     fn dense(&self, patches: &Tensor) -> Result<Tensor> {
         patches.matmul(&self.weight)?.broadcast_add(&self.bias)
     }
-}
-
-/// Each cell four times.
-fn doubled(x: &Tensor) -> Result<Tensor> {
-    let (batch, rows, cols, channels) = x.dims4()?;
-    // candle's own doubling and broadcasts take several times as long.
-    let from = |at: usize| at / (4 * cols) * cols + at % (2 * cols) / 2;
-    let from = (0..4 * batch * rows * cols).map(|at| from(at) as u32);
-    let from = Tensor::from_iter(from, x.device())?;
-    let doubled = x.reshape(((), channels))?.index_select(&from, 0)?;
-    doubled.reshape((batch, 2 * rows, 2 * cols, channels))
 }
 
 /// The patches of some cells: where their cells lie among those of all images, at full and half size, and which lie

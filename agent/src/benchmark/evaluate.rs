@@ -128,8 +128,8 @@ impl Candidates {
     fn filter(&mut self, frame: &Frame) -> Result<()> {
         for agent in &mut self.estimators {
             agent.correct(frame, None)?;
-            agent.predict();
         }
+        Agent::predict_all(&mut self.estimators);
         Ok(())
     }
 }

@@ -19,6 +19,7 @@ use emberwatch_learning::beliefs::{self, BeliefKind, NEURAL};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, Planned, Shown, usual};
+use emberwatch_learning::rollout::in_parallel;
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};
@@ -30,7 +31,6 @@ use emberwatch_network::Device;
 use numpy::ndarray::{Array3, ArrayView1, s};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use rayon::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::path::PathBuf;
 use std::sync::OnceLock;
@@ -263,8 +263,10 @@ impl State {
     fn begin(&mut self, seeds: impl Iterator<Item = (usize, u64)>, prior: &Belief) -> Result<()> {
         let seeds: Vec<(usize, u64)> = seeds.collect();
         let Self { crew, threads, .. } = self;
-        let begun = in_parallel(crew, threads, seeds, |(world, seed)| {
-            Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?))
+        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
+        let n_worlds = seeds.len();
+        let begun = on_threads(crew, threads, n_worlds, |threads| {
+            threads.each(seeds, begin)
         });
         for begun in begun {
             let (world, planned) = begun?;
@@ -320,7 +322,10 @@ impl State {
                 is_shown: shown.contains(&row),
             })
         });
-        let done = in_parallel(crew, threads, tasks.collect(), |task| task.done(crew));
+        let tasks: Vec<WorldWork<'_>> = tasks.collect();
+        let done = on_threads(crew, threads, tasks.len(), |threads| {
+            work_on(crew, tasks, threads)
+        });
         let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
         self.show(outlooks.into_iter().flatten());
         Ok(())
@@ -382,50 +387,89 @@ impl State {
     }
 }
 
+/// Corrects the beliefs, moves them to the next step, and plans. Worlds whose frame is refused stay as they are.
+fn work_on(
+    crew: &Crew,
+    mut tasks: Vec<WorldWork<'_>>,
+    threads: Threads,
+) -> Vec<Result<Option<Outlook>>> {
+    let seen = threads.each(&mut tasks, |task| task.see(crew));
+    let fits = tasks
+        .into_iter()
+        .zip(&seen)
+        .filter(|(_, seen)| seen.is_ok());
+    let mut tasks: Vec<_> = fits.map(|(task, _)| task).collect();
+    let new = tasks.iter_mut().filter(|task| task.frame.is_some());
+    let new = new.map(|task| &mut *task.planned);
+    match threads {
+        Threads::Several => Planned::predict_all(new),
+        Threads::One => new.for_each(|planned| Planned::predict_all([planned])),
+    }
+    let planning = tasks.into_iter().filter(|task| task.plans);
+    threads.each(planning, |task| task.planned.plan(task.robot.cell()));
+    seen
+}
+
 impl WorldWork<'_> {
-    fn done(self, crew: &Crew) -> Result<Option<Outlook>> {
-        let planned = self.planned;
-        let mut outlook = None;
-        if let Some(frame) = self.frame {
-            let intent = self.is_shown.then(|| planned.intent(self.flown));
-            let n_observations = crew.model().n_observations();
-            planned.see(&Shown {
-                frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
-                reward: (self.world.step > 0).then_some(self.robot.reward),
-            })?;
-            outlook = intent.map(|intent| Outlook {
-                index: self.index,
-                world: self.world,
-                belief: planned.agent().belief().clone(),
-                intent,
-            });
-            planned.predict();
-        }
-        if self.plans {
-            planned.plan(self.robot.cell());
-        }
-        Ok(outlook)
+    /// Corrects the belief with the frame, if there is one.
+    fn see(&mut self, crew: &Crew) -> Result<Option<Outlook>> {
+        let Some(frame) = self.frame else {
+            return Ok(None);
+        };
+        let intent = self.is_shown.then(|| self.planned.intent(self.flown));
+        let n_observations = crew.model().n_observations();
+        self.planned.see(&Shown {
+            frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
+            reward: (self.world.step > 0).then_some(self.robot.reward),
+        })?;
+        Ok(intent.map(|intent| Outlook {
+            index: self.index,
+            world: self.world,
+            belief: self.planned.agent().belief().clone(),
+            intent,
+        }))
     }
 }
 
-/// The results in order. One task alone is done here: handing it to another thread costs more than it gains, but for
-/// networks, whose own threads must be among these.
-fn in_parallel<T: Send, U: Send>(
+/// Whether worlds are worked on in parallel.
+#[derive(Clone, Copy)]
+enum Threads {
+    One,
+    Several,
+}
+
+impl Threads {
+    /// The results in order.
+    fn each<T: Send, U: Send>(
+        self,
+        tasks: impl IntoIterator<Item = T>,
+        work: impl Fn(T) -> U + Sync,
+    ) -> Vec<U> {
+        match self {
+            Self::One => tasks.into_iter().map(work).collect(),
+            Self::Several => in_parallel(tasks, work),
+        }
+    }
+}
+
+/// Works on several worlds with threads of its own. One world alone is worked on here: handing it to another thread costs
+/// more than it gains, but for networks, whose own threads must be among these.
+fn on_threads<R: Send>(
     crew: &Crew,
     threads: &mut Option<ThreadPool>,
-    tasks: Vec<T>,
-    work: impl Fn(T) -> U + Send + Sync,
-) -> Vec<U> {
-    if tasks.len() == 1 && *crew.estimator() != NEURAL {
-        return tasks.into_iter().map(work).collect();
+    n_worlds: usize,
+    work: impl FnOnce(Threads) -> R + Send,
+) -> R {
+    if n_worlds == 1 && *crew.estimator() != NEURAL {
+        return work(Threads::One);
     }
     if threads.is_none() {
         *threads = ThreadPoolBuilder::new().build().ok();
     }
     match threads {
-        Some(threads) => threads.install(|| tasks.into_par_iter().map(work).collect()),
+        Some(threads) => threads.install(|| work(Threads::Several)),
         // The system gives no threads.
-        None => tasks.into_iter().map(work).collect(),
+        None => work(Threads::One),
     }
 }
 

@@ -5,6 +5,7 @@ use crate::estimation::belief::{Belief, BeliefError};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Grid};
 use ndarray::Array2;
+use std::any::Any;
 use std::borrow::Cow;
 use std::error::Error as StdError;
 use thiserror::Error;
@@ -12,7 +13,7 @@ use thiserror::Error;
 /// Keeps a belief about one world: [`Self::correct`] with each frame, then [`Self::predict`].
 ///
 /// That is all that an estimator must do. What only some have, they offer beside it.
-pub trait Estimator: Send {
+pub trait Estimator: Send + Any {
     /// Takes in a frame of X_k (eq. 5).
     ///
     /// # Errors
@@ -21,6 +22,12 @@ pub trait Estimator: Send {
 
     /// Moves the belief from X_k to X_{k+1} (eq. 6).
     fn predict(&mut self);
+
+    /// Of one whose like predict many worlds together in less time than one by one: a function that does what
+    /// [`Self::predict`] does to each of several estimators, also of other kinds.
+    fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
+        None
+    }
 
     /// The belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
     fn belief(&self) -> &Belief;

@@ -7,6 +7,7 @@ use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::{LearnedModel, SavedModel, check_target};
 use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check};
+use crate::rollout::in_parallel;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::bayes::{correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
@@ -16,6 +17,7 @@ use emberwatch_model::{Frame, MAX_VALUES, Shape};
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
+use std::any::Any;
 use std::borrow::Cow;
 
 /// Before the names of the tensors of the filter that a network corrects.
@@ -186,7 +188,7 @@ impl NeuralEstimator {
         let sightings = Sightings::new(shape);
         let base = filter.as_deref().and_then(predicted_observations);
         Ok(Self {
-            belief: predicted(network, base.as_ref(), &sightings)?,
+            belief: belief(network.predict(&sightings, base.as_ref())?),
             network: network.clone(),
             filter,
             base,
@@ -213,15 +215,11 @@ impl Estimator for NeuralEstimator {
     }
 
     fn predict(&mut self) {
-        self.sightings.pass();
-        if let Some(filter) = &mut self.filter {
-            filter.predict();
-            self.base = predicted_observations(&**filter);
-        }
-        match predicted(&self.network, self.base.as_ref(), &self.sightings) {
-            Ok(belief) => self.belief = belief,
-            Err(failure) => self.failure = Some(failure),
-        }
+        predict_together(vec![self]);
+    }
+
+    fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
+        Some(predict_together)
     }
 
     fn belief(&self) -> &Belief {
@@ -287,14 +285,63 @@ impl Handover for NeuralEstimator {
     }
 }
 
-fn predicted(
-    network: &NeuralBelief,
-    base: Option<&Probabilities>,
-    sightings: &Sightings,
-) -> Result<Belief, NetworkError> {
-    let probabilities = network.predict(sightings, base)?;
+/// Moves beliefs to the next step, those of one network together.
+fn predict_together(estimators: Vec<&mut dyn Estimator>) {
+    let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
+    for estimator in estimators {
+        if (&*estimator as &dyn Any).is::<NeuralEstimator>() {
+            let estimator: &mut dyn Any = estimator;
+            networks.extend(estimator.downcast_mut::<NeuralEstimator>());
+        } else {
+            others.push(estimator);
+        }
+    }
+    in_parallel(others, |estimator| estimator.predict());
+    in_parallel(networks.iter_mut(), |it| it.pass());
+    for alike in networks.chunk_by_mut(|a, b| a.is_like(b)) {
+        NeuralEstimator::predict_all(alike);
+    }
+}
+
+impl NeuralEstimator {
+    /// Goes on to the next step, before the network predicts it.
+    fn pass(&mut self) {
+        self.sightings.pass();
+        if let Some(filter) = &mut self.filter {
+            filter.predict();
+            self.base = predicted_observations(&**filter);
+        }
+    }
+
+    /// Whether one pass of the network can predict both worlds.
+    fn is_like(&self, other: &Self) -> bool {
+        self.network.is_same(&other.network)
+            && self.sightings.shape() == other.sightings.shape()
+            && self.base.is_some() == other.base.is_some()
+    }
+
+    /// Predicts worlds that are like each other.
+    fn predict_all(all: &mut [&mut Self]) {
+        let worlds = all.iter().map(|it| (&it.sightings, it.base.as_ref()));
+        let predicted = all[0].network.predict_all(&worlds.collect::<Vec<_>>());
+        match predicted {
+            Ok(predicted) => {
+                for (estimator, probabilities) in all.iter_mut().zip(predicted) {
+                    estimator.belief = belief(probabilities);
+                }
+            }
+            Err(failure) => {
+                for estimator in all {
+                    estimator.failure = Some(failure.clone());
+                }
+            }
+        }
+    }
+}
+
+fn belief(probabilities: Probabilities) -> Belief {
     let belief = Belief::from_probabilities(probabilities);
-    Ok(belief.expect("invariant: a softmax is on the simplex"))
+    belief.expect("invariant: a softmax is on the simplex")
 }
 
 /// What an estimator whose belief is about X_{k+1} expects frames to show, `[O, H, W]`.

@@ -2,6 +2,7 @@
 
 use crate::config::AgentConfig;
 use crate::policy::Policy;
+use crate::rollout::in_parallel;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
@@ -252,10 +253,27 @@ impl Agent {
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
     pub fn predict(&mut self) {
-        if self.basis == BasisKind::Estimate {
-            self.estimate = Some(self.estimator.belief().clone());
+        Self::predict_all([self]);
+    }
+
+    /// [`Self::predict`] of several agents.
+    pub fn predict_all<'a>(agents: impl IntoIterator<Item = &'a mut Self>) {
+        let (mut together, mut alone) = (Vec::new(), Vec::new());
+        for agent in agents {
+            if agent.basis == BasisKind::Estimate {
+                agent.estimate = Some(agent.estimator.belief().clone());
+            }
+            let estimator = &mut *agent.estimator;
+            match estimator.predict_together() {
+                Some(_) => together.push(estimator),
+                None => alone.push(estimator),
+            }
         }
-        self.estimator.predict();
+        in_parallel(alone, Estimator::predict);
+        let predict = together.first().and_then(|first| first.predict_together());
+        if let Some(predict) = predict {
+            predict(together);
+        }
     }
 
     /// Goes on from an estimate p_k, if paths are planned on it.

@@ -307,9 +307,9 @@ impl Dqn {
 
     fn learn_batch(&mut self, batch: &Batch) -> Result<f32, NetworkError> {
         let targets = [("dqn.target.", &self.target_variables)];
-        let known = batch.named().into_iter().chain(named(&targets));
-        self.adam.check(known)?;
+        let known: Vec<_> = batch.named().into_iter().chain(named(&targets)).collect();
         let loss = self.loss(batch)?;
+        self.adam.checked(&known, &loss)?;
         let settings = &self.settings.adam;
         let loss = self
             .adam

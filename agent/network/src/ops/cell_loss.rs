@@ -3,25 +3,78 @@
 //! At a visited cell the predictor is `u = softmax(logits)`, the predicted observation `q = O u`, and the
 //! loss the binary cross-entropy of all O channels: `-log q_y - sum over a != y of log(1 - q_a)`.
 
+use super::cpu::{Frames, frames, total};
+use crate::window::Window;
+
 /// Added inside logarithms, as by the authors: the loss stays finite where a probability is rounded to 0
 /// or 1.
 pub(crate) const LOG_FLOOR: f64 = 1e-10;
 
+/// The mean loss over a window's targets, and its gradients.
+pub(crate) struct WindowLoss {
+    pub(crate) loss: f64,
+    /// Of the logits.
+    pub(crate) d_logits: Frames,
+    /// Of `O [observations, states]`.
+    pub(crate) d_observation: Vec<f32>,
+}
+
+/// From the logits of each frame, `[states, rows, cols]`.
+pub(crate) fn window_loss(
+    window: &Window,
+    logits: &Frames,
+    observation: &[f32],
+    [n_states, rows, cols]: [usize; 3],
+) -> WindowLoss {
+    let (weight, area) = (1.0 / window.all_targets().len() as f32, rows * cols);
+    let (d_logits, losses) = frames(
+        window.len(),
+        |_| n_states * area,
+        || {
+            (
+                CellLoss::new(observation, n_states, weight),
+                vec![0.0; n_states],
+            )
+        },
+        #[inline(always)]
+        |(loss, of_cell), frame, d_logits| {
+            let logits = logits.frame(frame);
+            for visit in window.targets(frame) {
+                let cell = usize::from(visit.row) * cols + usize::from(visit.col);
+                for (state, logit) in of_cell.iter_mut().enumerate() {
+                    *logit = logits[state * area + cell];
+                }
+                loss.add(of_cell, visit.value);
+                for (state, d) in of_cell.iter().enumerate() {
+                    d_logits[state * area + cell] = *d;
+                }
+            }
+        },
+    );
+    let losses: Vec<CellLoss<'_>> = losses.into_iter().map(|(loss, _)| loss).collect();
+    let d_observation = total(losses.iter().map(|loss| loss.d_observation.clone()));
+    WindowLoss {
+        loss: losses.iter().map(|loss| loss.loss).sum(),
+        d_logits,
+        d_observation: d_observation.into_iter().map(|d| d as f32).collect(),
+    }
+}
+
 /// Sums over cells, and room for one.
-pub(super) struct CellLoss<'a> {
+struct CellLoss<'a> {
     /// `O [observations, states]`, whose columns sum to one.
     observation: &'a [f32],
     /// Of each cell in the loss.
     weight: f32,
-    pub(super) loss: f64,
-    pub(super) d_observation: Vec<f64>,
+    loss: f64,
+    d_observation: Vec<f64>,
     u: Vec<f32>,
     q: Vec<f32>,
     d_u: Vec<f32>,
 }
 
 impl<'a> CellLoss<'a> {
-    pub(super) fn new(observation: &'a [f32], n_states: usize, weight: f32) -> Self {
+    fn new(observation: &'a [f32], n_states: usize, weight: f32) -> Self {
         Self {
             observation,
             weight,
@@ -38,7 +91,7 @@ impl<'a> CellLoss<'a> {
     /// At most one factor of the likelihood other than `q_y` is near zero, as the `q` sum to one, and 6e-8 or
     /// more unless it is zero, so the product underflows only where `q_y` all but does.
     #[inline(always)]
-    pub(super) fn add(&mut self, logits: &mut [f32], value: u8) {
+    fn add(&mut self, logits: &mut [f32], value: u8) {
         let largest = logits.iter().copied().fold(f32::MIN, f32::max);
         for (u, logit) in self.u.iter_mut().zip(&*logits) {
             *u = (logit - largest).exp();

@@ -1,108 +1,354 @@
-//! A dense convolution of the encoder, frame by frame: a product of the frame's patches and the kernels.
+//! The kernels of every convolution, one frame at a time: forward, and both gradients.
+//!
+//! A convolution reads a *large* map and gives a *small* one; a transposed convolution reads the small and gives the
+//! large. Each is the gradient of the other, so [`Conv::down`], [`Conv::up`] and [`Conv::add_weight_gradient`] serve
+//! both. Maps are planes, one per channel; weights are `[kernel rows, kernel cols, large channels, small channels]`.
+//!
+//! All three are products of matrices whose rows lie anywhere ([`super::product`]). No patch is copied: a plane lies in
+//! a [`Room`] with zeros around it, so what all patches have at one place of the kernel is a run of the plane. With a
+//! stride, the large map lies there as `stride * stride` planes, one for each remainder of row and column.
+//!
+//! Channels are given as lists: those that dropout takes are neither read nor computed.
 
-use super::product::{Left, Right, add_product, steps};
-use crate::shape::ConvShape;
+use super::cpu::add;
+use super::product::{add_product, left_factor, product, right_factor, steps};
 
-/// Frames are `[rows, cols, channels in]`, results `[positions, channels out]`.
-pub(super) struct Conv<'a> {
-    /// `[kernel rows * kernel cols * channels in, channels out]`.
-    kernels: &'a [f32],
-    channels_out: usize,
-    /// Numbers of one row of a patch, which lie side by side in the frame.
-    run: usize,
-    /// Where in the frame each patch begins.
-    positions: Vec<usize>,
-    /// Where in the frame the rows of a patch begin, after its first number.
-    runs: Vec<usize>,
-    /// Where in the frame each number of a patch lies, after its first.
-    numbers: Vec<usize>,
-    /// Where in the result each position's numbers begin.
-    outputs: Vec<usize>,
-    /// Where the kernels of each number of a patch begin.
-    rows: Vec<usize>,
-    /// Where the turned kernels of each channel begin.
-    turned_rows: Vec<usize>,
-    channels: Vec<usize>,
+/// The sizes of a convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Sizes {
+    /// Channels, rows and columns of the large map.
+    pub(crate) large: [usize; 3],
+    /// Channels, rows and columns of the small map.
+    pub(crate) small: [usize; 3],
+    /// Rows and columns.
+    pub(crate) kernel: [usize; 2],
+    pub(crate) stride: usize,
+    /// Zeros on each side of the large map.
+    pub(crate) padding: usize,
+    /// Steps between the cells that a kernel reads.
+    pub(crate) dilation: usize,
 }
 
-impl<'a> Conv<'a> {
-    pub(super) fn new(shape: &ConvShape, kernels: &'a [f32]) -> Self {
-        let (channels, n, cols) = (shape.channels_in, shape.channels_out, shape.input[1]);
-        let n_cols = shape.output[1];
-        let position = |at: usize| (at / n_cols * cols + at % n_cols) * shape.stride * channels;
-        let positions: Vec<usize> = (0..shape.output[0] * n_cols).map(position).collect();
-        let (run, patch) = (shape.kernel[1] * channels, kernels.len() / n);
-        let runs = steps(shape.kernel[0], cols * channels);
+/// A convolution's sizes and what follows from them.
+#[derive(Debug, Clone)]
+pub(crate) struct Conv {
+    pub(crate) sizes: Sizes,
+    taps: Vec<Tap>,
+    /// Rows and columns of one of the planes into which a padded large plane is split.
+    part: [usize; 2],
+    /// Rows and columns of zeros before a small plane.
+    margin: [usize; 2],
+    /// Columns of a small plane with its margins, and its numbers.
+    framed_cols: usize,
+    framed: usize,
+}
+
+/// One place of the kernel.
+#[derive(Debug, Clone, Copy)]
+struct Tap {
+    /// Which of a large plane's parts it reads.
+    part: usize,
+    /// By how many rows and columns its runs are shifted there.
+    shift: [usize; 2],
+}
+
+/// Room for the maps of one frame.
+#[derive(Default)]
+pub(crate) struct Room {
+    large: Vec<f32>,
+    small: Vec<f32>,
+    /// The small map with channels last, `[cells, channels]`.
+    turned: Vec<f32>,
+    /// Results with what lies between the ends of rows.
+    wide: Vec<f32>,
+}
+
+impl Conv {
+    pub(crate) fn new(sizes: Sizes) -> Self {
+        let Sizes {
+            stride, dilation, ..
+        } = sizes;
+        let part = [1, 2].map(|axis| (sizes.large[axis] + 2 * sizes.padding).div_ceil(stride));
+        let margin = sizes.kernel.map(|side| dilation * (side - 1) / stride);
+        let tap = |at: usize| {
+            let at = [at / sizes.kernel[1], at % sizes.kernel[1]].map(|at| at * dilation);
+            Tap {
+                part: at[0] % stride * stride + at[1] % stride,
+                shift: at.map(|at| at / stride),
+            }
+        };
+        let framed_cols = part[1] + margin[1];
         Self {
-            kernels,
-            channels_out: n,
-            run,
-            outputs: steps(positions.len(), n),
-            positions,
-            numbers: runs.iter().flat_map(|first| *first..first + run).collect(),
-            runs,
-            rows: steps(patch, n),
-            turned_rows: steps(n, patch),
-            channels: steps(n, 1),
+            taps: (0..sizes.kernel[0] * sizes.kernel[1]).map(tap).collect(),
+            part,
+            margin,
+            framed_cols,
+            framed: (part[0] + margin[0]) * framed_cols,
+            sizes,
         }
     }
 
-    /// The kernels as `[channels out, kernel rows * kernel cols * channels in]`.
-    pub(super) fn turned(&self) -> Vec<f32> {
-        let (patch, n) = (self.rows.len(), self.channels_out);
-        let places = 0..self.kernels.len();
-        places
-            .map(|at| self.kernels[at % patch * n + at / patch])
-            .collect()
+    /// Numbers of the weights.
+    pub(crate) fn n_weights(&self) -> usize {
+        self.sizes.small[0] * self.sizes.large[0] * self.taps.len()
     }
 
-    /// Adds a frame's result.
-    #[inline(always)]
-    pub(super) fn forward(&self, x: &[f32], out: &mut [f32]) {
-        let left = Left {
-            numbers: x,
-            rows: &self.positions,
-            terms: &self.numbers,
-        };
-        let right = Right {
-            numbers: self.kernels,
-            terms: &self.rows,
-            cols: self.channels_out,
-        };
-        add_product(out, &self.outputs, left, right);
+    /// Cells of the large map.
+    pub(crate) fn large_area(&self) -> usize {
+        self.sizes.large[1] * self.sizes.large[2]
     }
 
-    /// Adds gradients of the kernels.
-    #[inline(always)]
-    pub(super) fn add_gradient(&self, x: &[f32], d_out: &[f32], d_kernels: &mut [f32]) {
-        let left = Left {
-            numbers: x,
-            rows: &self.numbers,
-            terms: &self.positions,
-        };
-        let right = Right {
-            numbers: d_out,
-            terms: &self.outputs,
-            cols: self.channels_out,
-        };
-        add_product(d_kernels, &self.rows, left, right);
+    /// Cells of the small map.
+    pub(crate) fn small_area(&self) -> usize {
+        self.sizes.small[1] * self.sizes.small[2]
     }
 
-    /// Adds the gradient of a frame, with the turned kernels.
-    #[inline(always)]
-    pub(super) fn backward(&self, turned: &[f32], d_out: &[f32], dx: &mut [f32]) {
-        let left = Left {
-            numbers: d_out,
-            rows: &self.outputs,
-            terms: &self.channels,
-        };
-        for (index, from) in self.runs.iter().enumerate() {
-            let right = Right {
-                numbers: &turned[index * self.run..],
-                terms: &self.turned_rows,
-                cols: self.run,
-            };
-            add_product(&mut dx[*from..], &self.positions, left, right);
+    /// Numbers between a split plane and the next.
+    fn split(&self) -> usize {
+        self.sizes.stride * self.sizes.stride * self.part[0] * self.part[1]
+    }
+
+    pub(crate) fn room(&self) -> Room {
+        let Sizes { large, small, .. } = self.sizes;
+        let wide = (small[0] * small[1] * self.part[1]).max(large[0] * self.framed);
+        Room {
+            large: vec![0.0; large[0] * self.split()],
+            small: vec![0.0; small[0] * self.framed],
+            turned: vec![0.0; self.small_area() * small[0]],
+            wide: vec![0.0; wide],
         }
+    }
+
+    /// Puts a large plane at an index, between zeros that stay.
+    #[inline(always)]
+    pub(crate) fn put_large(&self, room: &mut Room, index: usize, plane: &[f32]) {
+        let Sizes {
+            stride, padding, ..
+        } = self.sizes;
+        let [part_rows, part_cols] = self.part;
+        let to = &mut room.large[index * self.split()..][..self.split()];
+        for (row, from) in plane.chunks_exact(self.sizes.large[2]).enumerate() {
+            let row = row + padding;
+            let first = row % stride * stride * part_rows + row / stride;
+            if stride == 1 {
+                to[first * part_cols + padding..][..from.len()].copy_from_slice(from);
+                continue;
+            }
+            for col in padding..(padding + stride).min(padding + from.len()) {
+                let first = (first + col % stride * part_rows) * part_cols + col / stride;
+                every(stride, &from[col - padding..], &mut to[first..]);
+            }
+        }
+    }
+
+    /// Puts all planes of a large map.
+    #[inline(always)]
+    pub(crate) fn put_all_large(&self, room: &mut Room, map: &[f32]) {
+        for (index, plane) in map.chunks_exact(self.large_area()).enumerate() {
+            self.put_large(room, index, plane);
+        }
+    }
+
+    /// All channels of the large map, and of the small one.
+    pub(crate) fn channels(&self) -> [Vec<usize>; 2] {
+        [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
+    }
+
+    /// Puts a small plane at an index, between zeros that stay.
+    #[inline(always)]
+    pub(crate) fn put_small(&self, room: &mut Room, index: usize, plane: &[f32]) {
+        let cols = self.sizes.small[2];
+        let first = self.margin[0] * self.framed_cols + self.margin[1];
+        let to = room.small[index * self.framed + first..].chunks_mut(self.framed_cols);
+        for (to, from) in to.zip(plane.chunks_exact(cols)) {
+            to[..cols].copy_from_slice(from);
+        }
+    }
+
+    /// Puts a small plane of a channel where [`Self::add_weight_gradient`] reads it, with channels last. Channels of other
+    /// frames stay until [`Self::forget_turned`].
+    #[inline(always)]
+    pub(crate) fn turn_small(&self, room: &mut Room, channel: usize, plane: &[f32]) {
+        let to = room.turned[channel..]
+            .iter_mut()
+            .step_by(self.sizes.small[0]);
+        to.zip(plane).for_each(|(to, from)| *to = *from);
+    }
+
+    /// Puts all planes of a small map there.
+    #[inline(always)]
+    pub(crate) fn turn_all_small(&self, room: &mut Room, map: &[f32]) {
+        /// Cells at a time, so that they stay in the first cache.
+        const CELLS: usize = 64;
+        let n = self.sizes.small[0];
+        for (block, to) in room.turned.chunks_mut(CELLS * n).enumerate() {
+            for (channel, plane) in map.chunks_exact(self.small_area()).enumerate() {
+                let to = to[channel..].iter_mut().step_by(n);
+                to.zip(&plane[block * CELLS..])
+                    .for_each(|(to, from)| *to = *from);
+            }
+        }
+    }
+
+    #[inline(always)]
+    pub(crate) fn forget_turned(&self, room: &mut Room) {
+        room.turned.fill(0.0);
+    }
+
+    /// The small map's numbers as [`Self::turn_small`] has put them, `[cells, channels]`.
+    pub(crate) fn turned<'a>(&self, room: &'a Room) -> &'a [f32] {
+        &room.turned
+    }
+
+    /// Adds the small map of some channels to `out`, from the large one of some channels in `room`.
+    #[inline(always)]
+    pub(crate) fn down(
+        &self,
+        weights: &[f32],
+        room: &mut Room,
+        [large, small]: [&[usize]; 2],
+        out: &mut [f32],
+    ) {
+        let [n, rows, cols] = self.sizes.small;
+        let (mut factors, mut runs) = (Vec::new(), Vec::new());
+        for tap in 0..self.taps.len() {
+            for (index, channel) in large.iter().enumerate() {
+                factors.push((tap * self.sizes.large[0] + channel) * n);
+                runs.push(index * self.split() + self.run(tap));
+            }
+        }
+        let width = self.part[1];
+        let to = steps(small.len(), rows * width);
+        let left = left_factor(weights, small, &factors);
+        let right = right_factor(&room.large, &runs, (rows - 1) * width + cols);
+        product(&mut room.wide, &to, left, right);
+        let wide = room.wide.chunks_exact(rows * width);
+        for (out, wide) in out
+            .chunks_exact_mut(rows * cols)
+            .zip(wide)
+            .take(small.len())
+        {
+            let rows = out.chunks_exact_mut(cols).zip(wide.chunks_exact(width));
+            rows.for_each(|(out, wide)| add(out, &wide[..cols]));
+        }
+    }
+
+    /// Adds the large map of some channels to `out`, from the small one of some channels in `room`.
+    #[inline(always)]
+    pub(crate) fn up(
+        &self,
+        weights: &[f32],
+        room: &mut Room,
+        [large, small]: [&[usize]; 2],
+        out: &mut [f32],
+    ) {
+        let stride = self.sizes.stride;
+        let [channels, rows, cols] = self.sizes.large;
+        let (n, width) = (self.sizes.small[0], self.framed_cols);
+        let rows_of: Vec<usize> = large.iter().map(|channel| channel * n).collect();
+        for part in 0..stride * stride {
+            let (first_row, n_rows) = self.inside(part / stride, rows);
+            let (first_col, n_cols) = self.inside(part % stride, cols);
+            let (mut factors, mut runs) = (Vec::new(), Vec::new());
+            let taps = self.taps.iter().enumerate().rev();
+            for (tap, Tap { shift, .. }) in taps.filter(|(_, tap)| tap.part == part) {
+                let row = self.margin[0] + first_row - shift[0];
+                let first = row * width + self.margin[1] + first_col - shift[1];
+                for (index, channel) in small.iter().enumerate() {
+                    factors.push(tap * channels * n + channel);
+                    runs.push(index * self.framed + first);
+                }
+            }
+            if n_rows == 0 || n_cols == 0 || runs.is_empty() {
+                continue;
+            }
+            let to = steps(large.len(), n_rows * width);
+            let left = left_factor(weights, &rows_of, &factors);
+            let right = right_factor(&room.small, &runs, (n_rows - 1) * width + n_cols);
+            product(&mut room.wide, &to, left, right);
+            let corner = |first: usize, rest: usize| first * stride + rest - self.sizes.padding;
+            let top = corner(first_row, part / stride);
+            let left = corner(first_col, part % stride);
+            let wide = room.wide.chunks_exact(n_rows * width);
+            for (out, wide) in out
+                .chunks_exact_mut(rows * cols)
+                .zip(wide)
+                .take(large.len())
+            {
+                let out = out.chunks_exact_mut(cols).skip(top).step_by(stride);
+                for (out, wide) in out.zip(wide.chunks_exact(width)) {
+                    add_to_every(stride, &wide[..n_cols], &mut out[left..]);
+                }
+            }
+        }
+    }
+
+    /// The first row or column of the parts of a remainder that lies inside a large plane of a side, and how many do.
+    fn inside(&self, remainder: usize, side: usize) -> (usize, usize) {
+        let Sizes {
+            stride, padding, ..
+        } = self.sizes;
+        let first = padding.saturating_sub(remainder).div_ceil(stride);
+        let end = (side + padding).saturating_sub(remainder).div_ceil(stride);
+        (first, end.saturating_sub(first))
+    }
+
+    /// Adds the gradient of the weights, from the large map of some channels in `room`, and the small one as
+    /// [`Self::turn_small`] has put it there.
+    #[inline(always)]
+    pub(crate) fn add_weight_gradient(&self, room: &Room, large: &[usize], to: &mut [f32]) {
+        let ([n, rows, cols], width) = (self.sizes.small, self.part[1]);
+        let (mut from, mut into) = (Vec::new(), Vec::new());
+        for (index, channel) in large.iter().enumerate() {
+            for tap in 0..self.taps.len() {
+                from.push(index * self.split() + self.run(tap));
+                into.push((tap * self.sizes.large[0] + channel) * n);
+            }
+        }
+        let cells = 0..rows * cols;
+        let cells: Vec<usize> = cells.map(|at| at / cols * width + at % cols).collect();
+        let turned = steps(rows * cols, n);
+        let left = left_factor(&room.large, &from, &cells);
+        add_product(to, &into, left, right_factor(&room.turned, &turned, n));
+    }
+
+    /// Where in a split plane the run of a tap begins.
+    fn run(&self, tap: usize) -> usize {
+        let Tap { part, shift } = self.taps[tap];
+        (part * self.part[0] + shift[0]) * self.part[1] + shift[1]
+    }
+}
+
+/// Copies every `n`th number.
+#[inline(always)]
+fn every(n: usize, from: &[f32], to: &mut [f32]) {
+    #[inline(always)]
+    fn constant<const N: usize>(from: &[f32], to: &mut [f32]) {
+        let (from, rest) = from.as_chunks::<N>();
+        let last = rest.first().into_iter();
+        let all = from.iter().map(|numbers| &numbers[0]).chain(last);
+        to.iter_mut().zip(all).for_each(|(to, from)| *to = *from);
+    }
+    match n {
+        2 => constant::<2>(from, to),
+        4 => constant::<4>(from, to),
+        _ => (to.iter_mut().zip(from.iter().step_by(n))).for_each(|(to, from)| *to = *from),
+    }
+}
+
+/// Adds to every `n`th number.
+#[inline(always)]
+fn add_to_every(n: usize, numbers: &[f32], to: &mut [f32]) {
+    match n {
+        1 => add(to, numbers),
+        2 => {
+            let (pairs, rest) = to.as_chunks_mut::<2>();
+            let all = pairs
+                .iter_mut()
+                .map(|pair| &mut pair[0])
+                .chain(rest.first_mut());
+            all.zip(numbers).for_each(|(to, number)| *to += number);
+        }
+        _ => (to.iter_mut().step_by(n).zip(numbers)).for_each(|(to, number)| *to += number),
     }
 }

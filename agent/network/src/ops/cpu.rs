@@ -8,16 +8,24 @@ use std::sync::Mutex;
 
 /// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
 /// their order: the number of threads changes no bit of the result.
-pub(super) const N_CHUNKS: usize = 8;
+const N_CHUNKS: usize = 32;
 
 /// The numbers of a contiguous tensor on the CPU, which is locked meanwhile.
-pub(super) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
+pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
     let (storage, layout) = tensor.storage_and_layout();
     let range = match (&*storage, layout.contiguous_offsets()) {
         (Storage::Cpu(CpuStorage::F32(_)), Some((start, end))) => start..end,
         _ => candle_core::bail!("expected contiguous 32-bit floats on the CPU"),
     };
     Ok(Numbers { storage, range })
+}
+
+/// As [`numbers`], of what an operator is given.
+pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
+    match (storage, layout.contiguous_offsets()) {
+        (CpuStorage::F32(numbers), Some((start, end))) => Ok(&numbers[start..end]),
+        _ => candle_core::bail!("expected contiguous 32-bit floats on the CPU"),
+    }
 }
 
 struct Numbers<G> {
@@ -38,7 +46,7 @@ impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
 
 /// A tensor of numbers that were computed from some others, whose gradients `backward` computes from its
 /// own, one after the other.
-pub(super) fn derived(
+pub(crate) fn derived(
     from: &[&Tensor],
     shape: impl Into<Shape>,
     numbers: Vec<f32>,
@@ -79,7 +87,7 @@ impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
 }
 
 /// Numbers of all frames, in chunks of frames.
-pub(super) struct Frames {
+pub(crate) struct Frames {
     chunks: Vec<Chunk>,
     /// Frames of a chunk.
     length: usize,
@@ -125,6 +133,15 @@ pub(super) fn frames<A: Send>(
 }
 
 impl Frames {
+    /// Frames of as many numbers each.
+    pub(crate) fn of(n_frames: usize, numbers: &[f32]) -> Self {
+        let n = numbers.len() / n_frames;
+        let copy = |_: &mut (), frame: usize, to: &mut [f32]| {
+            to.copy_from_slice(&numbers[frame * n..][..n])
+        };
+        frames(n_frames, |_| n, || (), copy).0
+    }
+
     /// A frame's numbers.
     #[inline(always)]
     pub(super) fn frame(&self, frame: usize) -> &[f32] {
@@ -134,7 +151,7 @@ impl Frames {
     }
 
     /// All numbers.
-    pub(super) fn concat(mut self) -> Vec<f32> {
+    pub(crate) fn concat(mut self) -> Vec<f32> {
         match self.chunks.len() {
             1 => self.chunks.remove(0).numbers,
             _ => {
@@ -158,14 +175,7 @@ pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>)
 /// `to += numbers`.
 #[inline(always)]
 pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
-    let (to, to_rest) = to.as_chunks_mut::<16>();
-    let (numbers, rest) = numbers.as_chunks::<16>();
-    for (to, numbers) in to.iter_mut().zip(numbers) {
-        for lane in 0..16 {
-            to[lane] += numbers[lane];
-        }
-    }
-    for (to, number) in to_rest.iter_mut().zip(rest) {
+    for (to, number) in to.iter_mut().zip(numbers) {
         *to += *number;
     }
 }
@@ -187,18 +197,4 @@ pub(super) fn sum(numbers: &[f32]) -> f32 {
         add(&mut lanes, numbers);
     }
     rest.iter().sum::<f32>() + lanes.iter().sum::<f32>()
-}
-
-/// A dot product in eight lanes.
-#[inline(always)]
-pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let mut lanes = [0.0; 8];
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
-    let rest: f32 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
-    for (a, b) in a.iter().zip(b) {
-        for lane in 0..8 {
-            lanes[lane] += a[lane] * b[lane];
-        }
-    }
-    rest + lanes.iter().sum::<f32>()
 }

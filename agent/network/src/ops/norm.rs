@@ -51,24 +51,31 @@ impl Sums {
         }
     }
 
-    /// Adds a plane of a kept channel.
+    /// Adds the two numbers that `f` gives for each pair of a kept channel's plane.
     #[inline(always)]
-    pub(super) fn add(&mut self, channel: usize, dy: &[f32], z: &[f32]) {
+    pub(super) fn add(
+        &mut self,
+        channel: usize,
+        [a, b]: [&[f32]; 2],
+        f: impl Fn(f32, f32) -> [f32; 2],
+    ) {
         const LANES: usize = 16;
-        let (mut s, mut q) = ([0.0_f32; LANES], [0.0_f32; LANES]);
-        let ((dy, dy_rest), (z, z_rest)) = (dy.as_chunks::<LANES>(), z.as_chunks::<LANES>());
-        for (dy, z) in dy_rest.iter().zip(z_rest) {
-            s[0] += dy;
-            q[0] += dy * z;
+        let (mut first, mut second) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+        for (a, b) in a_rest.iter().zip(b_rest) {
+            let [one, other] = f(*a, *b);
+            first[0] += one;
+            second[0] += other;
         }
-        for (dy, z) in dy.iter().zip(z) {
+        for (a, b) in a.iter().zip(b) {
             for lane in 0..LANES {
-                s[lane] += dy[lane];
-                q[lane] += dy[lane] * z[lane];
+                let [one, other] = f(a[lane], b[lane]);
+                first[lane] += one;
+                second[lane] += other;
             }
         }
-        self.first[channel] += f64::from(s.iter().sum::<f32>());
-        self.with_z[channel] += f64::from(q.iter().sum::<f32>());
+        self.first[channel] += f64::from(first.iter().sum::<f32>());
+        self.with_z[channel] += f64::from(second.iter().sum::<f32>());
     }
 
     pub(super) fn total(chunks: &[Self]) -> Self {

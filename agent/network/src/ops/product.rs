@@ -5,18 +5,40 @@ use pulp::{Arch, Simd, WithSimd};
 /// The left factor: the number of a row and a term lies at `rows[row] + terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Left<'a> {
-    pub(super) numbers: &'a [f32],
-    pub(super) rows: &'a [usize],
-    pub(super) terms: &'a [usize],
+    numbers: &'a [f32],
+    rows: &'a [usize],
+    terms: &'a [usize],
 }
 
 /// The right factor: the row of a term begins at `terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Right<'a> {
-    pub(super) numbers: &'a [f32],
-    pub(super) terms: &'a [usize],
+    numbers: &'a [f32],
+    terms: &'a [usize],
     /// Numbers of a row.
-    pub(super) cols: usize,
+    cols: usize,
+}
+
+/// A left factor of its numbers, rows and terms.
+pub(super) fn left_factor<'a>(
+    numbers: &'a [f32],
+    rows: &'a [usize],
+    terms: &'a [usize],
+) -> Left<'a> {
+    Left {
+        numbers,
+        rows,
+        terms,
+    }
+}
+
+/// A right factor of its numbers, terms and the numbers of a row.
+pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usize) -> Right<'a> {
+    Right {
+        numbers,
+        terms,
+        cols,
+    }
 }
 
 /// Multiples of `step`: where the rows of a matrix begin.
@@ -226,16 +248,8 @@ mod tests {
                     sums[to + col] += expected[to + col];
                 }
             }
-            let left = Left {
-                numbers: &left,
-                rows: &rows,
-                terms: &left_terms,
-            };
-            let right = Right {
-                numbers: &right,
-                terms: &right_terms,
-                cols,
-            };
+            let left = left_factor(&left, &rows, &left_terms);
+            let right = right_factor(&right, &right_terms, cols);
             let mut out = before.clone();
             add_product(&mut out, &to, left, right);
             assert_eq!(out, sums, "{n_rows} {n_terms} {cols}");

@@ -1,11 +1,13 @@
 //! The neural belief: against candle's layers in 64 bits, on threads, through a checkpoint, and that it learns.
 
 use crate::synthetic::rayon_pool;
-use candle_core::{DType, Device, Tensor, Var};
+use candle_core::{DType, Device, IndexOp, Tensor, Var};
 use emberwatch_model::grid::Shape;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_network::variables::{Variables, build};
-use emberwatch_network::{Lesson, NamedTensor, NetworkError, NeuralBelief, Sightings, UNet};
+use emberwatch_network::{
+    Lesson, NamedTensor, NetworkError, NeuralBelief, Operators, Sightings, UNet,
+};
 
 fn numbers(tensor: &Tensor) -> Vec<f64> {
     let numbers = tensor
@@ -24,8 +26,8 @@ fn off(got: &Tensor, expected: &Tensor) -> f64 {
 }
 
 /// A network in whose head no weight is zero.
-fn unet(dtype: DType, is_stock: bool) -> (UNet, Variables) {
-    let model = |vb| UNet::new(&vb, 12, 3, is_stock);
+fn unet(dtype: DType, operators: Operators) -> (UNet, Variables) {
+    let model = |vb| UNet::new(&vb, 12, 3, operators);
     let (model, variables) = build(3, dtype, &Device::Cpu, model).expect("a network");
     let head = &variables["head.weight"];
     let numbers = (0..head.elem_count()).map(|at| (at as f32 * 0.7).sin());
@@ -36,8 +38,8 @@ fn unet(dtype: DType, is_stock: bool) -> (UNet, Variables) {
 }
 
 fn images(dtype: DType) -> Var {
-    let numbers = (0..2 * 16 * 12 * 12).map(|at| (split_mix(5, at) % 100) as f32 / 100.0);
-    let images = Tensor::from_vec(numbers.collect::<Vec<_>>(), (2, 16, 12, 12), &Device::Cpu);
+    let numbers = (0..2 * 12 * 16 * 12).map(|at| (split_mix(5, at) % 100) as f32 / 100.0);
+    let images = Tensor::from_vec(numbers.collect::<Vec<_>>(), (2, 12, 16, 12), &Device::Cpu);
     let images = images.and_then(|images| Var::from_tensor(&images.to_dtype(dtype)?));
     images.expect("images")
 }
@@ -47,18 +49,18 @@ const CELLS: [[usize; 3]; 5] = [[0, 0, 0], [0, 15, 11], [1, 7, 0], [1, 8, 6], [1
 
 #[test]
 fn the_network_and_its_gradients_are_those_of_candles_layers_in_64_bits() {
-    let (ours, vars) = unet(DType::F32, false);
-    let (stock, exact) = unet(DType::F64, true);
+    let (ours, vars) = unet(DType::F32, Operators::Own);
+    let (stock, exact) = unet(DType::F64, Operators::Stock);
     let (x, exact_x) = (images(DType::F32), images(DType::F64));
     let got = ours.logits(&x).expect("logits");
     let expected = stock.logits(&exact_x).expect("logits");
-    assert_eq!(got.dims(), [2, 16, 12, 3]);
+    assert_eq!(got.dims(), [2, 3, 16, 12]);
     assert!(off(&got, &expected) < 1e-5);
     let got = ours.logits_at(&x, &CELLS).expect("logits");
     let expected: Vec<_> = CELLS
         .iter()
         .map(|[image, row, col]| {
-            let logits = expected.get(*image).and_then(|it| it.get(*row)?.get(*col));
+            let logits = expected.i((*image, .., *row, *col));
             logits.expect("a cell")
         })
         .collect();
@@ -139,6 +141,72 @@ fn one_and_more_threads_give_the_same_bits_and_so_does_a_resume() {
     };
     resumed.load(find, network.n_updates()).expect("whole");
     assert!(learn(&mut resumed) == learn(&mut network));
+}
+
+/// A network of candle's operators, as a GPU uses them.
+fn on_a_device() -> NeuralBelief {
+    let network = NeuralBelief::with_operators(3, 5, &Device::Cpu, Operators::Stock);
+    network.expect("a network")
+}
+
+/// Distributions of another, which the network corrects.
+fn with_bases(mut lessons: Vec<Lesson>) -> Vec<Lesson> {
+    for lesson in &mut lessons {
+        let base = lesson.frame.iter().flat_map(|(cell, _)| base_of(*cell));
+        lesson.base = base.collect();
+    }
+    lessons
+}
+
+fn base_of(cell: usize) -> [f32; 3] {
+    if cell.is_multiple_of(3) {
+        [0.1, 0.8, 0.1]
+    } else {
+        [0.6, 0.3, 0.1]
+    }
+}
+
+#[test]
+fn what_a_device_computes_is_what_we_compute() {
+    for lessons in [lessons(40), with_bases(lessons(40))] {
+        let (mut ours, mut other) = (neural(), on_a_device());
+        for batch in lessons.chunks(10) {
+            let losses = [&ours, &other].map(|network| network.loss(batch).expect("a loss"));
+            assert!(off(&losses[1], &losses[0]) < 1e-5);
+            let gradients = losses.map(|loss| loss.backward().expect("gradients"));
+            for (name, var) in ours.variables() {
+                let of_ours = gradients[0].get(var).expect("a gradient");
+                let of_other = gradients[1].get(&other.variables()[name]);
+                let error = off(of_other.expect("a gradient"), of_ours);
+                assert!(error < 1e-4, "gradient of {name}: off by {error}");
+            }
+            let losses = [&mut ours, &mut other].map(|network| network.update(2e-3, batch));
+            let [got, expected] = losses.map(|loss| loss.expect("finite"));
+            assert!((got - expected).abs() < 1e-5, "{got} {expected}");
+        }
+    }
+}
+
+#[test]
+fn worlds_are_predicted_together_as_each_alone() {
+    let (mut ours, mut other) = (neural(), on_a_device());
+    let lessons = lessons(30);
+    for network in [&mut ours, &mut other] {
+        network.update(2e-2, &lessons[..10]).expect("finite");
+    }
+    let base =
+        ndarray::Array3::from_shape_fn((3, 21, 18), |(y, row, col)| base_of(row * 18 + col)[y]);
+    for base in [None, Some(&base)] {
+        let worlds: Vec<_> = lessons.iter().map(|it| (&it.before, base)).collect();
+        let all = ours.predict_all(&worlds).expect("beliefs");
+        let of_other = other.predict_all(&worlds).expect("beliefs");
+        for ((sightings, base), (got, of_other)) in worlds.iter().zip(all.iter().zip(&of_other)) {
+            assert!(*got == ours.predict(sightings, *base).expect("a belief"));
+            let differences = got.iter().zip(of_other).map(|(a, b)| (a - b).abs());
+            assert!(differences.fold(0.0, f32::max) < 1e-4);
+        }
+    }
+    assert!(ours.predict_all(&[]).expect("none").is_empty());
 }
 
 #[test]

@@ -9,7 +9,7 @@ use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Tensor};
 use emberwatch_model::grid::Shape;
 use emberwatch_network::variables::{Variables, build};
-use emberwatch_network::{Network, NetworkShape, Pass, Stock, Window};
+use emberwatch_network::{Network, NetworkShape, Operators, Pass, Window};
 
 const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
 
@@ -47,8 +47,8 @@ struct Model {
 }
 
 impl Model {
-    fn new(shape: &NetworkShape, dtype: DType, stock: Stock) -> Self {
-        let network = |vb| Network::new(&vb, shape, stock);
+    fn new(shape: &NetworkShape, dtype: DType, operators: Operators) -> Self {
+        let network = |vb| Network::new(&vb, shape, operators);
         let (network, variables) = build(3, dtype, &Device::Cpu, network).expect("a network");
         // Weights and biases of normalisations that are not all alike; the numbers of 32 bits.
         for (index, (name, var)) in variables.iter().enumerate() {
@@ -80,10 +80,10 @@ fn numbers(tensor: &Tensor) -> Vec<f64> {
 }
 
 fn check(case: Case) {
-    check_with(case, Stock::default());
+    check_all(case, &[Operators::Own]);
 }
 
-fn check_with(case: Case, stock: Stock) {
+fn check_all(case: Case, all: &[Operators]) {
     let shape = NetworkShape {
         grid: Shape::new(case.grid[0], case.grid[1]).expect("shape"),
         n_states: case.n_states,
@@ -104,24 +104,29 @@ fn check_with(case: Case, stock: Stock) {
     };
     let window = Window::new(&frames);
     let pass = Pass::training(&window, &dropout);
-    let exact = Model::new(&shape, DType::F64, Stock::ALL);
+    let exact = Model::new(&shape, DType::F64, Operators::Stock);
     let (expected, derivatives) = exact.loss(&pass);
-    let model = Model::new(&shape, DType::F32, stock);
-    let (got, gradients) = model.loss(&pass);
-    assert!(
-        (got / expected - 1.0).abs() < 1e-5,
-        "loss {got}, expected {expected}"
-    );
-    for (name, var) in &exact.variables {
-        let Some(expected) = derivatives.get(var) else {
-            assert!(name.contains("running"), "{name} has no gradient");
-            continue;
-        };
-        let got = gradients.get(&model.variables[name]).expect("a gradient");
-        let error = relative(&numbers(got), &numbers(expected));
-        assert!(error < 1e-4, "gradient of {name}: off by {error}");
+    for &operators in all {
+        let model = Model::new(&shape, DType::F32, operators);
+        let (got, gradients) = model.loss(&pass);
+        assert!(
+            (got / expected - 1.0).abs() < 1e-5,
+            "{operators:?}: loss {got}, expected {expected}"
+        );
+        for (name, var) in &exact.variables {
+            let Some(expected) = derivatives.get(var) else {
+                assert!(name.contains("running"), "{name} has no gradient");
+                continue;
+            };
+            let got = gradients.get(&model.variables[name]).expect("a gradient");
+            let error = relative(&numbers(got), &numbers(expected));
+            assert!(
+                error < 1e-4,
+                "{operators:?}: gradient of {name}: off by {error}"
+            );
+        }
+        predictions_agree(&exact, &model, &window);
     }
-    predictions_agree(&exact, &model, &window);
 }
 
 /// With running statistics, which are those of the start.
@@ -140,33 +145,19 @@ fn predictions_agree(exact: &Model, model: &Model, window: &Window) {
 }
 
 #[test]
-fn each_operator_alone_and_none() {
-    let all = Stock::ALL;
-    for stock in [
-        all,
-        Stock {
-            encoder: false,
-            ..all
-        },
-        Stock { gru: false, ..all },
-        Stock {
-            decoder: false,
-            ..all
-        },
-    ] {
-        let case = Case {
-            grid: [32, 32],
-            n_frames: 12,
-            one_in: 9,
-            ..CASE
-        };
-        check_with(case, stock);
-    }
+fn on_paths() {
+    check(CASE);
 }
 
 #[test]
-fn on_paths() {
-    check(CASE);
+fn of_a_devices_operators() {
+    let case = Case {
+        grid: [32, 48],
+        n_frames: 12,
+        one_in: 9,
+        ..CASE
+    };
+    check_all(case, &[Operators::Own, Operators::Stock]);
 }
 
 #[test]
