@@ -14,6 +14,7 @@
 //! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the parts of learners
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files written whole or not at all
+//! - [`parallel`] -- tasks of several worlds at once
 
 #![allow(
     missing_docs,
@@ -28,6 +29,7 @@ pub mod gradient;
 pub mod learned;
 pub mod learners;
 pub mod options;
+pub mod parallel;
 pub mod policy;
 pub mod replay;
 pub mod reward;

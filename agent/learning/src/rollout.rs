@@ -4,13 +4,13 @@ pub mod agent;
 pub mod building;
 
 use self::agent::Agent;
+use crate::parallel::in_parallel;
 use anyhow::Result;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::planning::Plan;
 use emberwatch_messages::message::RobotResult;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::{Cell, Grid, Move};
-use rayon::prelude::*;
 
 /// One step of the worlds of an environment; `None` if it was stopped before they moved.
 ///
@@ -198,17 +198,4 @@ pub fn see_all<'a>(
 /// Moves all beliefs to the next step.
 pub fn predict_all<'a>(rollouts: impl IntoIterator<Item = &'a mut Rollout>) {
     Agent::predict_all(rollouts.into_iter().map(|rollout| &mut rollout.agent));
-}
-
-/// The results in order. One task alone is done here: handing it to another thread costs more than it gains.
-pub fn in_parallel<T: Send, U: Send>(
-    tasks: impl IntoIterator<Item = T>,
-    work: impl Fn(T) -> U + Sync,
-) -> Vec<U> {
-    let tasks: Vec<T> = tasks.into_iter().collect();
-    if tasks.len() == 1 {
-        tasks.into_iter().map(&work).collect()
-    } else {
-        tasks.into_par_iter().map(&work).collect()
-    }
 }

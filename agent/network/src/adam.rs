@@ -95,16 +95,7 @@ impl Adam {
         // In the order of computation.
         let all = named(&groups).chain(of_variables);
         let all: Vec<_> = all.chain([("loss".into(), loss)]).chain(after).collect();
-        let zeros = all.iter().map(|(_, tensor)| zero_if_finite(tensor));
-        let numbers = zeros
-            .chain([Ok(loss.clone())])
-            .collect::<Result<Vec<_>>>()?;
-        let numbers = copied(&numbers)?;
-        let first = all.iter().zip(&numbers).find(|(_, zero)| **zero != 0.0);
-        if let Some(((name, _), _)) = first {
-            return Err(self.not_finite(name.clone()));
-        }
-        let loss = numbers[all.len()];
+        let loss = self.checked(&all, loss)?;
         set(&changes)?;
         self.steps += 1;
         Ok(loss)

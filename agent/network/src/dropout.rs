@@ -78,11 +78,6 @@ impl Mask {
         self.kept.len() == self.scales.len()
     }
 
-    /// What each channel of a frame is multiplied with; lost ones with zero.
-    pub fn scales(&self, frame: usize) -> &[f32] {
-        &self.scales[frame * self.channels..][..self.channels]
-    }
-
     /// All scales, `[frames, channels]`.
     pub fn tensor(&self, dtype: DType, device: &Device) -> Result<Tensor> {
         let dims = (self.n_frames(), self.channels);
@@ -134,7 +129,8 @@ mod tests {
         let mask = &Dropout::draw(200, 1, 0).decoder[0];
         let mut n_kept = 0;
         for frame in 0..200 {
-            let scaled = (0..128).filter(|&channel| mask.scales(frame)[channel] == 2.0);
+            let scales = &mask.scales[frame * 128..][..128];
+            let scaled = (0..128).filter(|&channel| scales[channel] == 2.0);
             assert!(scaled.eq(mask.kept(frame).iter().copied()));
             n_kept += mask.kept(frame).len();
         }

@@ -37,7 +37,11 @@ impl Gru {
 
     /// The hidden vectors after each of the inputs `[steps, inputs]`, `[steps, hidden]`; `first` is the one
     /// before them.
+    ///
+    /// # Panics
+    /// If `first` has another length.
     pub fn forward(&self, x: &Tensor, first: &[f32]) -> Result<Tensor> {
+        assert_eq!(first.len(), self.w_hh.dim(1)?, "hidden vector: length");
         let inputs = x.matmul(&self.w_ih.t()?)?.broadcast_add(&self.b_ih)?;
         match (self.operators, inputs.dtype()) {
             (Operators::Own, _) => gru_sequence(&inputs, &self.w_hh, &self.b_hh, first),

@@ -88,9 +88,9 @@ impl NeuralBelief {
         })
     }
 
-    /// Whether it is a clone of another, and shares its variables.
-    pub fn is_same(&self, other: &Self) -> bool {
-        Arc::ptr_eq(&self.unet, &other.unet)
+    /// A number that it shares with its clones alone.
+    pub fn id(&self) -> usize {
+        Arc::as_ptr(&self.unet).addr()
     }
 
     /// Number of values that a cell may show.
@@ -139,8 +139,8 @@ impl NeuralBelief {
         Ok(all.swap_remove(0))
     }
 
-    /// [`Self::predict`] of several worlds of one grid, of which all have a base or none has: on the CPU each on a thread
-    /// of its own, on other devices many in one pass.
+    /// [`Self::predict`] of several worlds of one grid, of which all have a base or none has: by our operators each on
+    /// a thread of its own, by candle's many in one pass.
     ///
     /// # Errors
     /// As of [`Self::predict`].
@@ -228,6 +228,10 @@ impl NeuralBelief {
             .flat_map(|it| &it.base)
             .copied()
             .collect();
+        assert!(
+            base.is_empty() || base.len() == cells.len() * self.n_observations,
+            "lessons: expected a base of all cells, or none"
+        );
         Ok(match self.operators {
             Operators::Own => self.loss_at(&images, &cells, values, &base)?,
             Operators::Stock => self.loss_of_all(&images, &cells, &values, &base)?,

@@ -33,12 +33,15 @@ impl<'a> Pass<'a> {
     /// An update's pass.
     ///
     /// # Panics
-    /// If the masks are of another number of frames.
+    /// If the window is empty, or a mask is of another number of frames.
     pub fn training(window: &'a Window, dropout: &Dropout) -> Self {
-        assert_eq!(
-            dropout.encoder[0].n_frames(),
-            window.len(),
-            "frames of the masks"
+        let masks = dropout.encoder.iter().chain(&dropout.decoder);
+        let fits = masks
+            .into_iter()
+            .all(|mask| mask.n_frames() == window.len());
+        assert!(
+            fits && !window.is_empty(),
+            "window: no frame, or other frames than the masks"
         );
         Self {
             window,

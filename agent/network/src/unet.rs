@@ -17,7 +17,7 @@ pub const ALIGNMENT: usize = 4;
 /// Channels at full, half and quarter size.
 const CHANNELS: [usize; 3] = [16, 24, 32];
 
-/// Offsets of a cell and its eight neighbours, in the order of a kernel's taps.
+/// A cell and its eight neighbours, in the order of a kernel's taps.
 const AROUND: usize = 9;
 
 /// Features of cells to logits of observations.
@@ -129,7 +129,8 @@ impl UNet {
             return small.apply_op2(large, DoubledSum);
         }
         let (batch, channels, rows, cols) = small.dims4()?;
-        // On a GPU, the gradient of `index_select` has one thread for each channel.
+        // Not `upsample_nearest2d`, whose gradient candle has for whole batches of one stride alone, nor `index_select`, whose
+        // gradient has one thread for each channel on a GPU.
         let x = small.reshape((batch * channels, rows, 1, cols))?;
         let x = x.broadcast_as((batch * channels, rows, 2, cols))?;
         let x = x.reshape((batch * channels * 2 * rows, cols, 1))?;
@@ -162,7 +163,7 @@ impl Layer {
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
         match self.operators {
-            Operators::Own => self.conv.apply(x, &self.weight, &self.bias),
+            Operators::Own => self.conv.apply(&x.contiguous()?, &self.weight, &self.bias),
             Operators::Stock => self.stock(x),
         }
     }
@@ -184,7 +185,7 @@ impl Layer {
 
     fn residual(&self, x: &Tensor) -> Result<Tensor> {
         match self.operators {
-            Operators::Own => self.conv.residual(x, &self.weight, &self.bias),
+            Operators::Own => (self.conv).residual(&x.contiguous()?, &self.weight, &self.bias),
             Operators::Stock => self.stock(x)? + x,
         }
     }
@@ -219,7 +220,7 @@ impl Around {
                 around.is_inside.push(f32::from(is_inside));
                 let (row, col) = if is_inside { (row, col) } else { (0, 0) };
                 let full = (image * rows + row) * cols + col;
-                let half = (image * rows / 2 + row / 2) * cols / 2 + col / 2;
+                let half = (image * (rows / 2) + row / 2) * (cols / 2) + col / 2;
                 around.full.push(full as u32);
                 around.half.push(half as u32);
             }

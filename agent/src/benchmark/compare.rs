@@ -14,10 +14,11 @@ use emberwatch_learning::beliefs::first_belief::first_belief;
 use emberwatch_learning::beliefs::{Input, WorldForm};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
+use emberwatch_learning::parallel::in_parallel;
 use emberwatch_learning::policy::{Goal, Policy};
 use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::{
-    self, Actor, Rollout, Seen, StepRecord, building, in_parallel, predict_all, see_all,
+    self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
 };
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;

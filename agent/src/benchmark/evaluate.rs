@@ -59,6 +59,8 @@ pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Sc
             let frames: Vec<&Frame> = frames.collect();
             let both = worlds.par_iter_mut().zip(frames);
             both.try_for_each(|(candidates, frame)| candidates.look(frame))?;
+            let all = worlds.iter_mut().flat_map(|world| &mut world.estimators);
+            Agent::predict_all(all);
         }
         scores.extend(worlds.into_iter().map(|candidates| candidates.scores));
     }
@@ -108,7 +110,8 @@ fn candidates(
             counts: vec![0; model.n_observations()],
         },
     };
-    candidates.filter(&guide.observation().frame)?;
+    candidates.correct(&guide.observation().frame)?;
+    Agent::predict_all(&mut candidates.estimators);
     Ok((guide, candidates))
 }
 
@@ -122,15 +125,12 @@ impl Candidates {
         for (_, value) in frame.observed() {
             self.scores.counts[usize::from(value)] += 1;
         }
-        self.filter(frame)
+        self.correct(frame)
     }
 
-    fn filter(&mut self, frame: &Frame) -> Result<()> {
-        for agent in &mut self.estimators {
-            agent.correct(frame, None)?;
-        }
-        Agent::predict_all(&mut self.estimators);
-        Ok(())
+    fn correct(&mut self, frame: &Frame) -> Result<()> {
+        let mut agents = self.estimators.iter_mut();
+        agents.try_for_each(|agent| agent.correct(frame, None))
     }
 }
 

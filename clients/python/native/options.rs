@@ -19,7 +19,7 @@ use emberwatch_learning::beliefs::{self, BeliefKind, NEURAL};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, Planned, Shown, usual};
-use emberwatch_learning::rollout::in_parallel;
+use emberwatch_learning::parallel::in_parallel;
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};

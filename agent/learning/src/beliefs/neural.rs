@@ -7,7 +7,7 @@ use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::{LearnedModel, SavedModel, check_target};
 use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check};
-use crate::rollout::in_parallel;
+use crate::parallel::in_parallel;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::bayes::{correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
@@ -298,7 +298,8 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     }
     in_parallel(others, |estimator| estimator.predict());
     in_parallel(networks.iter_mut(), |it| it.pass());
-    for alike in networks.chunk_by_mut(|a, b| a.is_like(b)) {
+    networks.sort_by_key(|it| it.kind_of_pass());
+    for alike in networks.chunk_by_mut(|a, b| a.kind_of_pass() == b.kind_of_pass()) {
         NeuralEstimator::predict_all(alike);
     }
 }
@@ -313,14 +314,13 @@ impl NeuralEstimator {
         }
     }
 
-    /// Whether one pass of the network can predict both worlds.
-    fn is_like(&self, other: &Self) -> bool {
-        self.network.is_same(&other.network)
-            && self.sightings.shape() == other.sightings.shape()
-            && self.base.is_some() == other.base.is_some()
+    /// One pass of a network predicts worlds for which this is the same.
+    fn kind_of_pass(&self) -> (usize, [usize; 2], bool) {
+        let (height, width) = self.sightings.shape().dim();
+        (self.network.id(), [height, width], self.base.is_some())
     }
 
-    /// Predicts worlds that are like each other.
+    /// Predicts worlds that one pass predicts. If that fails, it fails for all of them.
     fn predict_all(all: &mut [&mut Self]) {
         let worlds = all.iter().map(|it| (&it.sightings, it.base.as_ref()));
         let predicted = all[0].network.predict_all(&worlds.collect::<Vec<_>>());
@@ -353,7 +353,8 @@ fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_network::Device;
+    use emberwatch_belief::estimation::BayesFilter;
+    use emberwatch_network::{Device, Lesson};
 
     fn estimator() -> NeuralEstimator {
         let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
@@ -386,6 +387,46 @@ mod tests {
             (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
             "nothing is learned"
         );
+    }
+
+    #[test]
+    fn many_of_several_networks_predict_together_as_each_alone() {
+        let networks = [1, 2].map(|seed| {
+            let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
+            let lesson = Lesson {
+                before: Sightings::new(shape()),
+                frame: vec![(0, 1), (4, 2)],
+                base: Vec::new(),
+            };
+            let updates = (0..3).map(|_| network.update(0.05, std::slice::from_ref(&lesson)));
+            assert!(updates.into_iter().all(|loss| loss.is_ok()));
+            network
+        });
+        let estimators = || -> Vec<Box<dyn Estimator>> {
+            let filter = || {
+                let model = emberwatch_model::Model::wildfire();
+                BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter")
+            };
+            let mut all: Vec<Box<dyn Estimator>> = vec![Box::new(filter())];
+            // Networks in turn, with a filter below and without.
+            for index in 0..8 {
+                let below = (index % 4 > 1).then(|| Box::new(filter()) as Box<dyn Estimator>);
+                let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
+                let mut estimator = estimator.expect("a belief");
+                let seen = [255, 255, index as u8 % 3, 255, 1, 255];
+                estimator.correct(&frame(&seen)).expect("possible");
+                all.push(Box::new(estimator));
+            }
+            all
+        };
+        let (mut together, mut alone) = (estimators(), estimators());
+        predict_together(together.iter_mut().map(|it| &mut **it).collect());
+        for (index, (together, alone)) in together.iter().zip(&mut alone).enumerate() {
+            let before = alone.belief().clone();
+            alone.predict();
+            assert!(together.belief() == alone.belief(), "{index}");
+            assert!(*alone.belief() != before, "{index}");
+        }
     }
 
     #[test]

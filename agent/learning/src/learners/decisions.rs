@@ -17,8 +17,9 @@ use crate::learners::base::{
     Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
 };
 use crate::learners::update::ModelUpdate;
+use crate::parallel::in_parallel;
 use crate::policy::Policy;
-use crate::rollout::{Actor, Rollout, Seen, StepRecord, in_parallel, predict_all, see_all};
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use anyhow::Result;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_messages::observation::Observation;

@@ -22,9 +22,10 @@ use crate::learners::base::{
 };
 use crate::learners::left::Left;
 use crate::learners::update::ModelUpdate;
+use crate::parallel::in_parallel;
 use crate::policy::Policy;
 use crate::reward::{RewardEstimate, met};
-use crate::rollout::{Actor, Rollout, Seen, StepRecord, in_parallel, predict_all, see_all};
+use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use anyhow::Result;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;

@@ -1,8 +1,8 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 use crate::config::AgentConfig;
+use crate::parallel::in_parallel;
 use crate::policy::Policy;
-use crate::rollout::in_parallel;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};

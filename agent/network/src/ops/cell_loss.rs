@@ -88,8 +88,8 @@ impl<'a> CellLoss<'a> {
 
     /// Adds the loss of a cell where `value` was seen, and puts the gradients of its logits in their place.
     ///
-    /// At most one factor of the likelihood other than `q_y` is near zero, as the `q` sum to one, and 6e-8 or
-    /// more unless it is zero, so the product underflows only where `q_y` all but does.
+    /// The loss is the logarithm of a product. It does not underflow before `q_y` does: the `q` sum to one, so at most one
+    /// of the other factors, `1 - q_a`, is small, and that is 6e-8 at least or zero.
     #[inline(always)]
     fn add(&mut self, logits: &mut [f32], value: u8) {
         let largest = logits.iter().copied().fold(f32::MIN, f32::max);

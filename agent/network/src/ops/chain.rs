@@ -1,10 +1,13 @@
 //! Convolutions with dropout, normalisation and ReLU between them, over all frames of a window and with all gradients.
 //!
 //! Between the passes over the frames only the convolutions' results are kept; what is cheap is computed again. Of each
-//! frame, only the channels that dropout keeps are stored and computed. Behind dropout, a lost channel is zero, and
-//! behind the normalisation and ReLU a constant. This constant is taken off all frames, so that lost channels are zero,
-//! and the constants of all channels go through the convolution once, as one more frame. Gradients follow the same
-//! split.
+//! frame, only the channels that dropout keeps are stored and computed. Dropout makes a lost channel zero, and
+//! normalisation and ReLU make that a constant, its *floor*. As a convolution is linear, `conv(x) = conv(x - floors) +
+//! conv(floors)`: in the first term lost channels are zero, and the second is the same for all frames and computed
+//! once. Gradients follow the same split.
+//!
+//! What lies between two convolutions has two steps, one before the normalisation and one behind it; one of them is
+//! ReLU ([`Order`]).
 
 use super::conv::{Conv, Room};
 use super::cpu::{Frames, add, derived, frames, numbers, sum, total};
@@ -29,7 +32,9 @@ pub(crate) struct Layer<'a> {
 /// What lies between dropout and the next convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Order {
+    /// ReLU, then the normalisation: the encoder. Dropout must scale by more than zero.
     ReluFirst,
+    /// The normalisation, then ReLU: the decoder.
     NormFirst,
 }
 
@@ -82,6 +87,11 @@ impl Chain {
         order: Order,
         mut moments: impl FnMut(usize, Moments) -> Result<Moments>,
     ) -> Result<(Self, Frames)> {
+        let has_norm = |layer: &Layer<'_>| layer.norm.is_some();
+        assert!(
+            layers[1..].iter().all(has_norm),
+            "invariant: only the first layer has no norm"
+        );
         let (mut z, mut sums) = kept_of(&numbers(maps)?, mask, order);
         let mut chain = Self {
             stages: Vec::new(),
@@ -257,7 +267,7 @@ impl Before {
             |dy, z| [dy, dy * order.first(z)],
         );
         if !self.mask.keeps_all() {
-            // What lost positions get is that of all, less this.
+            // Lost positions get that of all positions, which `back_of_floors` adds, less this.
             sums.lost[channel] -= f64::from(sum(dx));
         }
     }
@@ -449,7 +459,7 @@ impl Stage {
         Ok(frames(
             self.output.n_frames(),
             n,
-            || self.gradients(),
+            || self.room_for_gradients(),
             #[inline(always)]
             |to, frame, dy| {
                 let (inputs, outputs) = (before.mask.kept(frame), self.output.kept(frame));
@@ -458,7 +468,7 @@ impl Stage {
                 for (output, d) in outputs.iter().zip(d_out.chunks_exact(area)) {
                     add(&mut to.start[output * area..][..area], d);
                 }
-                if inputs.len() < before.mask.channels() {
+                if self.transposed && inputs.len() < before.mask.channels() {
                     self.conv.forget_turned(&mut to.room);
                 }
                 self.read(
@@ -483,7 +493,7 @@ impl Stage {
         ))
     }
 
-    fn gradients(&self) -> Gradients {
+    fn room_for_gradients(&self) -> Gradients {
         let ([in_area, area], [inputs, outputs]) = (self.areas(), self.all_channels());
         Gradients {
             room: self.conv.room(),
@@ -569,7 +579,7 @@ impl Stage {
         weights: &mut Vec<f32>,
         sums: &mut Sums,
     ) -> Result<()> {
-        let (mut to, [inputs, outputs]) = (self.gradients(), self.all_channels());
+        let (mut to, [inputs, outputs]) = (self.room_for_gradients(), self.all_channels());
         self.put_floors(&mut to.room);
         to.d_out.copy_from_slice(start);
         std::mem::swap(&mut to.weights, weights);
@@ -613,7 +623,7 @@ impl Layer<'_> {
 
 /// Numbers of `[a, b, c]` as `[c, b, a]`.
 fn permuted(numbers: &[f32], [a, b, c]: [usize; 3]) -> Vec<f32> {
-    // Rows of `to` are a power of two apart, and the caches hold few such lines at once: through a small tile.
+    // Rows of `to` are often a power of two apart, and caches hold few such lines at once: through a small tile.
     let (mut to, mut tile) = (vec![0.0; numbers.len()], vec![0.0; a * c]);
     for at_b in 0..b {
         for at_a in 0..a {

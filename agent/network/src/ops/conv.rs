@@ -8,6 +8,8 @@
 //! a [`Room`] with zeros around it, so what all patches have at one place of the kernel is a run of the plane. With a
 //! stride, the large map lies there as `stride * stride` planes, one for each remainder of row and column.
 //!
+//! At stride 1 both maps are of one size.
+//!
 //! Channels are given as lists: those that dropout takes are neither read nor computed.
 
 use super::cpu::add;
@@ -53,7 +55,6 @@ struct Tap {
 }
 
 /// Room for the maps of one frame.
-#[derive(Default)]
 pub(crate) struct Room {
     large: Vec<f32>,
     small: Vec<f32>,
@@ -64,7 +65,20 @@ pub(crate) struct Room {
 }
 
 impl Conv {
+    /// # Panics
+    /// If the small map is not what such a kernel makes of the large one.
     pub(crate) fn new(sizes: Sizes) -> Self {
+        for axis in [0, 1] {
+            let reach = sizes.dilation * (sizes.kernel[axis] - 1) + 1;
+            let padded = sizes.large[axis + 1] + 2 * sizes.padding;
+            let n = padded
+                .checked_sub(reach)
+                .map_or(0, |rest| rest / sizes.stride + 1);
+            assert!(
+                n > 0 && n == sizes.small[axis + 1],
+                "sizes of a convolution: {sizes:?}"
+            );
+        }
         let Sizes {
             stride, dilation, ..
         } = sizes;
@@ -245,6 +259,9 @@ impl Conv {
         let stride = self.sizes.stride;
         let [channels, rows, cols] = self.sizes.large;
         let (n, width) = (self.sizes.small[0], self.framed_cols);
+        if self.small_area() == 1 && self.sizes.padding == 0 && self.sizes.dilation == 1 {
+            return self.up_of_one_cell(weights, room, [large, small], out);
+        }
         let rows_of: Vec<usize> = large.iter().map(|channel| channel * n).collect();
         for part in 0..stride * stride {
             let (first_row, n_rows) = self.inside(part / stride, rows);
@@ -279,6 +296,32 @@ impl Conv {
                 for (out, wide) in out.zip(wide.chunks_exact(width)) {
                     add_to_every(stride, &wide[..n_cols], &mut out[left..]);
                 }
+            }
+        }
+    }
+
+    /// [`Self::up`] where the small map is one cell: each tap reaches another cell of the large map.
+    fn up_of_one_cell(
+        &self,
+        weights: &[f32],
+        room: &Room,
+        [large, small]: [&[usize]; 2],
+        out: &mut [f32],
+    ) {
+        let ([channels, _, cols], n) = (self.sizes.large, self.sizes.small[0]);
+        let first = self.margin[0] * self.framed_cols + self.margin[1];
+        let cell: Vec<f32> = (0..small.len())
+            .map(|index| room.small[index * self.framed + first])
+            .collect();
+        for (tap, weights) in weights.chunks_exact(channels * n).enumerate() {
+            let at = tap / self.sizes.kernel[1] * cols + tap % self.sizes.kernel[1];
+            for (channel, out) in large.iter().zip(out.chunks_exact_mut(self.large_area())) {
+                let weights = &weights[channel * n..][..n];
+                let products = small
+                    .iter()
+                    .zip(&cell)
+                    .map(|(channel, x)| weights[*channel] * x);
+                out[at] += products.sum::<f32>();
             }
         }
     }

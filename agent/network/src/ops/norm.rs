@@ -30,7 +30,7 @@ impl Moments {
     }
 }
 
-/// Per channel, sums over all positions.
+/// Per channel, sums over all positions: of a gradient `dy` and `dy z`, or, for moments, of `z` and `z^2`.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
     /// Of `dy` at kept positions.
@@ -60,22 +60,25 @@ impl Sums {
         f: impl Fn(f32, f32) -> [f32; 2],
     ) {
         const LANES: usize = 16;
-        let (mut first, mut second) = ([0.0_f32; LANES], [0.0_f32; LANES]);
-        let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-        for (a, b) in a_rest.iter().zip(b_rest) {
-            let [one, other] = f(*a, *b);
-            first[0] += one;
-            second[0] += other;
-        }
-        for (a, b) in a.iter().zip(b) {
-            for lane in 0..LANES {
-                let [one, other] = f(a[lane], b[lane]);
-                first[lane] += one;
-                second[lane] += other;
+        // Sums in 32 bits are short: a variance is a difference of two, so longer ones lose digits.
+        for (a, b) in a.chunks(16 * LANES).zip(b.chunks(16 * LANES)) {
+            let (mut first, mut second) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+            let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+            for (a, b) in a_rest.iter().zip(b_rest) {
+                let [one, other] = f(*a, *b);
+                first[0] += one;
+                second[0] += other;
             }
+            for (a, b) in a.iter().zip(b) {
+                for lane in 0..LANES {
+                    let [one, other] = f(a[lane], b[lane]);
+                    first[lane] += one;
+                    second[lane] += other;
+                }
+            }
+            self.first[channel] += f64::from(first.iter().sum::<f32>());
+            self.with_z[channel] += f64::from(second.iter().sum::<f32>());
         }
-        self.first[channel] += f64::from(first.iter().sum::<f32>());
-        self.with_z[channel] += f64::from(second.iter().sum::<f32>());
     }
 
     pub(super) fn total(chunks: &[Self]) -> Self {
