@@ -161,12 +161,13 @@ class Training:
         self.policy = Policy(self.belief, model, args)
 
     def learn(self) -> None:
-        args, begin = self.args, time.process_time()
+        args = self.args
         optimizer = torch.optim.Adam(self.belief.parameters())
         seen, _ = self.envs.reset(seed=args.seed)
         images = self.policy.look(seen)
         replay, log, n_steps, env_seconds = Replay(images, 6_000), Log(args.out), 0, 0.0
-        while (used := time.process_time() - begin) < args.cpu_seconds:
+        begin, used = time.process_time(), 0.0
+        while n_steps == 0 or used < args.cpu_seconds:
             for group in optimizer.param_groups:
                 group["lr"] = 2e-3 * (1.02 - used / args.cpu_seconds)
             paths = self.policy.plan(images, seen["robot"])
@@ -182,6 +183,7 @@ class Training:
             losses = [self.update(optimizer, replay) for _ in range(args.updates)]
             log.add(rewards.mean(), *np.mean(losses, axis=0))
             n_steps += 1
+            used = time.process_time() - begin
             if n_steps % 100 == 0:
                 log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
                 self.save()
