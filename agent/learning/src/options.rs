@@ -139,7 +139,7 @@ impl Planned {
         Ok(())
     }
 
-    /// Moves the beliefs about some worlds to the next step.
+    /// Predicts the beliefs about several worlds.
     pub fn predict_all<'a>(all: impl IntoIterator<Item = &'a mut Self>) {
         Agent::predict_all(all.into_iter().map(|planned| &mut planned.agent));
     }

@@ -119,7 +119,7 @@ fn dqn(c: &mut Criterion) {
     });
 }
 
-/// What a flight of 32 moves along rows and 32 along columns sees, one way or the other.
+/// Returns the frame of a flight of 32 moves along a row and 32 along a column.
 fn flight_frame(step: u64) -> Frame {
     let directions = match step % 4 {
         0 => [Move::Right, Move::Down],
@@ -136,7 +136,8 @@ fn flight_frame(step: u64) -> Frame {
     frame
 }
 
-/// As in a training (`neural.batch`): 64 lessons, of which 16 fill a batch, as flights need whole grids.
+/// Measures the neural belief as a training uses it: from 64 lessons (`neural.batch`) an update takes the 16 that fill a
+/// batch, because long flights need whole grids.
 fn neural_belief(c: &mut Criterion) {
     let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());

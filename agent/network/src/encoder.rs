@@ -4,9 +4,11 @@
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
 use crate::operators::Operators;
-use crate::ops::chain::{Chain, Layer, Order};
+use crate::ops::activation::Order;
+use crate::ops::chain::Chain;
 use crate::ops::conv::{Conv, Sizes};
 use crate::ops::cpu::{Frames, derived};
+use crate::ops::stage::Layer;
 use crate::pass::Pass;
 use crate::shape::{ConvShape, NetworkShape};
 use crate::variables::uniform_init;

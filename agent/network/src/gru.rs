@@ -18,7 +18,7 @@ pub struct Gru {
 }
 
 impl Gru {
-    /// A GRU from so many inputs to a hidden vector of some length, of these operators.
+    /// Creates a GRU with the given input and hidden sizes.
     pub fn new(
         vb: &VarBuilder<'_>,
         inputs: usize,

@@ -33,7 +33,7 @@ const LEAST: f64 = 1e-6;
 /// Cells of a batch: 16 grids of 64 x 64, or 40 crops of 40 x 40.
 const BATCH_CELLS: usize = 65_536;
 
-/// Cells of one pass of predictions on a device other than the CPU: 64 grids of 64 x 64.
+/// Maximum number of cells in one pass of predictions with candle's operators: 64 grids of 64 x 64.
 const PASS_CELLS: usize = 262_144;
 
 /// What was seen in a world, and what the filter that is corrected predicts there, `[O, H, W]`.
@@ -68,7 +68,7 @@ impl NeuralBelief {
         Self::with_operators(n_observations, seed, device, operators)
     }
 
-    /// As [`Self::new`], of these operators. Candle's also compute on the CPU.
+    /// Creates a network like [`Self::new`], with the given operators. Candle's operators work on every device.
     pub fn with_operators(
         n_observations: usize,
         seed: u64,
@@ -88,7 +88,7 @@ impl NeuralBelief {
         })
     }
 
-    /// A number that it shares with its clones alone.
+    /// Returns an identifier shared by clones only.
     pub fn id(&self) -> usize {
         Arc::as_ptr(&self.unet).addr()
     }
@@ -139,8 +139,8 @@ impl NeuralBelief {
         Ok(all.swap_remove(0))
     }
 
-    /// [`Self::predict`] of several worlds of one grid, of which all have a base or none has: by our operators each on
-    /// a thread of its own, by candle's many in one pass.
+    /// Predicts several worlds of one grid like [`Self::predict`]. Either all worlds have a base, or none has. Our operators
+    /// predict one world per thread, candle's operators many worlds in one pass.
     ///
     /// # Errors
     /// As of [`Self::predict`].
@@ -238,7 +238,7 @@ impl NeuralBelief {
         })
     }
 
-    /// The last layers compute the cells that are seen.
+    /// Computes the last layers at the observed cells only.
     fn loss_at(
         &self,
         images: &Tensor,
@@ -257,7 +257,7 @@ impl NeuralBelief {
         log_p.mean_all()?.neg()
     }
 
-    /// The same with all cells, and a weight for each: nothing is gathered or scattered.
+    /// Computes the same loss from all cells, weighted by whether they were observed, without gather or scatter.
     fn loss_of_all(
         &self,
         images: &Tensor,

@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Device};
 
-/// Ours, or those of candle's stock layers. Both compute the same, up to rounding.
+/// The implementation of the networks' operators. Both give the same results up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operators {
     /// Hand-written kernels and gradients (`ops`), for 32-bit floats on the CPU.

@@ -1,14 +1,15 @@
 //! Operators with hand-written kernels and gradients, for 32-bit floats on the CPU.
 //!
-//! The layers keep the stock operators beside them, which run on other devices and with other numbers, and are what the
-//! tests compare with. There are four:
+//! Each layer also has an implementation with candle's operators, which runs on other devices and number types. Tests compare
+//! the two.
 //!
-//! - convolutions, plain and transposed, one frame at a time ([`conv`], on [`product`]s of matrices);
-//! - one of images, with bias, ReLU and residual, for the U-Net ([`image_conv`]), and its doubling ([`doubled_sum`]);
-//! - chains of convolutions with dropout, normalisation and ReLU between them, for the autoencoder ([`chain`]), and its
-//!   loss at visited cells ([`cell_loss`]);
-//! - a GRU over a sequence ([`gru_sequence`]).
+//! - [`conv`]: the arithmetic of plain and transposed convolutions, one frame at a time, on the matrix [`product`]s.
+//! - [`image_conv`], [`doubled_sum`]: the U-Net's operators, a convolution with bias, ReLU and residual, and upsampling.
+//! - [`chain`]: the autoencoder's encoder and decoder, sequences of convolutions ([`stage`]) with dropout, normalisation
+//!   ([`norm`]) and ReLU ([`activation`]) between them. [`cell_loss`]: their loss at visited cells.
+//! - [`gru_sequence`]: a GRU over a sequence.
 
+pub(crate) mod activation;
 pub(crate) mod cell_loss;
 pub(crate) mod chain;
 pub(crate) mod conv;
@@ -18,3 +19,4 @@ pub(crate) mod gru_sequence;
 pub(crate) mod image_conv;
 pub(crate) mod norm;
 mod product;
+pub(crate) mod stage;

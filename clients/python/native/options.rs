@@ -387,7 +387,7 @@ impl State {
     }
 }
 
-/// Corrects the beliefs, moves them to the next step, and plans. Worlds whose frame is refused stay as they are.
+/// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
 fn work_on(
     crew: &Crew,
     mut tasks: Vec<WorldWork<'_>>,

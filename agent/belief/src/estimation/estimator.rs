@@ -23,8 +23,8 @@ pub trait Estimator: Send + Any {
     /// Moves the belief from X_k to X_{k+1} (eq. 6).
     fn predict(&mut self);
 
-    /// Of one whose like predict many worlds together in less time than one by one: a function that does what
-    /// [`Self::predict`] does to each of several estimators, also of other kinds.
+    /// Returns a function that predicts several estimators, of any kind, with the same results as [`Self::predict`] on
+    /// each. Estimators that predict many worlds faster together provide it.
     fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
         None
     }

@@ -285,7 +285,7 @@ impl Handover for NeuralEstimator {
     }
 }
 
-/// Moves beliefs to the next step, those of one network together.
+/// Predicts all estimators; worlds that share a network are predicted in one pass.
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
     for estimator in estimators {
@@ -305,7 +305,7 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
 }
 
 impl NeuralEstimator {
-    /// Goes on to the next step, before the network predicts it.
+    /// Advances the sightings and the corrected filter by one step.
     fn pass(&mut self) {
         self.sightings.pass();
         if let Some(filter) = &mut self.filter {
@@ -314,13 +314,13 @@ impl NeuralEstimator {
         }
     }
 
-    /// One pass of a network predicts worlds for which this is the same.
+    /// Returns the key by which worlds are grouped into passes: network, grid, and whether a filter is corrected.
     fn kind_of_pass(&self) -> (usize, [usize; 2], bool) {
         let (height, width) = self.sightings.shape().dim();
         (self.network.id(), [height, width], self.base.is_some())
     }
 
-    /// Predicts worlds that one pass predicts. If that fails, it fails for all of them.
+    /// Predicts the worlds of one group. A failure is recorded for every world of the group.
     fn predict_all(all: &mut [&mut Self]) {
         let worlds = all.iter().map(|it| (&it.sightings, it.base.as_ref()));
         let predicted = all[0].network.predict_all(&worlds.collect::<Vec<_>>());

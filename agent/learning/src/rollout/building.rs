@@ -39,9 +39,10 @@ pub fn agent(
         airspace: model.airspace(shape)?,
         chooser: chooser(policy, config, learned, target)?,
         basis: basis(policy, config, learned)?,
-        beam_width: match policy.chooses_options() {
-            true => policy.decisions(learned)?.beam_width,
-            false => config.decisions.beam_width,
+        beam_width: if policy.chooses_options() {
+            policy.decisions(learned)?.beam_width
+        } else {
+            config.decisions.beam_width
         },
         state_names: belief.state_names(conditions)?,
         n_moves,

@@ -10,16 +10,16 @@ use crate::window::Window;
 /// or 1.
 pub(crate) const LOG_FLOOR: f64 = 1e-10;
 
-/// The mean loss over a window's targets, and its gradients.
+/// The mean loss over a window's targets, in nats per cell, and its gradients.
 pub(crate) struct WindowLoss {
     pub(crate) loss: f64,
-    /// Of the logits.
+    /// Gradient of the logits.
     pub(crate) d_logits: Frames,
-    /// Of `O [observations, states]`.
+    /// Gradient of `O [observations, states]`.
     pub(crate) d_observation: Vec<f32>,
 }
 
-/// From the logits of each frame, `[states, rows, cols]`.
+/// Computes the loss from the logits of each frame, `[states, rows, cols]`.
 pub(crate) fn window_loss(
     window: &Window,
     logits: &Frames,
@@ -88,8 +88,8 @@ impl<'a> CellLoss<'a> {
 
     /// Adds the loss of a cell where `value` was seen, and puts the gradients of its logits in their place.
     ///
-    /// The loss is the logarithm of a product. It does not underflow before `q_y` does: the `q` sum to one, so at most one
-    /// of the other factors, `1 - q_a`, is small, and that is 6e-8 at least or zero.
+    /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: the `q` sum to one, so at
+    /// most one other factor `1 - q_a` is small, and it is zero or at least 6e-8.
     #[inline(always)]
     fn add(&mut self, logits: &mut [f32], value: u8) {
         let largest = logits.iter().copied().fold(f32::MIN, f32::max);

@@ -1,16 +1,14 @@
-//! The kernels of every convolution, one frame at a time: forward, and both gradients.
+//! The arithmetic of every convolution, one frame at a time: the forward pass and both gradients.
 //!
-//! A convolution reads a *large* map and gives a *small* one; a transposed convolution reads the small and gives the
-//! large. Each is the gradient of the other, so [`Conv::down`], [`Conv::up`] and [`Conv::add_weight_gradient`] serve
-//! both. Maps are planes, one per channel; weights are `[kernel rows, kernel cols, large channels, small channels]`.
+//! A convolution reads a *large* map and produces a *small* one (of equal size at stride 1). A transposed convolution does the
+//! reverse. Each is the gradient of the other, so [`Conv::down`], [`Conv::up`] and [`Conv::add_weight_gradient`] serve both.
+//! Maps are `[channels, rows, cols]`, weights `[kernel rows, kernel cols, large channels, small channels]`.
 //!
-//! All three are products of matrices whose rows lie anywhere ([`super::product`]). No patch is copied: a plane lies in
-//! a [`Room`] with zeros around it, so what all patches have at one place of the kernel is a run of the plane. With a
-//! stride, the large map lies there as `stride * stride` planes, one for each remainder of row and column.
+//! All three are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into a zero-padded
+//! buffer, where the cells that one tap of the kernel reads for all output cells are one contiguous run. With a stride `s`, the
+//! large plane is split into `s * s` parts by the remainders of row and column, so that runs stay contiguous.
 //!
-//! At stride 1 both maps are of one size.
-//!
-//! Channels are given as lists: those that dropout takes are neither read nor computed.
+//! Channels are passed as lists: channels dropped by dropout are neither read nor computed.
 
 use super::cpu::add;
 use super::product::{add_product, left_factor, product, right_factor, steps};
@@ -31,42 +29,42 @@ pub(crate) struct Sizes {
     pub(crate) dilation: usize,
 }
 
-/// A convolution's sizes and what follows from them.
+/// A convolution with its index tables.
 #[derive(Debug, Clone)]
 pub(crate) struct Conv {
     pub(crate) sizes: Sizes,
     taps: Vec<Tap>,
-    /// Rows and columns of one of the planes into which a padded large plane is split.
+    /// Rows and columns of each part of a padded large plane.
     part: [usize; 2],
-    /// Rows and columns of zeros before a small plane.
+    /// Rows and columns of zeros above and left of a small plane.
     margin: [usize; 2],
-    /// Columns of a small plane with its margins, and its numbers.
+    /// Columns and numbers of a small plane with its margins.
     framed_cols: usize,
     framed: usize,
 }
 
-/// One place of the kernel.
+/// One position of the kernel.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
-    /// Which of a large plane's parts it reads.
+    /// Index of the part that it reads.
     part: usize,
-    /// By how many rows and columns its runs are shifted there.
+    /// Rows and columns by which its run is shifted in that part.
     shift: [usize; 2],
 }
 
-/// Room for the maps of one frame.
+/// Buffers for the maps of one frame.
 pub(crate) struct Room {
     large: Vec<f32>,
     small: Vec<f32>,
     /// The small map with channels last, `[cells, channels]`.
     turned: Vec<f32>,
-    /// Results with what lies between the ends of rows.
+    /// Results including the padding between rows.
     wide: Vec<f32>,
 }
 
 impl Conv {
     /// # Panics
-    /// If the small map is not what such a kernel makes of the large one.
+    /// If the sizes of the two maps do not match the kernel, stride, padding and dilation.
     pub(crate) fn new(sizes: Sizes) -> Self {
         for axis in [0, 1] {
             let reach = sizes.dilation * (sizes.kernel[axis] - 1) + 1;
@@ -117,7 +115,7 @@ impl Conv {
         self.sizes.small[1] * self.sizes.small[2]
     }
 
-    /// Numbers between a split plane and the next.
+    /// Returns the size of a split plane.
     fn split(&self) -> usize {
         self.sizes.stride * self.sizes.stride * self.part[0] * self.part[1]
     }
@@ -133,7 +131,7 @@ impl Conv {
         }
     }
 
-    /// Puts a large plane at an index, between zeros that stay.
+    /// Copies a large plane to an index; the zeros around it stay.
     #[inline(always)]
     pub(crate) fn put_large(&self, room: &mut Room, index: usize, plane: &[f32]) {
         let Sizes {
@@ -155,7 +153,7 @@ impl Conv {
         }
     }
 
-    /// Puts all planes of a large map.
+    /// Copies all planes of a large map.
     #[inline(always)]
     pub(crate) fn put_all_large(&self, room: &mut Room, map: &[f32]) {
         for (index, plane) in map.chunks_exact(self.large_area()).enumerate() {
@@ -163,12 +161,12 @@ impl Conv {
         }
     }
 
-    /// All channels of the large map, and of the small one.
+    /// Returns all channels of the large map and of the small map.
     pub(crate) fn channels(&self) -> [Vec<usize>; 2] {
         [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
     }
 
-    /// Puts a small plane at an index, between zeros that stay.
+    /// Copies a small plane to an index; the zeros around it stay.
     #[inline(always)]
     pub(crate) fn put_small(&self, room: &mut Room, index: usize, plane: &[f32]) {
         let cols = self.sizes.small[2];
@@ -179,8 +177,8 @@ impl Conv {
         }
     }
 
-    /// Puts a small plane of a channel where [`Self::add_weight_gradient`] reads it, with channels last. Channels of other
-    /// frames stay until [`Self::forget_turned`].
+    /// Copies a small plane, transposed to channels last, for [`Self::add_weight_gradient`]. Other channels keep the values of
+    /// earlier frames until [`Self::forget_turned`].
     #[inline(always)]
     pub(crate) fn turn_small(&self, room: &mut Room, channel: usize, plane: &[f32]) {
         let to = room.turned[channel..]
@@ -189,10 +187,10 @@ impl Conv {
         to.zip(plane).for_each(|(to, from)| *to = *from);
     }
 
-    /// Puts all planes of a small map there.
+    /// Copies all planes of a small map like [`Self::turn_small`].
     #[inline(always)]
     pub(crate) fn turn_all_small(&self, room: &mut Room, map: &[f32]) {
-        /// Cells at a time, so that they stay in the first cache.
+        /// Cells per block, which fits into the first-level cache.
         const CELLS: usize = 64;
         let n = self.sizes.small[0];
         for (block, to) in room.turned.chunks_mut(CELLS * n).enumerate() {
@@ -209,12 +207,12 @@ impl Conv {
         room.turned.fill(0.0);
     }
 
-    /// The small map's numbers as [`Self::turn_small`] has put them, `[cells, channels]`.
+    /// Returns the transposed small map, `[cells, channels]`.
     pub(crate) fn turned<'a>(&self, room: &'a Room) -> &'a [f32] {
         &room.turned
     }
 
-    /// Adds the small map of some channels to `out`, from the large one of some channels in `room`.
+    /// Computes the given small channels from the given large channels in `room`, and adds them to `out`.
     #[inline(always)]
     pub(crate) fn down(
         &self,
@@ -247,7 +245,7 @@ impl Conv {
         }
     }
 
-    /// Adds the large map of some channels to `out`, from the small one of some channels in `room`.
+    /// Computes the given large channels from the given small channels in `room`, and adds them to `out`.
     #[inline(always)]
     pub(crate) fn up(
         &self,
@@ -300,7 +298,7 @@ impl Conv {
         }
     }
 
-    /// [`Self::up`] where the small map is one cell: each tap reaches another cell of the large map.
+    /// Computes [`Self::up`] where the small map is one cell: each tap writes a different cell of the large map.
     fn up_of_one_cell(
         &self,
         weights: &[f32],
@@ -326,7 +324,7 @@ impl Conv {
         }
     }
 
-    /// The first row or column of the parts of a remainder that lies inside a large plane of a side, and how many do.
+    /// Returns the first row (or column) inside the large plane among the rows with a remainder, and their number.
     fn inside(&self, remainder: usize, side: usize) -> (usize, usize) {
         let Sizes {
             stride, padding, ..
@@ -336,8 +334,7 @@ impl Conv {
         (first, end.saturating_sub(first))
     }
 
-    /// Adds the gradient of the weights, from the large map of some channels in `room`, and the small one as
-    /// [`Self::turn_small`] has put it there.
+    /// Adds the gradient of the weights, from the given large channels and the transposed small map in `room`.
     #[inline(always)]
     pub(crate) fn add_weight_gradient(&self, room: &Room, large: &[usize], to: &mut [f32]) {
         let ([n, rows, cols], width) = (self.sizes.small, self.part[1]);
@@ -355,7 +352,7 @@ impl Conv {
         add_product(to, &into, left, right_factor(&room.turned, &turned, n));
     }
 
-    /// Where in a split plane the run of a tap begins.
+    /// Returns where the run of a tap begins in a split plane.
     fn run(&self, tap: usize) -> usize {
         let Tap { part, shift } = self.taps[tap];
         (part * self.part[0] + shift[0]) * self.part[1] + shift[1]

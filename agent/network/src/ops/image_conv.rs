@@ -7,8 +7,8 @@ use emberwatch_model::vectors::vectorised;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
-/// Sums of gradients whose total is that of a batch, each of images that follow one another: the number of threads
-/// changes no bit of the result.
+/// Number of partial sums of a batch's gradients, each over consecutive images. It is constant, so that results do not
+/// depend on the number of threads.
 const N_SUMS: usize = 8;
 
 /// A convolution that keeps the image's size, or divides it by the stride.
@@ -26,12 +26,12 @@ pub(crate) struct ImageConv {
 }
 
 impl ImageConv {
-    /// Of images, weights and bias.
+    /// Applies the convolution to images.
     pub(crate) fn apply(self, x: &Tensor, weights: &Tensor, bias: &Tensor) -> Result<Tensor> {
         x.apply_op3(weights, bias, Call::new(self, false))
     }
 
-    /// The same with the image added, behind ReLU; of as many channels and without a stride.
+    /// Applies the convolution, and adds the image after ReLU. The result must have the image's shape.
     pub(crate) fn residual(self, x: &Tensor, weights: &Tensor, bias: &Tensor) -> Result<Tensor> {
         x.apply_op3(weights, bias, Call::new(self, true))
     }
@@ -65,7 +65,7 @@ impl ImageConv {
 struct Call {
     conv: ImageConv,
     adds_image: bool,
-    /// Which results ReLU kept: of the sum with the image nothing tells.
+    /// Whether ReLU passed each result. It cannot be derived from the output of a residual layer.
     kept: OnceLock<Vec<bool>>,
 }
 
@@ -93,7 +93,7 @@ impl Call {
     }
 
     #[inline(always)]
-    fn before_relu(&self, kept: &[bool], dy: &[f32]) -> Vec<f32> {
+    fn gradient_before_relu(&self, kept: &[bool], dy: &[f32]) -> Vec<f32> {
         let relu = self.conv.relu;
         let pairs = dy.iter().zip(kept);
         pairs
@@ -178,7 +178,7 @@ impl CustomOp3 for Call {
             call: self,
             conv: &conv,
             weights: &weight_numbers,
-            // A tensor that is no result, as the first image, needs no gradient.
+            // Constants, such as the network's input, need no gradient.
             of_image: x.track_op(),
         };
         let images = images.map_init(
@@ -222,7 +222,8 @@ struct Back<'a> {
 }
 
 impl Back<'_> {
-    /// Writes the gradient of an image `x`, and that before ReLU with channels last; returns that of the weights.
+    /// Writes the gradient `dx` of an image, and the gradient before ReLU, `[cells, channels]`, to `turned`. Returns the
+    /// gradient of the weights.
     #[inline(always)]
     fn image(
         &self,
@@ -233,7 +234,7 @@ impl Back<'_> {
         turned: &mut [f32],
     ) -> Vec<f32> {
         let (conv, [large, small]) = (self.conv, self.conv.channels());
-        let dz = self.call.before_relu(kept, dy);
+        let dz = self.call.gradient_before_relu(kept, dy);
         conv.put_all_large(room, x);
         conv.turn_all_small(room, &dz);
         turned.copy_from_slice(conv.turned(room));

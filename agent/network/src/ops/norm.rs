@@ -30,7 +30,7 @@ impl Moments {
     }
 }
 
-/// Per channel, sums over all positions: of a gradient `dy` and `dy z`, or, for moments, of `z` and `z^2`.
+/// Sums over all positions, per channel: of `dy` and `dy z` in the backward pass, of `z` and `z^2` for moments.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
     /// Of `dy` at kept positions.
@@ -51,7 +51,7 @@ impl Sums {
         }
     }
 
-    /// Adds the two numbers that `f` gives for each pair of a kept channel's plane.
+    /// Adds `f(a, b)` for each pair of numbers of a channel's planes.
     #[inline(always)]
     pub(super) fn add(
         &mut self,

@@ -183,7 +183,7 @@ fn what_a_device_computes_is_what_we_compute() {
             let losses = [&mut ours, &mut other].map(|network| network.update(2e-3, batch));
             let [got, expected] = losses.map(|loss| loss.expect("finite"));
             assert!((got - expected).abs() < 1e-5, "{got} {expected}");
-            // Steps of Adam are as long as its rate at most, also where a gradient is all but zero.
+            // Where a gradient is almost zero, Adam still takes a step of its full rate, in a direction set by rounding.
             for (name, var) in ours.variables() {
                 let moved = (var.as_tensor() - other.variables()[name].as_tensor())
                     .and_then(|moved| moved.abs()?.mean_all()?.to_scalar::<f32>());
