@@ -20,7 +20,7 @@ const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinc
                       mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
                       steps_to_detection,burning_cells_at_detection,recent_steps,\
                       burning_seen_share,front_distance,grid_seen_share,log_likelihood,\
-                      worlds_fingerprint,policy_fingerprint";
+                      worlds_fingerprint,policy_fingerprint,training_seconds";
 
 /// The rows of a CSV file without the time that plans took; its header is checked.
 fn rows(path: &Path) -> Vec<Vec<String>> {
@@ -29,7 +29,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 23, "{line}");
+        assert_eq!(fields.len(), 24, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields

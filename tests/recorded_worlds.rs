@@ -2,6 +2,7 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::recording::{read, read_whole, start_recorder, start_replay, stop, truths};
+use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::client::truth::TruthFeed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::ConnectionError;
@@ -337,6 +338,84 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     refuse(ladder, no_model);
     let words = "--steps: expected at most 23, as the shortest episode has, got 24";
     refuse("compare --seeds 0..1 --steps 24", words);
+}
+
+/// States that stay as they are.
+const STILL: &str = r##"
+name = "still"
+kernel_size = [1, 1]
+states = [
+    { name = "unburnt", color = "#000000", initial = 0.4, observed_as = [1.0, 0.0, 0.0] },
+    { name = "burning", color = "#ff0000", initial = 0.3, observed_as = [0.0, 1.0, 0.0], reward = 1.0 },
+    { name = "burnt", color = "#777777", initial = 0.3, observed_as = [0.0, 0.0, 1.0] },
+]
+observations = [
+    { name = "dark", color = "#000000" },
+    { name = "hot", color = "#ff0000" },
+    { name = "grey", color = "#777777" },
+]
+kernel = [
+    { from = "unburnt", to = "unburnt", weights = [[1.0]] },
+    { from = "burning", to = "burning", weights = [[1.0]] },
+    { from = "burnt", to = "burnt", weights = [[1.0]] },
+]
+"##;
+
+#[test]
+fn beliefs_of_a_given_model_run_on_recorded_states() {
+    let place = Place::new(&[6], (3, 5));
+    let mut states = place.sequences[0].clone();
+    let first = place.sequences[0].index_axis(Axis(0), 0);
+    states
+        .outer_iter_mut()
+        .for_each(|mut step| step.assign(&first));
+    let path = |name: &str| place.folder.path().join(name);
+    let file = File::create(path("0.npy")).expect("create");
+    states.write_npy(file).expect("write");
+    let [model, rows] = ["still.toml", "rows.csv"].map(path);
+    std::fs::write(&model, STILL).expect("write");
+    let compare = format!(
+        "compare --states {} --moves 4 --seeds 0..2 --steps 4 --policies beam_exploit,spatial_beam,coverage \
+         --baseline coverage --csv {}",
+        place.folder.path().display(),
+        rows.display()
+    );
+    let measure = |flags: &str| {
+        agent(&format!("{compare} --model {} {flags}", model.display())).check(0);
+        let runs = read_runs(&rows).expect("rows");
+        let known = runs.into_iter().filter(|run| run.policy != "coverage");
+        known.collect::<Vec<_>>()
+    };
+    let (unknown, known) = (measure(""), measure("--first-state-known"));
+    assert_eq!((unknown.len(), known.len()), (4, 4));
+    for (unknown, known) in unknown.iter().zip(&known) {
+        assert!(unknown.brier > Some(0.0) && unknown.log_likelihood < Some(0.0));
+        assert_eq!((known.brier, known.log_likelihood), (Some(0.0), Some(0.0)));
+        assert_ne!(unknown.policy_fingerprint, known.policy_fingerprint);
+    }
+    check(
+        AGENT,
+        &compare,
+        "policy \"beam_exploit\" filters with a model, and recorded worlds have none",
+    );
+    let other =
+        "--model: expected the recorded states unburnt, burning, burnt, got normal, latent, fire";
+    check(AGENT, &format!("{compare} --model wildfire"), other);
+    let train = format!(
+        "train --states {} --model wildfire",
+        place.folder.path().display()
+    );
+    let out = path("out").display().to_string();
+    check(
+        AGENT,
+        &format!("{train} --out {out}"),
+        "--model: expected none beside --states",
+    );
+    check(
+        AGENT,
+        &format!("{compare} --first-state-known --prior uniform"),
+        "cannot be used with",
+    );
 }
 
 #[test]

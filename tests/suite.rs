@@ -271,7 +271,7 @@ fn html_and_markdown_in_an_entry_are_refused_by_their_column() {
         "task: expected 1 to 64 letters",
     );
     board.check(replace("be807c7", "<i>be807c7"), "commit: expected 7 to 40");
-    let about = "--policy mine --by <svg> --code here --commit abcdef0";
+    let about = "--policy mine --by <svg> --code here --commit abcdef0 --training-seconds 0";
     let out = board.0.path().join("out");
     std::fs::create_dir(&out).expect("a folder");
     let rows = read(&repository().join("docs/learning/rows.csv"));
@@ -359,6 +359,47 @@ fn a_policy_runs_again_on_what_was_learned_since() {
 }
 
 #[test]
+fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    std::fs::write(path("tiny.toml"), TASK).expect("write");
+    let recorded = "name = \"fires\"\nstates = \"jacksboro\"\nmoves = 8\nmax_steps = 10\n\
+                    test_seeds = { start = 0, end = 2 }\n";
+    std::fs::write(path("fires.toml"), recorded).expect("write");
+    let suite = |steps: u64| {
+        let [tiny, fires, out, runs] = ["tiny.toml", "fires.toml", "out", "runs"].map(path);
+        let policies = "learned_beam,learned_policy,neural_beam,beam_exploit,known/options/learned";
+        agent(&format!(
+            "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} --train --train-steps {steps}"
+        ))
+        .check(0)
+    };
+    let first = suite(64);
+    first.check_says("task tiny: training filter for learned_beam, 0 of 64 world steps done");
+    first.check_says("task fires: training decisions for learned_policy, 0 of 64 world steps");
+    for policy in ["beam_exploit", "known/options/learned"] {
+        let gap = "is not run: it needs a known model, and recorded worlds have none";
+        first.check_says(&format!("task fires: {policy} {gap}"));
+    }
+    let seconds = |task: &str, policy: &str| {
+        let runs = read_runs(&folder.path().join("out").join(task)).expect("rows");
+        let run = runs.into_iter().find(|run| run.policy == policy);
+        run.expect(policy).training_seconds.expect("kept")
+    };
+    for task in ["tiny.csv", "fires.csv"] {
+        assert!(seconds(task, "neural_beam") > 0.0);
+        assert!(seconds(task, "learned_policy") >= seconds(task, "learned_beam"));
+        assert_eq!(seconds(task, "random_walk"), 0.0);
+    }
+    let again = suite(64);
+    again.check_says("3 rows of learned_policy kept");
+    assert!(!again.stderr.contains("training"), "{}", again.stderr);
+    let longer = suite(96);
+    longer.check_says("task tiny: training neural for neural_beam, 64 of 96 world steps done");
+    longer.check_says("3 rows of neural_beam are run again");
+}
+
+#[test]
 fn all_names_are_checked_before_anything_runs() {
     let folder = TempDir::new().expect("a folder");
     std::fs::write(folder.path().join("tiny.toml"), TASK).expect("write");
@@ -386,6 +427,8 @@ fn wrong_suites_and_entries_are_named() {
 suite --policies bem => policy: expected one of | got \"bem\"
 suite --worlds 0 => --worlds
 suite --tasks small --checkpoints no/such => --checkpoints: expected a folder, got no/such
+suite --train => --checkpoints
+suite --checkpoints runs --train-steps 5 => --train
 leaderboard --entries no/such => expected a folder of entries at no/such
 leaderboard --policy mine => --add
 leaderboard --add x --policy mine => --by";

@@ -138,6 +138,35 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
 }
 
 #[test]
+fn a_filter_learns_from_frames_that_show_every_cell() {
+    let place = place();
+    place.train("path", &format!("{WORLDS} --steps 120"));
+    place.train("full", &format!("{WORLDS} --steps 120 --coverage full"));
+    // The replay keeps 54 cells of a step, where a path of five moves shows at most six.
+    let size = |out: &str| bytes(&place.checkpoint(out)).len();
+    assert!(2 * size("full") > 3 * size("path"));
+    place.train(
+        "full",
+        &format!("{WORLDS} --steps 20 --coverage full --resume"),
+    );
+    let server = Server::start(&format!("{SMALL} --worlds 2"));
+    let name = server.instance.name();
+    for (flags, words) in [
+        (
+            format!("--instance {name} --worlds 1"),
+            "--coverage full: expected a server with --coverage client or full, got path",
+        ),
+        (
+            format!("{WORLDS} --learner neural"),
+            "--coverage full: expected --learner filter, got neural",
+        ),
+    ] {
+        let refused = place.words("refused", &format!("{flags} --coverage full"));
+        check(AGENT, &refused, words);
+    }
+}
+
+#[test]
 fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 60"));

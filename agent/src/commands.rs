@@ -8,6 +8,7 @@ mod run;
 mod shared;
 mod suite;
 mod train;
+mod trainings;
 mod worlds;
 
 pub use compare::CompareCommand;

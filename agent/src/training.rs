@@ -7,6 +7,7 @@
 mod acting;
 mod events;
 pub mod metrics;
+pub mod seconds;
 mod spec;
 pub mod tensorboard;
 
@@ -16,7 +17,8 @@ use self::acting::Acting;
 use self::events::Events;
 use crate::client::info::connect;
 use crate::training::metrics::{FROZEN, METRICS, Metrics, Tick};
-use anyhow::{Context, Result, bail};
+use crate::training::seconds::Stopwatch;
+use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::learners::{Beginning, Learner, LearnerKind, ModelUpdate, Worlds};
@@ -26,7 +28,7 @@ use emberwatch_protocol::Client;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::control::WorldSeed;
+use emberwatch_protocol::control::{CoverageRule, WorldSeed};
 use emberwatch_protocol::feed::Feed;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -84,6 +86,7 @@ struct TrainingLoop {
     learner: Box<dyn Learner>,
     metrics: Metrics,
     events: Events,
+    stopwatch: Stopwatch,
     feed: Feed,
     summary: TrainSummary,
     /// Updates before this run, of the runs that it resumes.
@@ -106,6 +109,7 @@ impl TrainingLoop {
         spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
+        let stopwatch = Stopwatch::start(&spec.out, spec.resume)?;
         if let Some(contents) = &contents {
             warn_of_other_settings(spec, contents)?;
         }
@@ -115,6 +119,10 @@ impl TrainingLoop {
             takeover: spec.takeover,
             time_to_live: Some(LEASE),
         };
+        ensure!(
+            !spec.full_frames || connection.info().coverage != CoverageRule::Path,
+            "--coverage full: expected a server with --coverage client or full, got path"
+        );
         let mut client = Client::acquire(connection, &claim)?;
         let kind = spec.learner()?;
         let mut learner = begin(spec, kind, &client, contents.as_ref())?;
@@ -143,6 +151,7 @@ impl TrainingLoop {
             learner,
             metrics,
             events,
+            stopwatch,
             feed,
             summary: TrainSummary::default(),
             saved: now,
@@ -154,7 +163,7 @@ impl TrainingLoop {
         let is_over = || spec.deadline.is_some_and(|end| Instant::now() >= end);
         let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let tick = self.step();
+            let tick = self.step(spec);
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             let start = Instant::now();
             let updates = if spec.freeze {
@@ -181,8 +190,8 @@ impl TrainingLoop {
     }
 
     /// One step of each robot; worlds at the end of their episodes begin again.
-    fn step(&mut self) -> Result<Tick> {
-        let shows_all = self.learner.wants_full_frames();
+    fn step(&mut self, spec: &TrainingSpec) -> Result<Tick> {
+        let shows_all = spec.full_frames || self.learner.wants_full_frames();
         let learner = &mut *self.learner;
         let mut acting = Acting::new(learner, self.kind, &mut self.feed, &self.client);
         let mut served = Served::new(&mut self.client, shows_all);
@@ -209,6 +218,7 @@ impl TrainingLoop {
             contents.settings = toml::to_string(&spec.config)?;
             let place = spec.out.join(CHECKPOINT);
             checkpoint::write(&place, self.kind.checkpoints[0], &contents)?;
+            self.stopwatch.write()?;
         }
         self.metrics.flush()?;
         self.events.flush()

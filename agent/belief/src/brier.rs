@@ -15,6 +15,32 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
     sum / truth.len() as f64
 }
 
+/// Mean over all cells of `-ln p` in nats, where `p` is the probability of the cell's state; infinite where that is 0.
+///
+/// # Panics
+/// If a state is not one of the belief's.
+pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
+    let of_state = |((row, col), &state): ((usize, usize), &u8)| {
+        let probability = belief.probabilities()[[usize::from(state), row, col]];
+        f64::from(probability).ln()
+    };
+    let sum: f64 = truth.indexed_iter().map(of_state).sum();
+    // Not -0 where all are certain.
+    0.0 - sum / truth.len() as f64
+}
+
+/// Share of the cells whose most probable state is the true one; the first of several such states counts.
+pub fn accuracy(belief: &Belief, truth: &Grid<u8>) -> f64 {
+    let numbers = belief.as_slice();
+    let is_right = |&(index, &state): &(usize, &u8)| {
+        let states = numbers[index..].iter().step_by(truth.len()).enumerate();
+        let best = states.reduce(|best, it| if it.1 > best.1 { it } else { best });
+        best.is_some_and(|best| best.0 == usize::from(state))
+    };
+    let n_right = truth.iter().enumerate().filter(is_right).count();
+    n_right as f64 / truth.len() as f64
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -29,5 +55,27 @@ mod tests {
         let uniform = Belief::uniform(3, shape);
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
         assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
+    }
+
+    #[test]
+    fn loss_and_accuracy_are_about_the_true_state() {
+        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
+        let certain = Belief::from_states(&truth, 3).expect("test states");
+        assert_eq!(
+            (log_loss(&certain, &truth), accuracy(&certain, &truth)),
+            (0.0, 1.0)
+        );
+        let other = Grid::from_shape_vec((1, 4), vec![2, 1, 1, 0]).expect("test grid");
+        assert_eq!(
+            (log_loss(&certain, &other), accuracy(&certain, &other)),
+            (f64::INFINITY, 0.75)
+        );
+        let uniform = Belief::uniform(3, Shape::new(1, 4).expect("test shape"));
+        assert!((log_loss(&uniform, &truth) - 3.0_f64.ln()).abs() < 1e-6);
+        assert_eq!(
+            accuracy(&uniform, &truth),
+            0.5,
+            "the first state of each cell"
+        );
     }
 }

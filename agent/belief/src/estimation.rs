@@ -9,6 +9,7 @@ pub mod filter;
 mod innovation;
 pub mod kept_belief;
 pub mod parameters;
+pub mod prediction;
 pub mod prior;
 pub mod scoring;
 pub mod spatial;

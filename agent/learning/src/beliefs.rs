@@ -14,8 +14,10 @@ mod world_form;
 
 pub use self::autoencoder::AUTOENCODER;
 pub use self::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, numbered_states};
-pub use self::known::{KNOWN, KNOWN_SPATIAL};
-pub use self::learned::{LEARNED, LEARNED_SPATIAL};
+pub use self::known::{
+    KNOWN, KNOWN_CAVITIES, KNOWN_SECOND_ORDER, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES,
+};
+pub use self::learned::{LEARNED, LEARNED_CAVITIES, LEARNED_SPATIAL, LEARNED_SPATIAL_CAVITIES};
 pub use self::neural::NEURAL;
 pub use self::truth::{NEXT_TRUTH, NONE, TRUTH};
 pub use self::world_form::WorldForm;
@@ -25,8 +27,13 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &NONE,
     &KNOWN,
     &KNOWN_SPATIAL,
+    &KNOWN_SECOND_ORDER,
+    &KNOWN_CAVITIES,
+    &KNOWN_SPATIAL_CAVITIES,
     &LEARNED,
     &LEARNED_SPATIAL,
+    &LEARNED_CAVITIES,
+    &LEARNED_SPATIAL_CAVITIES,
     &NEURAL,
     &AUTOENCODER,
     &TRUTH,
@@ -72,8 +79,12 @@ mod tests {
 
     #[test]
     fn options_are_learned_on_what_frames_tell() {
-        let labels =
-            "known_model, spatial_filter, learned_filter, learned_spatial_filter, neural_belief";
+        let labels = [
+            "known_model, spatial_filter, second_order_filter, cavity_filter",
+            "spatial_cavity_filter, learned_filter, learned_spatial_filter",
+            "learned_cavity_filter, learned_spatial_cavity_filter, neural_belief",
+        ]
+        .join(", ");
         let error = of_options("filter").expect_err("no name");
         assert_eq!(error, format!("expected one of {labels}, got \"filter\""));
         for label in labels.split(", ") {

@@ -2,7 +2,7 @@
 //! Pure: the caller flies the paths.
 
 use crate::beliefs::autoencoder::AutoencoderModel;
-use crate::beliefs::{self, BELIEFS, BeliefKind, Conditions, KNOWN, WorldForm};
+use crate::beliefs::{BELIEFS, BeliefKind, Conditions, KNOWN, WorldForm};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, LearnedDecisions, Policy};
@@ -58,7 +58,7 @@ impl Crew {
         ensure!(
             learned.get::<AutoencoderModel>().is_none(),
             "checkpoint: expected one of a belief that options are planned on, such as {}, got an autoencoder's",
-            kind.label
+            KNOWN.label
         );
         kind.learned(&learned).context("checkpoint")?;
         kind.check(&learned, &WorldForm::of(&model, shape))?;
@@ -113,19 +113,14 @@ impl Crew {
     }
 }
 
-/// What options are planned on unless it is said: what decisions were learned on, or else the belief that was learned;
-/// without one the known model's.
+/// The belief that a checkpoint is about: the one that decisions were learned on, otherwise the one that was learned, and
+/// without any the known model's.
 pub fn usual(learned: &Learned) -> &'static BeliefKind {
     let decided = learned
         .get::<LearnedDecisions>()
         .map(|decisions| decisions.belief);
     let mut kinds = BELIEFS.iter().copied();
-    let serves = |kind: &&BeliefKind| {
-        kind.learned_by.is_some()
-            && beliefs::of_options(kind.label).is_ok()
-            && kind.learned(learned).is_ok()
-    };
-    let found = kinds.find(serves);
+    let found = kinds.find(|kind| kind.learned_by.is_some() && kind.learned(learned).is_ok());
     decided.or(found).unwrap_or(&KNOWN)
 }
 

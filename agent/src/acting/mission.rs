@@ -174,6 +174,12 @@ pub(super) fn model_of(
             instance.name()
         ),
     };
+    check_sensor(info, &model)?;
+    Ok(model)
+}
+
+/// Refuses a model for filters whose sensor is not the server's.
+fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     let (expected, got) = (info.n_observations, model.n_observations());
     ensure!(
         got == expected,
@@ -184,5 +190,16 @@ pub(super) fn model_of(
         model.airspace(info.shape()?)? == airspace,
         "model: expected the server's sensor and no-fly cells, got others"
     );
-    Ok(model)
+    Ok(())
+}
+
+/// Refuses a model for filters of recorded worlds with other states or another sensor.
+pub fn check_recorded(info: &ServerInfo, states: &Model, model: &Model) -> Result<()> {
+    let [expected, got] = [states, model].map(|model| model.state_names().join(", "));
+    ensure!(
+        got == expected,
+        "--model: expected the recorded states {expected}, got {got}"
+    );
+    check_sensor(info, model)?;
+    Ok(model.check_on(info.shape()?)?)
 }

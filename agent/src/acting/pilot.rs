@@ -12,7 +12,7 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
 use emberwatch_learning::beliefs::first_belief::first_belief;
 use emberwatch_learning::beliefs::{Conditions, Input, WorldForm};
-use emberwatch_learning::policy::{Goal, Policy};
+use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::agent::{Agent, handover_of};
 use emberwatch_learning::rollout::{self, Actor, Rollout, Seen, StepRecord, building};
 use emberwatch_protocol::connection::ConnectionError;
@@ -304,11 +304,6 @@ fn check(
     ensure!(
         policy.belief.input != Input::NextStates,
         "policy {:?} needs worlds that run one step ahead: only `compare` has them",
-        policy.name
-    );
-    ensure!(
-        policy.goal != Goal::Learned || mission.company != Company::Team,
-        "policy {:?} decides for one robot, not for a team",
         policy.name
     );
     ensure!(

@@ -4,7 +4,7 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
-use crate::acting::mission::{needs_model, recorded_states};
+use crate::acting::mission::{check_recorded, needs_model, recorded_states};
 use crate::benchmark::team::Team;
 use crate::client::info::connect;
 use crate::client::truth::TruthFeed;
@@ -36,7 +36,10 @@ pub struct Arena {
     client: Client,
     /// Where the hidden states are published.
     truth: Option<TruthFeed>,
+    /// Of recorded worlds: one in which the states do not change.
     model: Model,
+    /// With which beliefs predict in recorded worlds, if one was given.
+    known: Option<Model>,
     main: Range<u32>,
     scouts: Range<u32>,
     spare: Option<u32>,
@@ -80,6 +83,7 @@ impl Arena {
             client,
             truth,
             model,
+            known: None,
             main: 0..n_main,
             scouts: n_main..used,
             spare,
@@ -99,9 +103,24 @@ impl Arena {
         &self.model
     }
 
-    /// Whether its worlds were recorded, so that they have no model.
-    pub fn is_recorded(&self) -> bool {
-        self.info().recorded_world.is_some()
+    /// The model with which beliefs predict.
+    pub fn known_model(&self) -> &Model {
+        self.known.as_ref().unwrap_or(&self.model)
+    }
+
+    /// Gives beliefs a model for recorded worlds.
+    ///
+    /// # Errors
+    /// If its states or its sensor are not those of the worlds.
+    pub fn know(&mut self, model: Model) -> Result<()> {
+        check_recorded(self.info(), &self.model, &model)?;
+        self.known = Some(model);
+        Ok(())
+    }
+
+    /// Whether its worlds were recorded, and no model was given for them.
+    pub fn lacks_model(&self) -> bool {
+        self.info().recorded_world.is_some() && self.known.is_none()
     }
 
     pub fn shape(&self) -> Shape {
@@ -214,7 +233,7 @@ impl Arena {
     ) -> Result<Agent> {
         self.check_model(policy)?;
         let conditions = Conditions {
-            model: Some(&self.model),
+            model: Some(self.known_model()),
             shape: self.shape(),
             prior: Some(prior),
             learned,
@@ -226,7 +245,7 @@ impl Arena {
     /// Refuses a policy that filters with a model on worlds that have none.
     pub fn check_model(&self, policy: &Policy) -> Result<()> {
         ensure!(
-            !(self.is_recorded() && policy.belief.knows_model),
+            !(self.lacks_model() && policy.belief.knows_model),
             needs_model(policy)
         );
         Ok(())

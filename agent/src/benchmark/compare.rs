@@ -15,7 +15,7 @@ use emberwatch_learning::beliefs::{Input, WorldForm};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::parallel::in_parallel;
-use emberwatch_learning::policy::{Goal, Policy};
+use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::{
     self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
@@ -26,6 +26,7 @@ use emberwatch_protocol::message::WorldResult;
 use emberwatch_protocol::path::Flight;
 use emberwatch_protocol::{Grid, Model, Move};
 use sha2::{Digest, Sha256};
+use std::borrow::Cow;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -45,6 +46,8 @@ pub struct Comparison {
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
+    /// Whether beliefs of a known model begin with each world's hidden state.
+    pub first_state_known: bool,
 }
 
 #[derive(Debug)]
@@ -98,7 +101,12 @@ pub fn compare(
     progress: &dyn Fn(&str, u64),
 ) -> Result<Results> {
     let prior = comparison.config.prior(arena.info().burn_in);
-    let prior = first_belief(prior, arena.model(), arena.shape(), comparison.config.seed)?;
+    let prior = first_belief(
+        prior,
+        arena.known_model(),
+        arena.shape(),
+        comparison.config.seed,
+    )?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results {
         runs: Vec::new(),
@@ -132,7 +140,8 @@ pub fn compare(
                 let both = [results.snapshot, worlds[0].snapshot.take()];
                 results.snapshot = both.into_iter().flatten().max_by_key(Snapshot::rank);
             }
-            let fingerprint = comparison.policy_fingerprint(&contestant.policy, arena.model());
+            let model = arena.known_model();
+            let fingerprint = comparison.policy_fingerprint(&contestant.policy, model);
             let runs = worlds.into_iter();
             let runs = runs.map(|world| contestant.policy_run(world, arena.info(), &fingerprint));
             results.runs.extend(runs);
@@ -158,7 +167,11 @@ impl Comparison {
         let model = toml::to_string(model.file()).expect("invariant: model files serialise");
         let config = toml::to_string(&self.config).expect("invariant: settings serialise");
         let version = env!("CARGO_PKG_VERSION");
-        let hash = Sha256::digest(format!("{version}\n{model}\n{config}\n{learned:?}"));
+        let mut text = format!("{version}\n{model}\n{config}\n{learned:?}");
+        if self.first_state_known {
+            text += "\nfirst state known";
+        }
+        let hash = Sha256::digest(text);
         hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
@@ -201,15 +214,10 @@ struct Match<'a> {
 impl Match<'_> {
     /// Refuses a contestant that cannot act.
     fn check(&self, arena: &Arena) -> Result<()> {
-        let Contestant { policy, team } = self.contestant;
-        ensure!(
-            !(policy.goal == Goal::Learned && team.is_joint() && arena.n_robots() > 1),
-            "it decides for one robot: expected --team alone or shared, got {}",
-            team.label()
-        );
+        let policy = &self.contestant.policy;
         let is_told = matches!(policy.belief.input, Input::States | Input::NextStates);
         ensure!(
-            arena.shows_truth() || !is_told,
+            arena.shows_truth() || !(is_told || self.comparison.first_state_known),
             "it needs the truth channel: start the server with --publish-truth"
         );
         arena.check_model(policy)?;
@@ -241,7 +249,10 @@ impl Match<'_> {
         let agents = self.seeds.iter();
         let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
         let seen = arena.reset(self.seeds)?;
-        let rollout = |(agent, seen)| Rollout::begun(self.agent(arena, agent)?, seen);
+        let rollout = |(agent, seen)| {
+            let prior = self.prior(arena, &seen)?;
+            Rollout::begun(self.agent(arena, &prior, agent)?, seen)
+        };
         let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
         let world = |&seed: &u64| WorldRun {
             seed,
@@ -262,11 +273,22 @@ impl Match<'_> {
         })
     }
 
-    fn agent(&self, arena: &Arena, agent: (u64, usize)) -> Result<Agent> {
+    fn agent(&self, arena: &Arena, prior: &Belief, agent: (u64, usize)) -> Result<Agent> {
         let Comparison {
             config, learned, ..
         } = self.comparison;
-        arena.agent(&self.contestant.policy, config, self.prior, agent, learned)
+        arena.agent(&self.contestant.policy, config, prior, agent, learned)
+    }
+
+    /// An agent's first belief, which is certain if the first state is known.
+    fn prior(&self, arena: &Arena, seen: &Seen) -> Result<Cow<'_, Belief>> {
+        if !self.comparison.first_state_known {
+            return Ok(Cow::Borrowed(self.prior));
+        }
+        let states = seen.truth.as_ref();
+        let states = states.context("expected published hidden states, got none")?;
+        let certain = Belief::from_states(states, arena.known_model().n_states())?;
+        Ok(Cow::Owned(certain))
     }
 }
 
@@ -440,6 +462,7 @@ impl Contestant {
             log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
             worlds_fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
             policy_fingerprint: fingerprint.into(),
+            training_seconds: None,
             is_added: false,
             rewards: tally.rewards,
         }

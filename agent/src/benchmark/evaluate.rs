@@ -40,7 +40,7 @@ pub struct Scores {
 pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Scores>> {
     let config = evaluation.config;
     let prior = config.prior(arena.info().burn_in);
-    let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
+    let prior = first_belief(prior, arena.known_model(), arena.shape(), config.seed)?;
     let seeds: Vec<u64> = evaluation.seeds.clone().collect();
     let mut scores = Vec::new();
     for batch in seeds.chunks(arena.batch_size()) {

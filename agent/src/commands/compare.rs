@@ -45,7 +45,7 @@ pub struct CompareCommand {
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
     /// The policy that others are paired against [default: shooting_exploit; of options: that which exploits; of
-    /// teams: the first policy; of recorded worlds: coverage]
+    /// teams: the first policy; of recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
     /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
@@ -76,6 +76,9 @@ pub struct CompareCommand {
     /// Write rewards step by step for TensorBoard into this directory, a run of each policy
     #[arg(long, value_name = "DIR")]
     tensorboard: Option<PathBuf>,
+    /// Begin beliefs of a known model with each world's hidden state, instead of --prior
+    #[arg(long, conflicts_with = "prior")]
+    first_state_known: bool,
     /// Steps for which a cell counts as seen after a visit, in the figures of merit
     #[arg(long, value_name = "STEPS", default_value_t = RECENT_STEPS, value_parser = clap::value_parser!(u32).range(1..))]
     recent_steps: u32,
@@ -122,6 +125,7 @@ impl CompareCommand {
                 recent_steps: self.recent_steps,
                 config: config.clone(),
                 learned: learned.clone(),
+                first_state_known: self.first_state_known,
             };
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
@@ -129,7 +133,7 @@ impl CompareCommand {
                 draw_step(directory, arena, &results)?;
             }
             let policies = &comparison.policies;
-            report.baseline = self.baseline(arena.model(), arena.is_recorded(), policies)?;
+            report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
             report.add(axis_label(arena.model()), results);
         }
         self.tell(&report, added, &config, csv)
@@ -208,7 +212,7 @@ impl CompareCommand {
     /// The policies on an arena's worlds; of the ladder those that need no model, if there is none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
         let mut policies = self.policies(arena.model(), learned)?;
-        if arena.is_recorded() && self.policies.is_empty() && !self.has_teams() {
+        if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
             policies.retain(|policy| !policy.belief.knows_model);
         }
         Ok(policies)
@@ -264,7 +268,7 @@ impl CompareCommand {
     }
 
     /// The name of the one that was asked for; else of one of the policies, if these are of teams or of options.
-    fn baseline(&self, model: &Model, is_recorded: bool, policies: &[Policy]) -> Result<String> {
+    fn baseline(&self, model: &Model, lacks_model: bool, policies: &[Policy]) -> Result<String> {
         if let Some(name) = &self.baseline {
             return Ok(Policy::named(name, model).context("--baseline")?.name);
         }
@@ -274,7 +278,7 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| self.has_teams())
         };
-        let usual = if is_recorded {
+        let usual = if lacks_model {
             "coverage"
         } else {
             "shooting_exploit"

@@ -111,6 +111,7 @@ impl EvaluateCommand {
             recent_steps: RECENT_STEPS,
             config,
             learned,
+            first_state_known: false,
         };
         let results = run_comparison(arena, &comparison)?;
         write(&render_table(&results.runs, BASELINE))?;

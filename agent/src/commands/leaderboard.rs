@@ -39,9 +39,9 @@ pub struct LeaderboardCommand {
     /// The commit of that code
     #[arg(long, requires = "add")]
     commit: Option<String>,
-    /// Processor seconds of training, of all tasks together
-    #[arg(long, value_name = "SECONDS", requires = "add", default_value_t = 0.0)]
-    training_seconds: f64,
+    /// Processor seconds of training, of all tasks together [default: those in the rows of `suite`]
+    #[arg(long, value_name = "SECONDS", requires = "add")]
+    training_seconds: Option<f64>,
 }
 
 impl LeaderboardCommand {
@@ -69,13 +69,7 @@ impl LeaderboardCommand {
 
     fn add(&self, folder: &Path) -> Result<()> {
         let text = |flag: &Option<String>| flag.clone().unwrap_or_default();
-        let about = About {
-            policy: text(&self.policy),
-            by: text(&self.by),
-            code: text(&self.code),
-            commit: text(&self.commit),
-            training_seconds: self.training_seconds,
-        };
+        let policy = text(&self.policy);
         let files =
             std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
         let files = files
@@ -85,7 +79,7 @@ impl LeaderboardCommand {
             .iter()
             .filter(|path| path.extension().is_some_and(|it| it == "csv"));
         let tasks = files
-            .map(|path| task(path, &about.policy))
+            .map(|path| task(path, &policy))
             .collect::<Result<Vec<_>>>()?;
         let tasks: Vec<TaskRuns> = tasks
             .into_iter()
@@ -95,8 +89,15 @@ impl LeaderboardCommand {
             !tasks.is_empty(),
             "--add {}: expected results of {:?}, got none",
             folder.display(),
-            about.policy
+            policy
         );
+        let about = About {
+            training_seconds: self.training_seconds(&tasks)?,
+            policy,
+            by: text(&self.by),
+            code: text(&self.code),
+            commit: text(&self.commit),
+        };
         let path = self
             .entries
             .join(format!("{}.csv", file_stem(&about.policy)));
@@ -115,6 +116,23 @@ impl LeaderboardCommand {
         entries.push(entry.clone());
         check_entries(&entries)?;
         entry.write(&path)
+    }
+
+    /// The flag, or the sum over tasks of what their rows say.
+    fn training_seconds(&self, tasks: &[TaskRuns]) -> Result<f64> {
+        if let Some(seconds) = self.training_seconds {
+            return Ok(seconds);
+        }
+        let seconds = tasks.iter().map(|task| {
+            let seconds = task.runs[0].training_seconds;
+            seconds.with_context(|| {
+                format!(
+                    "expected --training-seconds, as the rows of task {} do not say them",
+                    task.task
+                )
+            })
+        });
+        seconds.sum()
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::compare::run_comparison;
 use super::shared::{asks_for_help, make_folder, write};
+use super::trainings::{self, Lesson, Trainings};
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::common_worlds::CommonWorlds;
@@ -10,16 +11,13 @@ use crate::benchmark::report::{PolicyRun, RunsFile};
 use crate::benchmark::team::Team;
 use crate::client::launch::OwnServer;
 use crate::flags::AgentFlags;
-use crate::training::CHECKPOINT;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_learning::beliefs::Input;
+use emberwatch_learning::beliefs::{Input, WorldForm};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners;
 use emberwatch_learning::policy::{self, Policy};
-use emberwatch_network::Device;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::task::Task;
@@ -45,9 +43,15 @@ pub struct SuiteCommand {
         default_value = "coverage,beam_exploit,learned_beam,learned_policy"
     )]
     policies: Vec<String>,
-    /// For learned policies: a folder with what `train --task NAME --out FOLDER/NAME` learned of each task
+    /// For learned policies: a folder with what --train, or `train --task NAME --out FOLDER/NAME`, learned of each task
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
+    /// First train what the policies need and --checkpoints lacks; continues trainings that were stopped
+    #[arg(long, requires = "checkpoints")]
+    train: bool,
+    /// World steps of each training, of all worlds together [default: those of the settings]
+    #[arg(long, value_name = "STEPS", requires = "train", value_parser = clap::value_parser!(u64).range(1..))]
+    train_steps: Option<u64>,
     /// A folder for results, a CSV file a task; rows that it has are kept, unless the checkpoint, the settings or
     /// the task's worlds have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
@@ -79,7 +83,8 @@ impl SuiteCommand {
             "--policies: expected none that is told the next states, as these act only in `compare`"
         );
         let config = self.settings.effective()?;
-        if let Some(folder) = &self.checkpoints {
+        let folder = self.checkpoints.as_deref();
+        if let Some(folder) = folder.filter(|_| !self.train) {
             ensure!(
                 folder.is_dir(),
                 "--checkpoints: expected a folder, got {}",
@@ -94,8 +99,13 @@ impl SuiteCommand {
         let plans = plans.collect::<Result<Vec<_>>>()?;
         make_folder(&self.out)?;
         plans.iter().try_for_each(|plan| plan.read().map(|_| ()))?;
+        let trainings = folder.filter(|_| self.train).map(|folder| {
+            make_folder(folder)?;
+            Trainings::new(folder, &config, self.train_steps, self.server.clone())
+        });
+        let trainings = trainings.transpose()?;
         let runs = plans.iter().map(|plan| {
-            let runs = self.carry_out(plan);
+            let runs = self.carry_out(plan, trainings.as_ref());
             runs.with_context(|| of_task(&plan.task.name))
         });
         write(&render_suite(&runs.collect::<Result<Vec<_>>>()?))
@@ -113,7 +123,6 @@ impl SuiteCommand {
 
     /// What is to be done on a task; all names and files are checked before anything runs.
     fn plan(&self, task: Task, config: &AgentConfig) -> Result<Plan> {
-        let learned = self.learned(&task)?;
         let seeds = self.seeds(&task);
         let (arena, _server) = self.open(&task, &seeds, 1)?;
         let info = arena.info();
@@ -135,21 +144,24 @@ impl SuiteCommand {
             recent_steps: None,
         };
         let team = if task.robots > 1 {
-            Team::Shared
+            Team::Joint
         } else {
             Team::Alone
         };
-        let policies = self.policies(&task, arena.model(), &learned)?;
         Ok(Plan {
+            policies: self.policies(arena.model())?,
             comparison: Comparison {
-                policies,
+                policies: Vec::new(),
                 teams: vec![team],
                 seeds,
                 steps: task.max_steps,
                 recent_steps: RECENT_STEPS,
                 config: config.clone(),
-                learned,
+                learned: Learned::default(),
+                first_state_known: false,
             },
+            checkpoints: self.checkpoints.clone(),
+            form: WorldForm::of(arena.model(), arena.shape()),
             file: self.out.join(format!("{}.csv", task.name)),
             model: arena.model().clone(),
             task,
@@ -157,58 +169,55 @@ impl SuiteCommand {
         })
     }
 
-    /// The policies that can run on a task; warns of the others.
-    fn policies(&self, task: &Task, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
+    /// All policies of the command, each once.
+    fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
         let names = [FLOOR, CEILING].into_iter();
         let mut policies: Vec<Policy> = Vec::new();
         for name in names.chain(self.policies.iter().map(|name| &**name)) {
             let policy = Policy::named(name, model)?;
-            let can_run =
-                policy.check(learned).is_ok() && !(task.is_recorded() && policy.belief.knows_model);
-            if !can_run {
-                let task = &task.name;
-                tracing::warn!("task {task}: {name} is not run: it needs a model or --checkpoints");
-            } else if !policies.contains(&policy) {
+            if !policies.contains(&policy) {
                 policies.push(policy);
             }
         }
         Ok(policies)
     }
 
-    /// Runs the policies whose runs are missing or outdated, one by one; returns all runs that count.
-    fn carry_out(&self, plan: &Plan) -> Result<TaskRuns> {
-        let (task, comparison) = (&plan.task.name, &plan.comparison);
-        let kept = plan.read()?;
-        let mut missing = Vec::new();
-        for policy in &comparison.policies {
-            let name = &policy.name;
-            let n_rows = kept.iter().filter(|run| run.policy == *name).count();
-            match plan.check(name, &kept) {
-                Ok(()) => tracing::info!("task {task}: {n_rows} rows of {name} kept"),
+    /// Trains for the policies of a task, then runs those whose runs are missing or outdated, one by one; returns all runs
+    /// that count. Policies that cannot run are left out, with a warning.
+    fn carry_out(&self, plan: &Plan, trainings: Option<&Trainings<'_>>) -> Result<TaskRuns> {
+        let mut ready = Vec::new();
+        for policy in &plan.policies {
+            let (task, name) = (&plan.task.name, &policy.name);
+            match plan.prepare(policy, trainings) {
+                Ok(lesson) => ready.push((policy, lesson)),
                 Err(reason) => {
-                    if n_rows > 0 {
-                        tracing::warn!(
-                            "task {task}: {n_rows} rows of {name} are run again: {reason:#}"
-                        );
-                    }
-                    missing.push(policy.clone());
+                    check_stop(trainings)?;
+                    tracing::warn!("task {task}: {name} is not run: {reason:#}");
                 }
             }
         }
-        if !missing.is_empty() {
-            let n_worlds = comparison.seeds.end - comparison.seeds.start;
-            let (mut arena, _server) = self.open(&plan.task, &comparison.seeds, n_worlds as u32)?;
-            for policy in missing {
+        let kept = plan.read()?;
+        ready.retain(|(policy, _)| !plan.keeps(policy, &kept));
+        if !ready.is_empty() {
+            let seeds = &plan.comparison.seeds;
+            let (mut arena, _server) =
+                self.open(&plan.task, seeds, (seeds.end - seeds.start) as u32)?;
+            for (policy, lesson) in ready {
                 let comparison = Comparison {
-                    policies: vec![policy],
-                    ..comparison.clone()
+                    policies: vec![policy.clone()],
+                    learned: lesson.learned,
+                    ..plan.comparison.clone()
                 };
-                let runs = run_comparison(&mut arena, &comparison)?.runs;
+                let mut runs = run_comparison(&mut arena, &comparison)?.runs;
+                let seconds = lesson.seconds;
+                runs.iter_mut()
+                    .for_each(|run| run.training_seconds = seconds);
                 plan.replace(runs)?;
+                check_stop(trainings)?;
             }
         }
         Ok(TaskRuns {
-            task: task.clone(),
+            task: plan.task.name.clone(),
             runs: plan.valid_runs()?,
         })
     }
@@ -219,19 +228,6 @@ impl SuiteCommand {
             ..self
                 .worlds
                 .map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
-    }
-
-    /// What was learned of a task.
-    fn learned(&self, task: &Task) -> Result<Learned> {
-        let Some(folder) = &self.checkpoints else {
-            return Ok(Learned::default());
-        };
-        let place = folder.join(&task.name).join(CHECKPOINT);
-        if !place.exists() {
-            tracing::warn!("no {}: no learned policy for this task", place.display());
-            return Ok(Learned::default());
-        }
-        learners::read([&*place], &Device::Cpu)
     }
 
     /// A server with a task's worlds, which stops when it is dropped.
@@ -254,12 +250,25 @@ impl SuiteCommand {
     }
 }
 
+/// Ends the suite after a signal.
+fn check_stop(trainings: Option<&Trainings<'_>>) -> Result<()> {
+    ensure!(
+        !trainings.is_some_and(Trainings::is_stopped),
+        "stopped: the same command continues"
+    );
+    Ok(())
+}
+
 /// What is to be done on a task.
 struct Plan {
     task: Task,
+    policies: Vec<Policy>,
+    checkpoints: Option<PathBuf>,
+    form: WorldForm,
     file: PathBuf,
     worlds: CommonWorlds,
     model: Model,
+    /// Without policies and what they learned.
     comparison: Comparison,
 }
 
@@ -270,6 +279,41 @@ impl Plan {
 
     fn read(&self) -> Result<Vec<PolicyRun>> {
         self.lock()?.read()
+    }
+
+    /// What a policy acts on, which is learned first where it may be.
+    fn prepare(&self, policy: &Policy, trainings: Option<&Trainings<'_>>) -> Result<Lesson> {
+        ensure!(
+            !(self.task.is_recorded() && policy.belief.knows_model),
+            "it needs a known model, and recorded worlds have none"
+        );
+        let found = self.lesson(policy);
+        match trainings {
+            Some(trainings) if !found.as_ref().is_ok_and(|lesson| lesson.is_final) => {
+                trainings.complete(&self.task, policy)?;
+                self.lesson(policy)
+            }
+            _ => found,
+        }
+    }
+
+    fn lesson(&self, policy: &Policy) -> Result<Lesson> {
+        trainings::find(self.checkpoints.as_deref(), &self.task, policy, &self.form)
+    }
+
+    /// Whether a policy's rows need not be run again; says which are.
+    fn keeps(&self, policy: &Policy, kept: &[PolicyRun]) -> bool {
+        let (task, name) = (&self.task.name, &policy.name);
+        let n_rows = kept.iter().filter(|run| run.policy == *name).count();
+        match self.check(name, kept) {
+            Ok(()) => tracing::info!("task {task}: {n_rows} rows of {name} kept"),
+            Err(reason) if n_rows > 0 => {
+                tracing::warn!("task {task}: {n_rows} rows of {name} are run again: {reason:#}");
+                return false;
+            }
+            Err(_) => return false,
+        }
+        true
     }
 
     /// Reads all runs that count; warns of the policies whose runs do not.
@@ -296,10 +340,19 @@ impl Plan {
         let Ok(policy) = Policy::named(policy, &self.model) else {
             return Ok(());
         };
-        let fingerprint = self.comparison.policy_fingerprint(&policy, &self.model);
+        let comparison = Comparison {
+            learned: self.lesson(&policy).unwrap_or_default().learned,
+            ..self.comparison.clone()
+        };
+        let fingerprint = comparison.policy_fingerprint(&policy, &self.model);
         ensure!(
             runs.iter().all(|run| run.policy_fingerprint == fingerprint),
             "it was run with other settings or another checkpoint"
+        );
+        let team = self.comparison.teams[0].label();
+        ensure!(
+            runs.iter().all(|run| run.team == team),
+            "its robots were a team of another kind: expected {team}"
         );
         Ok(())
     }

@@ -7,7 +7,7 @@ use crate::client::launch::OwnServer;
 use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
 use emberwatch_learning::checkpoint::Contents;
 use emberwatch_learning::config::{AgentConfig, KernelKind};
@@ -23,6 +23,18 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
+
+/// Worlds of a training, unless its learner follows one alone.
+pub(super) const N_WORLDS: u32 = 16;
+
+/// What frames show.
+#[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
+enum Coverage {
+    /// The cells in sight of the path
+    Path,
+    /// Every cell, where the server's coverage is `client` or `full`
+    Full,
+}
 
 /// Learn a model while acting on a server's worlds.
 #[derive(Args)]
@@ -64,6 +76,9 @@ pub struct TrainCommand {
     /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
     #[arg(long)]
     resume: bool,
+    /// What the frames that a filter learns from show
+    #[arg(long, value_name = "CELLS", default_value = "path")]
+    coverage: Coverage,
     /// Act on the checkpoint's parameters without learning
     #[arg(long, requires = "resume")]
     freeze: bool,
@@ -123,7 +138,15 @@ impl TrainCommand {
             config.decisions.estimator = estimator.label.into();
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
-        let n_worlds = self.worlds.unwrap_or(if kind.is_single { 1 } else { 16 });
+        let full_frames = self.coverage == Coverage::Full;
+        ensure!(
+            !full_frames || *kind == FILTER,
+            "--coverage full: expected --learner filter, got {}",
+            kind.name
+        );
+        let n_worlds = self
+            .worlds
+            .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
         let steps = (kind.steps)(&config);
@@ -138,6 +161,7 @@ impl TrainCommand {
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
+            full_frames,
             learned,
             device,
             config,
@@ -262,6 +286,11 @@ impl TrainCommand {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
         }
+        let of_states = self.grid.model_of_states()?;
+        ensure!(
+            of_states.is_none(),
+            "--model: expected none beside --states, as training uses no model"
+        );
         self.grid.check()?;
         ensure!(
             self.world == 0,
@@ -274,19 +303,28 @@ impl TrainCommand {
         });
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        let (kind, config) = (training.learner()?, &training.config);
-        // What learns a model does not look at it, and could not.
-        let reveals = (decides(kind) && training.belief()?.knows_model).to_string();
-        let rest = ["--reveal-model", &reveals, "--coverage", "client"];
-        arguments.extend(rest.map(String::from));
-        let episode_steps = (kind.episode_steps)(config);
+        let episode_steps = (training.learner()?.episode_steps)(&training.config);
         // A task has its own.
         let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
         let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
         arguments.extend(episode.into_iter().flatten());
-        let server = OwnServer::start(self.server.clone(), &arguments)?;
+        let server = start_server(self.server.clone(), arguments, training)?;
         Ok((server.instance().clone(), Some(server)))
     }
+}
+
+/// A server with some worlds for a training; dropped, it stops.
+pub(super) fn start_server(
+    program: Option<PathBuf>,
+    mut arguments: Vec<String>,
+    training: &TrainingSpec,
+) -> Result<OwnServer> {
+    // What learns a model does not look at it, and could not.
+    let reveals = decides(training.learner()?) && training.belief()?.knows_model;
+    let reveals = reveals.to_string();
+    let rest = ["--reveal-model", &reveals, "--coverage", "client"];
+    arguments.extend(rest.map(String::from));
+    OwnServer::start(program, &arguments)
 }
 
 fn decides(kind: &LearnerKind) -> bool {
@@ -313,7 +351,7 @@ fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool)
 }
 
 /// Trains, says what that gave, and returns the world steps that were acted.
-fn learn(
+pub(super) fn learn(
     instance: &Instance,
     training: &TrainingSpec,
     contents: Option<Contents>,

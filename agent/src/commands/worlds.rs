@@ -14,6 +14,9 @@ use emberwatch_protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
 
+/// The model of simulated worlds.
+const DEFAULT_MODEL: &str = "wildfire";
+
 const BENCHMARK_BURN_IN: u64 = 25_000;
 
 const BENCHMARK_STEPS: u64 = 1500;
@@ -52,9 +55,10 @@ pub struct GridFlags {
         help = format!("The task whose worlds the server that is started has: {} or a task file",
             listed(Task::built_in_names())))]
     pub task: Option<Task>,
-    #[arg(long, value_name = "NAME|FILE", default_value = "wildfire", conflicts_with = "instance",
-        help = format!("The model, for the server that is started: {} or a model file", listed(Model::built_in_names())))]
-    model: String,
+    #[arg(long, value_name = "NAME|FILE", conflicts_with = "instance",
+        help = format!("The model, for the server that is started: {} or a model file; with --states, the model of beliefs \
+            [default: {DEFAULT_MODEL}; with --states: none]", listed(Model::built_in_names())))]
+    model: Option<String>,
     #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64), conflicts_with_all = ["instance", "task"],
         help = format!("Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS}, for the \
             server that is started [default: as the model says]"))]
@@ -68,8 +72,8 @@ pub struct GridFlags {
     /// Moves in a path, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
-    #[arg(long, value_name = "NAME|FILE|FOLDER", conflicts_with_all = ["instance", "model", "height", "width"],
-        help = format!("Recorded states in the place of a model, for the server that is started: {} or a .npz or .npy \
+    #[arg(long, value_name = "NAME|FILE|FOLDER", conflicts_with_all = ["instance", "height", "width"],
+        help = format!("Recorded states in the place of simulated ones, for the server that is started: {} or a .npz or .npy \
             file or folder", listed(state_names())))]
     states: Option<String>,
     /// World seeds choose among the symmetries of the grid, too
@@ -112,7 +116,10 @@ impl WorldFlags {
                 (server.instance().clone(), Some(server))
             }
         };
-        let arena = Arena::open(&instance, self.n_seeds(), needs_scouts)?;
+        let mut arena = Arena::open(&instance, self.n_seeds(), needs_scouts)?;
+        if let Some(model) = self.grid.model_of_states()? {
+            arena.know(model)?;
+        }
         let got = arena.info().burn_in;
         let asked = self.burn_in.unwrap_or(got);
         ensure!(
@@ -179,22 +186,34 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// The model, if it can be simulated on the grid; recorded states have none.
+    /// The model, if it can be simulated on the grid; of recorded states that which was given.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),
             Some(task) => (model_of(task)?, task.height, task.width),
-            None if self.states.is_some() => return Ok(None),
+            None if self.states.is_some() => return self.model_of_states(),
             None => {
-                let model = with_sensor(
-                    model_named(&self.model)?,
-                    self.sensor_radius.map(usize::from),
-                )?;
+                let model = with_sensor(model_named(self.model())?, self.radius())?;
                 (model, self.height, self.width)
             }
         };
         model.check_on(Shape::new(height, width)?)?;
         Ok(Some(model))
+    }
+
+    /// The model that was given for recorded states, with the server's sensor.
+    pub fn model_of_states(&self) -> Result<Option<Model>> {
+        let model = self.model.as_deref().filter(|_| self.states.is_some());
+        let model = model.map(|model| with_sensor(model_named(model)?, self.radius()));
+        model.transpose()
+    }
+
+    fn model(&self) -> &str {
+        self.model.as_deref().unwrap_or(DEFAULT_MODEL)
+    }
+
+    fn radius(&self) -> Option<usize> {
+        self.sensor_radius.map(usize::from)
     }
 
     /// The flags of a server with these worlds.
@@ -213,7 +232,7 @@ impl GridFlags {
             ],
             (None, None) => vec![
                 ("--moves", self.moves.to_string()),
-                ("--model", self.model.clone()),
+                ("--model", self.model().into()),
                 ("--height", self.height.to_string()),
                 ("--width", self.width.to_string()),
                 ("--burn-in", burn_in.to_string()),

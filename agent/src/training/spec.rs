@@ -30,6 +30,8 @@ pub struct TrainingSpec {
     pub out: PathBuf,
     pub resume: bool,
     pub freeze: bool,
+    /// Whether all frames show every cell.
+    pub full_frames: bool,
     pub device: Device,
     pub config: AgentConfig,
     /// What was learned before, for decisions on it.

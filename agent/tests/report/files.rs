@@ -92,7 +92,7 @@ fn files_with_a_byte_order_mark_and_of_older_releases_are_read() {
     std::fs::write(&path, format!("\u{feff}{text}")).expect("written");
     let runs = read_runs(&path).expect("rows");
     assert_eq!((runs.len(), &*runs[0].policy), (1, "mine"));
-    let cut = |line: &str| line.rsplitn(3, ',').last().map(String::from);
+    let cut = |line: &str| line.rsplitn(4, ',').last().map(String::from);
     let old: Vec<String> = text.lines().filter_map(cut).collect();
     std::fs::write(&path, old.join("\r\n")).expect("written");
     let runs = read_runs(&path).expect("rows");

@@ -117,7 +117,8 @@ impl Transition {
     }
 }
 
-fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
+/// The error of a model whose weights can all be 0, or lose their precision.
+pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     match error {
         ModelError::ZeroWeight { cell, .. } => {
             let subject = format!("model: transition weights of cell {cell}");

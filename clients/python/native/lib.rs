@@ -7,6 +7,7 @@ mod belief;
 mod connection;
 mod detached;
 mod errors;
+mod estimators;
 mod flights;
 #[cfg(unix)]
 mod fork;
@@ -15,12 +16,14 @@ mod merit;
 mod model;
 mod moves;
 mod options;
+mod origin;
 mod owned;
 mod planning;
 mod reader;
 mod recording;
 mod refusal;
 mod samples;
+mod threads;
 mod windows;
 mod wire;
 
@@ -49,10 +52,12 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<reader::Outlooks>()?;
     module.add_class::<recording::Recording>()?;
     module.add_class::<belief::Transition>()?;
+    module.add_class::<estimators::Estimators>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
     module.add_function(wrap_pyfunction!(options::estimator_names, module)?)?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
+    module.add_function(wrap_pyfunction!(origin::belief_kinds, module)?)?;
     module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
     module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;

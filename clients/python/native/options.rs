@@ -4,22 +4,21 @@ use crate::airspace::Given;
 use crate::answer::RESULT_BYTES;
 use crate::belief::first_belief;
 use crate::connection::checked;
-use crate::errors::error;
+use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::owned::Owned;
-use crate::refusal::{failed, invalid};
+use crate::refusal::{invalid, refused};
+use crate::threads::{Pool, Threads};
 use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
-use emberwatch_belief::estimation::estimator::EstimatorError;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
 use emberwatch_learning::beliefs::{self, BeliefKind, NEURAL};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, Planned, Shown, usual};
-use emberwatch_learning::parallel::in_parallel;
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};
@@ -31,7 +30,6 @@ use emberwatch_network::Device;
 use numpy::ndarray::{Array3, ArrayView1, s};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
@@ -90,8 +88,7 @@ struct State {
     crew: Crew,
     /// `None` before a world's first episode.
     worlds: Vec<Option<Planned>>,
-    /// A thread pool for this object alone: threads of a global pool do not survive a fork.
-    threads: Option<ThreadPool>,
+    threads: Pool,
     watched: Option<Watched>,
 }
 
@@ -176,7 +173,7 @@ impl Options {
                 State {
                     crew,
                     worlds: (0..n_worlds).map(|_| None).collect(),
-                    threads: None,
+                    threads: Pool::default(),
                     watched: watched.transpose()?,
                 },
             ),
@@ -265,7 +262,7 @@ impl State {
         let Self { crew, threads, .. } = self;
         let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
         let n_worlds = seeds.len();
-        let begun = on_threads(crew, threads, n_worlds, |threads| {
+        let begun = threads.work(is_short(crew, n_worlds), |threads| {
             threads.each(seeds, begin)
         });
         for begun in begun {
@@ -323,7 +320,7 @@ impl State {
             })
         });
         let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = on_threads(crew, threads, tasks.len(), |threads| {
+        let done = threads.work(is_short(crew, tasks.len()), |threads| {
             work_on(crew, tasks, threads)
         });
         let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
@@ -431,46 +428,10 @@ impl WorldWork<'_> {
     }
 }
 
-/// Whether worlds are worked on in parallel.
-#[derive(Clone, Copy)]
-enum Threads {
-    One,
-    Several,
-}
-
-impl Threads {
-    /// The results in order.
-    fn each<T: Send, U: Send>(
-        self,
-        tasks: impl IntoIterator<Item = T>,
-        work: impl Fn(T) -> U + Sync,
-    ) -> Vec<U> {
-        match self {
-            Self::One => tasks.into_iter().map(work).collect(),
-            Self::Several => in_parallel(tasks, work),
-        }
-    }
-}
-
-/// Works on several worlds with threads of its own. One world alone is worked on here: handing it to another thread costs
-/// more than it gains, but for networks, whose own threads must be among these.
-fn on_threads<R: Send>(
-    crew: &Crew,
-    threads: &mut Option<ThreadPool>,
-    n_worlds: usize,
-    work: impl FnOnce(Threads) -> R + Send,
-) -> R {
-    if n_worlds == 1 && *crew.estimator() != NEURAL {
-        return work(Threads::One);
-    }
-    if threads.is_none() {
-        *threads = ThreadPoolBuilder::new().build().ok();
-    }
-    match threads {
-        Some(threads) => threads.install(|| work(Threads::Several)),
-        // The system gives no threads.
-        None => work(Threads::One),
-    }
+/// Whether the work on some worlds is too short for other threads: one world alone, but for networks, whose own threads
+/// must be among the pool's.
+fn is_short(crew: &Crew, n_worlds: usize) -> bool {
+    n_worlds == 1 && *crew.estimator() != NEURAL
 }
 
 /// The model that filters know, or a stand-in where the worlds' model is hidden.
@@ -498,21 +459,4 @@ fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Mo
 
 fn no_such_world(n_worlds: usize, got: usize) -> String {
     format!("options: expected a world below {n_worlds}, got {got}")
-}
-
-fn refused(py: Python<'_>, problem: String) -> PyErr {
-    error(py, "InvalidArgumentError", (problem,))
-}
-
-fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
-    let is_impossible = matches!(
-        error.downcast_ref::<EstimatorError>(),
-        Some(EstimatorError::ZeroEvidence(_))
-    );
-    let code = if is_impossible {
-        "impossible_frame"
-    } else {
-        "program"
-    };
-    failed(py, &format!("{error:#}"), code)
 }

@@ -29,3 +29,8 @@ pub fn invalid(
 pub fn failed(py: Python<'_>, problem: &str, code: &str) -> PyErr {
     error(py, "EmberwatchError", (problem, code))
 }
+
+/// An impossible argument, in a sentence of its own.
+pub fn refused(py: Python<'_>, problem: impl Display) -> PyErr {
+    error(py, "InvalidArgumentError", (problem.to_string(),))
+}

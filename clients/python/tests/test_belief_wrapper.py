@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import golden_options
 import gymnasium
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from emberwatch.belief import Filter, initial_prior, uniform_prior
+from emberwatch.belief import initial_prior, known, uniform_prior
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
 from emberwatch.wrappers import BeliefObservation
@@ -52,17 +53,17 @@ gymnasium.register("test/Stub-v0", entry_point=f"{__name__}:Stub")
 def test_a_reset_observes_the_prior_and_a_step_the_posterior() -> None:
     stub = Stub()
     env = BeliefObservation(stub)
-    expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
     for seed in (1, 2):
         observation, _ = env.reset(seed=seed)
-        expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
-        assert (observation == expected.belief.astype(np.float32)).all()
+        expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+        assert (observation == expected.belief).all()
         for _ in range(4):
             observation, *_ = env.step(env.action_space.sample())
             expected.predict()
             expected.correct(stub.frame)
             assert observation.dtype == np.float32
-            assert (observation == expected.belief.astype(np.float32)).all()
+            assert (observation == expected.belief).all()
             assert (env.filter.belief == expected.belief).all()
 
 
@@ -74,7 +75,7 @@ def test_the_belief_follows_the_steps_of_the_world(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(stub, "step", lambda _: (frame, 0.0, False, False, {"step": next(steps)}))
     env = BeliefObservation(stub)
     env.reset()
-    expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
     expected.correct(frame[:, :, 0])  # a resumed episode begins with its last frame
     for n_predictions in (0, 1, 0, 3):
         env.step(None)
@@ -180,3 +181,25 @@ def test_an_impossible_frame_is_an_error() -> None:
     env.reset(seed=0)
     with fails("impossible_frame"):
         env.step(None)
+
+
+def test_it_observes_beliefs_of_other_kinds(tmp_path: Path) -> None:
+    stub = Stub()
+    env = BeliefObservation(stub, kind="known+spatial")
+    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind="known+spatial")
+    for seed in (1, 2):
+        env.reset(seed=seed)
+        expected.reset()
+        for _ in range(4):
+            observation, *_ = env.step(None)
+            expected.predict()
+            expected.correct(stub.frame)
+            assert (observation == expected.belief).all()
+    checkpoint = tmp_path / "checkpoint"
+    golden = np.load(golden_options.FILE)
+    checkpoint.write_bytes(golden["checkpoint neural_belief"].tobytes())
+    env = BeliefObservation(Stub(model=None), checkpoint=checkpoint)
+    env.reset(seed=1)
+    assert env.filter.kind == "neural" and env.step(None)[0] in env.observation_space
+    with refuses("prior: expected none beside a checkpoint"):
+        BeliefObservation(Stub(), checkpoint=checkpoint, prior="uniform")

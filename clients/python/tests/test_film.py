@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from test_recording import FILE_HEADER, deflated, packed
 
-from emberwatch.belief import Filter, uniform_prior
+from emberwatch.belief import known, uniform_prior
 from emberwatch.client import wire
 from emberwatch.model import Model
 from emberwatch.render.film.__main__ import main
@@ -133,11 +133,11 @@ def test_panels_show_truth_frame_belief_and_entropy(studio: Studio) -> None:
     assert (cells(image, 0) == np.array(MODEL.state_colors, np.uint8)[TRUTH]).all()
     seen = np.array([*MODEL.observation_colors, UNSEEN], np.uint8)[np.minimum(SEEN, 3)]
     assert (cells(image, 1) == seen).all()
-    known = Filter(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
-    known.correct(SEEN)
-    known.predict()
-    known.correct(SEEN)
-    for panel, shares in ((2, known.belief[2]), (3, known.entropy() / np.log(3))):
+    kept = known(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
+    kept.correct(SEEN)
+    kept.predict()
+    kept.correct(SEEN)
+    for panel, shares in ((2, kept.belief[2]), (3, kept.entropy() / np.log(3))):
         lightness = cells(image, panel).astype(int).sum(axis=2).ravel()
         order = np.argsort(shares.ravel())
         assert (np.diff(lightness[order]) <= 0).all()
@@ -167,14 +167,14 @@ def test_the_belief_goes_through_gaps_which_are_shown_and_told(studio: Studio) -
     assert studio.millis() == [100, 100, 1000, 100, 1000]
     gap = studio.pictures()[2][0]
     assert (cells(gap, 0)[0] == 255).all() and (cells(gap, 1)[0] == 255).all()
-    known = Filter(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
-    known.correct(SEEN)
-    known.predict()
-    known.correct(SEEN)
+    kept = known(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
+    kept.correct(SEEN)
+    kept.predict()
+    kept.correct(SEEN)
     for _ in range(2):
-        known.predict()
+        kept.predict()
     shades = cells(gap, 2).astype(int).sum(axis=2)
-    levels = np.rint(known.belief[2] * 23)
+    levels = np.rint(kept.belief[2] * 23)
     assert len(np.unique(levels)) == len(np.unique(shades)) > 1
     assert (np.argsort(levels.ravel(), kind="stable")[-1:] == np.argmin(shades)).all()
     studio.film(records, "--to", 4, "--every", 4)

@@ -343,6 +343,12 @@ impl Checker<'_> {
         Ok(weights)
     }
 
+    /// The state of cells outside the grid.
+    pub fn edge(&self, file: &ModelFile) -> Result<Option<usize>, ModelError> {
+        let edge = file.edge.as_deref();
+        edge.map(|name| self.state(file, name)).transpose()
+    }
+
     fn state(&self, file: &ModelFile, name: &str) -> Result<usize, ModelError> {
         let found = file.states.iter().position(|state| state.name == name);
         found.ok_or_else(|| ModelError::UnknownState {

@@ -67,6 +67,7 @@ impl Description {
         Model::new(ModelFile {
             name: self.name.clone(),
             kernel_size: [1, 1],
+            edge: None,
             zone_map: None,
             no_fly: self.no_fly.clone(),
             sensor: self.sensor.clone(),

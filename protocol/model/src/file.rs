@@ -31,6 +31,9 @@ pub struct ModelFile {
     pub name: String,
     /// Rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
+    /// Name of the state that cells outside the grid are always in; without it, they add no weight.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub edge: Option<String>,
     /// The zone of each cell: its place in `zones`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone_map: Option<CellMap>,

@@ -21,6 +21,7 @@ pub struct Model {
     likelihood: Array2<f64>,
     initial: Array1<f64>,
     reward: Array1<f64>,
+    edge: Option<usize>,
     zone_map: Option<Arc<Grid<u8>>>,
     /// Where no robot may be.
     no_fly: Option<Arc<Grid<bool>>>,
@@ -97,7 +98,9 @@ impl Model {
         let initial = &initial / initial.sum();
         let zone_map = check.zone_map(&file)?.map(Arc::new);
         let no_fly = check.no_fly(&file)?.map(Arc::new);
+        let edge = check.edge(&file)?;
         Ok(Self {
+            edge,
             zone_map,
             no_fly,
             file,
@@ -154,13 +157,18 @@ impl Model {
         };
         for row in distinct(shape.height(), kernel_height) {
             for col in distinct(shape.width(), kernel_width) {
-                let on_grid = least.indexed_iter().filter(|&((i, j), _)| {
-                    let (i, j) = (row + i, col + j);
+                let weights = least.indexed_iter().map(|((i, j), weight)| {
+                    let (to_row, to_col) = (row + i, col + j);
                     let (up, left) = (kernel_height / 2, kernel_width / 2);
-                    (up..shape.height() + up).contains(&i)
-                        && (left..shape.width() + left).contains(&j)
+                    let is_on_grid = (up..shape.height() + up).contains(&to_row)
+                        && (left..shape.width() + left).contains(&to_col);
+                    match self.edge {
+                        _ if is_on_grid => *weight,
+                        Some(edge) => column_sums[[edge, i, j]],
+                        None => 0.0,
+                    }
                 });
-                let sum = self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>();
+                let sum = self.bias.sum() + weights.sum::<f64>();
                 self.check_share(sum / largest, shape, Cell { row, col })?;
             }
         }
@@ -277,6 +285,11 @@ impl Model {
     /// Transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
     pub fn bias(&self) -> &Array1<f64> {
         &self.bias
+    }
+
+    /// The state that cells outside the grid are always in; `None`: they add no weight.
+    pub fn edge(&self) -> Option<usize> {
+        self.edge
     }
 
     /// `P(y | x)`, shape `[S, O]`; each row sums to one for each of the [`Model::n_rings`] matrices (eq. 1).

@@ -1,8 +1,8 @@
 //! The transition operator `Phi` on beliefs: the predictor `u_{k+1} = Phi(p_k)` of paper eqs. 2-4.
 //!
 //! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` with `(A, C)`
-//! the centre of the kernel and `x` zero outside the grid (eq. 2: a cross-correlation, not a flipped
-//! convolution), then divided by its sum over `m` (eq. 3). [`super::dynamics`] draws realised states
+//! the centre of the kernel and `x` zero outside the grid, or certain of the model's `edge` state there (eq. 2: a
+//! cross-correlation, not a flipped convolution), then divided by its sum over `m` (eq. 3). [`super::dynamics`] draws realised states
 //! from the same operator.
 //!
 //! Where the weights see the cell's own state `o`, `phi[m | o]` has the weights of `o`, and its centre tap
@@ -14,7 +14,7 @@
 //! `tests/model/transition.rs`, `own_state.rs` and `zones.rs` have these sums as they stand, and compare for any models and grids.
 //!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
-//! a margin of zeros, so no cell is special and many are computed at once. And taps that weigh alike are added up
+//! a margin, so no cell is special and many are computed at once. And taps that weigh alike are added up
 //! before they are multiplied (`rows.rs`). Every lane does the same operations in the same order and none is fused, so
 //! results are bit-identical on every platform.
 
@@ -43,7 +43,7 @@ pub struct Transition<T = f32> {
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
     land: Arc<Land<T>>,
-    /// The belief with a margin of zeros.
+    /// The belief with a margin of zeros, in the plane of the edge's state of ones.
     planes: Vec<T>,
     /// The inputs of each group, added up.
     sums: Vec<[T; LANES]>,
@@ -111,7 +111,13 @@ impl<T: NdFloat> Transition<T> {
         model.check_on(shape)?;
         let bias = model.bias().to_vec();
         let land = (model.zone_map().map(|map| &**map), model.n_zones());
-        Ok(Self::on_land(model.kernels(), &bias, shape, land))
+        let mut transition = Self::on_land(model.kernels(), &bias, shape, land);
+        if let Some(edge) = model.edge() {
+            // Inside the margins `load` replaces them.
+            let planes = &mut transition.planes;
+            planes[edge * transition.layout.plane..][..transition.layout.plane].fill(T::one());
+        }
+        Ok(transition)
     }
 
     /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid:

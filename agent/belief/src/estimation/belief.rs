@@ -92,7 +92,11 @@ impl Belief {
         let probabilities = probabilities.as_standard_layout().into_owned();
         let sums = probabilities.sum_axis(Axis(0));
         let least = probabilities.fold_axis(Axis(0), f32::INFINITY, |&a, &b| {
-            if b >= 0.0 { a.min(b) } else { f32::NAN }
+            if b >= 0.0 {
+                a.min(b)
+            } else {
+                f32::NEG_INFINITY
+            }
         });
         let fine =
             |(&sum, &least): (&f32, &f32)| (sum - 1.0).abs() <= SUM_TOLERANCE && least >= 0.0;
@@ -287,8 +291,11 @@ mod tests {
             .into_iter()
             .for_each(check);
         let mut numbers = Probabilities::from_elem((2, 1, 2), 0.5);
+        // The sum is one, but this is no distribution, wherever the negative number stands.
         numbers[[0, 0, 1]] = 1.5;
-        numbers[[1, 0, 1]] = -0.5; // sums to one, but is no distribution
+        numbers[[1, 0, 1]] = -0.5;
+        assert!(Belief::from_probabilities(numbers.clone()).is_err());
+        numbers.invert_axis(Axis(0));
         assert!(Belief::from_probabilities(numbers).is_err());
         assert!(Belief::from_probabilities(Probabilities::from_elem((2, 3, 4), 0.5)).is_ok());
     }

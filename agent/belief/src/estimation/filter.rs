@@ -8,21 +8,24 @@ use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::parameters::Tables;
+use crate::estimation::prediction::{Prediction, PredictionKind, Weights};
 use emberwatch_model::frame::Frame;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::transition::Transition;
 use emberwatch_model::{Model, ModelError};
-use ndarray::{Array2, Array4};
+use ndarray::Array2;
 use std::borrow::Cow;
 
 /// Filter of one world.
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
     transition: Transition,
+    /// In the place of the transition, unless it is the mean field.
+    prediction: Option<Prediction>,
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Where the transition writes.
+    /// Where the transition writes; what the belief was before it was corrected.
     predictor: Probabilities,
     /// Checksum of the parameters, which give the belief its meaning.
     checksum: u32,
@@ -51,9 +54,21 @@ impl BayesFilter {
         Self::of(transition, likelihood, prior, checksum)
     }
 
+    /// The same filter with another prediction by the same learned parameters.
+    pub fn predicting_learned(self, tables: &Tables, kind: PredictionKind) -> Self {
+        let weights = Weights {
+            kernels: &tables.kernels(),
+            bias: &vec![0.0; tables.dimensions.n_states],
+            zones: (None, 1),
+            edge: None,
+        };
+        self.predicting(weights, kind)
+    }
+
     fn of(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
         Self {
             transition,
+            prediction: None,
             likelihood,
             predictor: belief.probabilities().clone(),
             belief,
@@ -61,14 +76,41 @@ impl BayesFilter {
         }
     }
 
-    /// Names the beliefs of filters of a known model, see [`Handover::kind`].
-    pub fn handover_of_known(model: &Model) -> String {
-        handover_of(known_checksum(model))
+    /// The same filter of a known model with another prediction.
+    pub fn predicting_known(self, model: &Model, kind: PredictionKind) -> Self {
+        self.predicting(model.into(), kind)
     }
 
-    /// Takes newer learned parameters of the same dimensions; the belief stays.
+    fn predicting(mut self, weights: Weights<'_>, kind: PredictionKind) -> Self {
+        if kind != PredictionKind::MeanField {
+            self.prediction = Some(Prediction::new(weights, kind, &self.belief));
+        }
+        self
+    }
+
+    /// Tells the prediction what has changed the belief since it was predicted.
+    pub(super) fn corrected(&mut self) {
+        if let Some(prediction) = &mut self.prediction {
+            let before = self.predictor.as_slice().expect("invariant: row-major");
+            prediction.correct(before, self.belief.as_slice());
+        }
+    }
+
+    /// Names the beliefs of filters of a known model, see [`Handover::kind`].
+    pub fn handover_of_known(model: &Model, kind: PredictionKind) -> String {
+        handover_of(known_checksum(model), kind)
+    }
+
+    /// Bytes of [`Handover::to_bytes`].
+    pub(super) fn n_bytes(&self) -> usize {
+        let cavities = self.prediction.as_ref().map_or(0, Prediction::n_bytes);
+        4 * self.belief.as_slice().len() + cavities
+    }
+
+    /// Takes newer learned parameters of the same dimensions; the belief stays. It predicts by the mean field.
     pub fn set_tables(&mut self, tables: &Tables) {
         (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
+        self.prediction = None;
     }
 
     /// The belief and `P(y | x)`, shape `[S, O]`.
@@ -85,10 +127,20 @@ impl Estimator for BayesFilter {
     /// # Panics
     /// If the frame is of another grid or was decoded for more observations than the model has.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
-        Ok(correct(&mut self.belief, &self.likelihood, frame)?)
+        correct(&mut self.belief, &self.likelihood, frame)?;
+        self.corrected();
+        Ok(())
     }
 
     fn predict(&mut self) {
+        if let Some(prediction) = &mut self.prediction {
+            let predictor = self.predictor.as_slice_mut();
+            let predictor = predictor.expect("invariant: row-major");
+            prediction.predict(self.belief.as_slice(), predictor);
+            // The same belief in both: what it was before corrections, which the cavities follow.
+            self.belief.as_mut_slice().copy_from_slice(predictor);
+            return;
+        }
         let belief = self.belief.probabilities_mut();
         self.transition.apply(belief, &mut self.predictor);
         std::mem::swap(belief, &mut self.predictor);
@@ -114,26 +166,49 @@ impl Estimator for BayesFilter {
 
 impl Handover for BayesFilter {
     fn kind(&self) -> String {
-        handover_of(self.checksum)
+        let kind = self.prediction.as_ref().map(Prediction::kind);
+        handover_of(self.checksum, kind.unwrap_or_default())
     }
 
     fn to_bytes(&self) -> Vec<u8> {
-        self.belief.to_bytes()
+        let mut bytes = self.belief.to_bytes();
+        bytes.extend(self.prediction.iter().flat_map(Prediction::to_bytes));
+        bytes
     }
 
     fn restore(&mut self, bytes: &[u8]) -> bool {
-        let belief = Belief::from_bytes(bytes, self.belief.probabilities().dim());
-        belief.map(|belief| self.belief = belief).is_some()
+        let Some((belief, rest)) = bytes.split_at_checked(4 * self.belief.as_slice().len()) else {
+            return false;
+        };
+        let belief = Belief::from_bytes(belief, self.belief.probabilities().dim());
+        let Some(belief) = belief else {
+            return false;
+        };
+        let is_taken = match &mut self.prediction {
+            Some(prediction) => prediction.restore(rest),
+            None => rest.is_empty(),
+        };
+        if is_taken {
+            self.predictor.assign(belief.probabilities());
+            self.belief = belief;
+        }
+        is_taken
     }
 }
 
-fn handover_of(checksum: u32) -> String {
-    format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+fn handover_of(checksum: u32, kind: PredictionKind) -> String {
+    let of_kind = match kind {
+        PredictionKind::MeanField => "",
+        PredictionKind::SecondOrder => " of second order",
+        PredictionKind::Cavities => " with cavities",
+    };
+    format!("bayes_filter{of_kind} {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 fn known_checksum(model: &Model) -> u32 {
     let weights = model.kernels().iter().flatten();
-    let numbers = weights.chain(model.bias()).copied();
+    let edge = model.edge().map(|edge| edge as f64);
+    let numbers = weights.chain(model.bias()).copied().chain(edge);
     checksum(numbers, model.likelihood())
 }
 
@@ -141,14 +216,7 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let dimensions = tables.dimensions;
     let n_states = dimensions.n_states;
     assert_eq!(belief.n_states(), n_states, "belief: expected other states");
-    let (height, width) = dimensions.kernel;
-    let n_weights = n_states * n_states * height * width;
-    let kernel = |weights: &[f32]| {
-        let weights = weights.iter().map(|&weight| f64::from(weight)).collect();
-        let kernel = Array4::from_shape_vec((n_states, n_states, height, width), weights);
-        kernel.expect("invariant: S x S kernels")
-    };
-    let kernels: Vec<_> = tables.kernel.chunks_exact(n_weights).map(kernel).collect();
+    let kernels = tables.kernels();
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
     let bias = vec![0.0; n_states];

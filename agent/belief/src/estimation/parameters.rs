@@ -7,7 +7,7 @@
 use crate::estimation::belief::Belief;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Model, Shape};
-use ndarray::Array2;
+use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -262,6 +262,18 @@ impl Tables {
             likelihood: model.likelihood().iter().map(cast).collect(),
             initial: model.initial().iter().map(cast).collect(),
         }
+    }
+
+    /// The weights as arrays of shape `[S, S, KH, KW]`: one for all cells, or one for each own state.
+    pub fn kernels(&self) -> Vec<Array4<f64>> {
+        let (n, (height, width)) = (self.dimensions.n_states, self.dimensions.kernel);
+        let kernel = |weights: &[f32]| {
+            let weights = weights.iter().map(|&weight| f64::from(weight)).collect();
+            let kernel = Array4::from_shape_vec((n, n, height, width), weights);
+            kernel.expect("invariant: S x S kernels")
+        };
+        let kernels = self.kernel.chunks_exact(n * n * height * width);
+        kernels.map(kernel).collect()
     }
 
     /// `P(y | x)` as an array of shape `[S, O]`.

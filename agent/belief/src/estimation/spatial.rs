@@ -66,6 +66,16 @@ impl SpatialFilter {
         }
     }
 
+    /// What it has learned of how cells vary together.
+    pub fn correlations(&self) -> &Correlations {
+        &self.correlations
+    }
+
+    /// Goes on with what another filter has learned of how cells vary together.
+    pub fn set_correlations(&mut self, correlations: Correlations) {
+        self.correlations = correlations;
+    }
+
     /// Takes in what was seen at some cells, by index, one after the other; each cell once.
     ///
     /// # Errors
@@ -91,6 +101,7 @@ impl SpatialFilter {
             self.spread.spread(index, &innovation, states);
         }
         self.spread.end(self.filter.belief_mut(), &mut self.ages);
+        self.filter.corrected();
         Ok(())
     }
 }
@@ -142,8 +153,7 @@ impl Handover for SpatialFilter {
     }
 
     fn restore(&mut self, bytes: &[u8]) -> bool {
-        let n_bytes = 4 * self.belief().as_slice().len();
-        let Some((belief, own)) = bytes.split_at_checked(n_bytes) else {
+        let Some((belief, own)) = bytes.split_at_checked(self.filter.n_bytes()) else {
             return false;
         };
         let decoded = bincode::serde::decode_from_slice::<(Ages, Correlations), _>(own, FORM);

@@ -7,6 +7,7 @@ use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check, wrong};
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_model::Shape;
 use emberwatch_network::NamedTensor;
@@ -25,14 +26,38 @@ pub const LEARNED: BeliefKind = BeliefKind {
     }),
     chart: ("learned", [0x00, 0x9e, 0x73]),
     handover: None,
-    build: |conditions| Ok(model(conditions)?.estimator(false, conditions.shape)),
+    build: |conditions| {
+        Ok(model(conditions)?.estimator(false, PredictionKind::MeanField, conditions.shape))
+    },
 };
 
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     label: "learned_spatial_filter",
     about: "the same; what a cell shows corrects its neighbours, too",
-    build: |conditions| Ok(model(conditions)?.estimator(true, conditions.shape)),
+    build: |conditions| {
+        Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
+    },
+    ..LEARNED
+};
+
+pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
+    name: "learned+cavities",
+    label: "learned_cavity_filter",
+    about: "the learned filter, predicting as known+cavities does",
+    build: |conditions| {
+        Ok(model(conditions)?.estimator(false, PredictionKind::Cavities, conditions.shape))
+    },
+    ..LEARNED
+};
+
+pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
+    name: "learned+spatial+cavities",
+    label: "learned_spatial_cavity_filter",
+    about: "both: cavities, and what a cell shows corrects others",
+    build: |conditions| {
+        Ok(model(conditions)?.estimator(true, PredictionKind::Cavities, conditions.shape))
+    },
     ..LEARNED
 };
 
@@ -63,8 +88,14 @@ impl LearnedModel {
     }
 
     /// Before the first frame. `is_spatial`: whether its corrections reach the neighbours of visited cells.
-    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Estimator> {
+    pub fn estimator(
+        &self,
+        is_spatial: bool,
+        kind: PredictionKind,
+        shape: Shape,
+    ) -> Box<dyn Estimator> {
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
+        let filter = filter.predicting_learned(&self.tables, kind);
         let neighbours = || (self.target, self.correlations.clone());
         correcting(filter, is_spatial.then(neighbours))
     }

@@ -6,7 +6,9 @@ use crate::benchmark::report::figures::{Height, draw_bars};
 use crate::benchmark::report::number::number;
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
-use crate::benchmark::report::suite::{Aggregate, FLOOR, TaskRuns, by_score, render_suite, told};
+use crate::benchmark::report::suite::{
+    Aggregate, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, told,
+};
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_protocol::task::is_file_name;
@@ -270,32 +272,39 @@ fn is_plain(text: &str) -> bool {
             .all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
 }
 
-/// The page: a row an entry, the best first, then each task's scores.
+/// The page: a row an entry, the best first, then entries that lack a task, then each task's scores.
 pub fn render_page(entries: &[Entry]) -> String {
     let tasks = merged(entries);
-    let headings = [
-        "policy",
-        "score [95 %]",
-        "training, s",
-        "by",
-        "code",
-        "commit",
-    ];
     let rows = by_score(&tasks).into_iter().map(|(policy, score)| {
-        let score = told(score);
         let entry = entries.iter().find(|entry| entry.about.policy == policy);
-        let about = &entry.expect("invariant: each policy is an entry's").about;
-        let seconds = number(about.training_seconds, 0);
-        vec![
+        let entry = entry.expect("invariant: each policy is an entry's");
+        let about = &entry.about;
+        let row = vec![
             policy.into(),
-            score,
-            seconds,
+            score.map_or_else(|| n_tasks(entry.tasks.len(), &tasks), told),
+            number(about.training_seconds, 0),
             about.by.clone(),
             about.code.clone(),
             about.commit.clone(),
-        ]
+        ];
+        (score.is_some(), row)
     });
-    format!("{}\n\n{}", markdown(&headings, rows), render_suite(&tasks))
+    let (complete, partial) = by_completeness(rows);
+    let mut parts = Vec::new();
+    for (words, heading, rows) in [("", "score [95 %]", complete), (PARTIAL, "tasks", partial)] {
+        if !rows.is_empty() {
+            let headings = ["policy", heading, "training, s", "by", "code", "commit"];
+            let table = markdown(&headings, rows.into_iter()).to_string();
+            parts.extend([words.to_owned(), table]);
+        }
+    }
+    parts.push(render_suite(&tasks));
+    parts.retain(|part| !part.is_empty());
+    parts.join("\n\n")
+}
+
+fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
+    format!("{n} of {}", tasks.len())
 }
 
 /// Draws each entry's score over tasks, with a mark for its mean of each task; of entries that lack tasks the marks alone.
@@ -327,12 +336,12 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
         Some(score) => Height {
             value: score.mean,
             ends: score.interval,
-            label: told(Some(score)),
+            label: told(score),
         },
         None => Height {
             value: f64::NAN,
             ends: None,
-            label: format!("{} of {} tasks", group.runs.len(), tasks.len()),
+            label: format!("{} tasks", n_tasks(group.runs.len(), &tasks)),
         },
     };
     let words = [

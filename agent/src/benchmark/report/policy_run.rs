@@ -56,6 +56,8 @@ pub struct PolicyRun {
     /// Identifies all that the policy's actions depend on besides the worlds; empty in files of earlier releases.
     #[serde(default)]
     pub policy_fingerprint: String,
+    /// Processor seconds of training for the world's task, where `suite` knows them.
+    pub training_seconds: Option<f64>,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,

@@ -7,15 +7,22 @@ use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::PolicyRun;
 use crate::benchmark::report::statistics::Estimate;
+use comfy_table::Table;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// The policy whose mean reward of a task is 0.
 pub const FLOOR: &str = "random_walk";
 
 /// The policy whose mean reward of a task is 1.
 pub const CEILING: &str = "oracle_ahead";
+
+const SCORES: &str = "Scores: 0 is random_walk's mean reward of a task, 1 is oracle_ahead's; over all the interquartile \
+     mean over the worlds of all tasks.";
+
+/// Above the rows of policies that lack a task.
+pub(super) const PARTIAL: &str = "Policies that lack a task have no score over all:";
 
 /// How often worlds are drawn again for an interval.
 const N_DRAWS: usize = 10_000;
@@ -27,6 +34,14 @@ pub struct TaskRuns {
     pub runs: Vec<PolicyRun>,
 }
 
+/// The mean rewards of one world: the ends of the scale, and a policy's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WorldRewards {
+    pub floor: f64,
+    pub ceiling: f64,
+    pub policy: f64,
+}
+
 /// An interquartile mean with the ends of its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Aggregate {
@@ -36,51 +51,57 @@ pub struct Aggregate {
 }
 
 impl Aggregate {
-    /// Of the scores of each task's worlds; `None` if a task has none.
+    /// Of the rewards of each task's worlds; `None` if a task has no scores.
     ///
     /// The interval is that of a stratified bootstrap: in each draw the worlds of each task are drawn again, with
-    /// replacement. The same scores give the same digits.
-    pub fn of(tasks: &[Vec<f64>]) -> Option<Self> {
-        if tasks.is_empty() || tasks.iter().any(Vec::is_empty) {
-            return None;
-        }
-        let mean = interquartile_mean(tasks.concat());
-        if tasks.iter().any(|scores| scores.len() == 1) {
+    /// replacement, and give the policy's rewards and both ends of the scale. Policies on the same worlds meet the same
+    /// draws. Draws in which a task's ceiling is not above its floor have no scale and are left out.
+    pub fn of(tasks: &[Vec<WorldRewards>]) -> Option<Self> {
+        let mean = score(tasks.iter().map(|worlds| worlds.iter().copied()))?;
+        if tasks.iter().any(|worlds| worlds.len() == 1) {
             let interval = None;
             return Some(Self { mean, interval });
         }
         let mut random = ChaCha8Rng::seed_from_u64(0);
-        let mut draw = || {
-            let again = tasks.iter().flat_map(|scores| {
-                let index =
-                    |_| ((u64::from(random.next_u32()) * scores.len() as u64) >> 32) as usize;
-                (0..scores.len())
-                    .map(index)
-                    .map(|index| scores[index])
-                    .collect::<Vec<_>>()
-            });
-            interquartile_mean(again.collect())
+        let mut draw = |worlds: &Vec<WorldRewards>| -> Vec<WorldRewards> {
+            let n = worlds.len() as u64;
+            let index = |_| ((u64::from(random.next_u32()) * n) >> 32) as usize;
+            (0..n).map(index).map(|index| worlds[index]).collect()
         };
-        let mut means: Vec<f64> = (0..N_DRAWS).map(|_| draw()).collect();
+        let means = (0..N_DRAWS).filter_map(|_| {
+            let drawn: Vec<_> = tasks.iter().map(&mut draw).collect();
+            score(drawn.into_iter().map(Vec::into_iter))
+        });
+        let mut means: Vec<f64> = means.collect();
         means.sort_by(f64::total_cmp);
-        let interval = Some([0.025, 0.975].map(|share| quantile(&means, share)));
+        let ends = || [0.025, 0.975].map(|share| quantile(&means, share));
+        let interval = (!means.is_empty()).then(ends);
         Some(Self { mean, interval })
     }
 }
 
 impl TaskRuns {
-    /// A policy's reward of each world, scaled so that the random walk's mean is 0 and the oracle's 1; none if these
+    /// A policy's score of each world, scaled so that the random walk's mean is 0 and the oracle's 1; none if these
     /// are missing, or the oracle's is no higher.
     pub fn scores(&self, policy: &str) -> Vec<f64> {
-        let means = [FLOOR, CEILING].map(|policy| self.mean(policy, reward));
-        let [Some(floor), Some(ceiling)] = means else {
-            return Vec::new();
+        scaled(&self.rewards(policy)).unwrap_or_default()
+    }
+
+    /// The rewards of the worlds of a policy, of the random walk and of the oracle.
+    fn rewards(&self, policy: &str) -> Vec<WorldRewards> {
+        let by_seed = |policy| -> BTreeMap<u64, f64> {
+            let runs = self.of(policy);
+            runs.map(|run| (run.world_seed, run.mean_reward)).collect()
         };
-        let score = |run: &PolicyRun| (run.mean_reward - floor) / (ceiling - floor);
-        self.of(policy)
-            .filter(|_| ceiling > floor)
-            .map(score)
-            .collect()
+        let [floors, ceilings] = [FLOOR, CEILING].map(by_seed);
+        let of_world = |(seed, policy)| {
+            Some(WorldRewards {
+                floor: *floors.get(&seed)?,
+                ceiling: *ceilings.get(&seed)?,
+                policy,
+            })
+        };
+        by_seed(policy).into_iter().filter_map(of_world).collect()
     }
 
     fn of<'a>(&'a self, policy: &'a str) -> impl Iterator<Item = &'a PolicyRun> {
@@ -94,56 +115,70 @@ impl TaskRuns {
     }
 }
 
-/// Each policy's score of each task and over all, then how well beliefs predict: a row a policy, a column a task.
+/// Each policy's score of each task and over all, then those of policies that lack a task, then how well beliefs
+/// predict: a row a policy, a column a task.
 pub fn render_suite(tasks: &[TaskRuns]) -> String {
     let policies = by_score(tasks);
-    let names = || tasks.iter().map(|task| task.task.clone());
-    let heading = |last: Option<&str>| {
-        let last = last.map(String::from);
-        ["policy".into()]
-            .into_iter()
-            .chain(names())
-            .chain(last)
-            .collect::<Vec<String>>()
-    };
-    let rows = policies.iter().map(|policy| scores(tasks, *policy));
-    let scores = markdown(&heading(Some("score [95 %]")), rows);
-    let belief = |value: fn(&PolicyRun) -> Option<f64>| {
-        let row = |(policy, _): &(&str, Option<Aggregate>)| {
-            let means: Vec<Option<f64>> =
-                tasks.iter().map(|task| task.mean(policy, value)).collect();
-            let cells = || {
-                means
-                    .iter()
-                    .map(|mean| mean.map_or(NOTHING.into(), |mean| number(mean, 4)))
-            };
-            means
-                .iter()
-                .any(Option::is_some)
-                .then(|| [(*policy).into()].into_iter().chain(cells()).collect())
+    let scores = policies.iter().map(|(policy, score)| {
+        let mean = |task: &TaskRuns| {
+            let mean = Estimate::of(&task.scores(policy));
+            mean.map_or(NOTHING.into(), |it| number(it.mean, 3))
         };
-        let rows: Vec<Vec<String>> = policies.iter().filter_map(row).collect();
-        markdown(&heading(None), rows.into_iter())
+        let cells = tasks.iter().map(mean).chain(score.map(told));
+        (score.is_some(), row(policy, cells))
+    });
+    let (complete, partial) = by_completeness(scores);
+    let belief = |value: fn(&PolicyRun) -> Option<f64>| {
+        let policies = policies.iter();
+        let rows = policies.filter_map(|(policy, _)| belief_row(tasks, policy, value));
+        table(tasks, None, rows.collect())
     };
-    format!(
-        "Scores: 0 is {FLOOR}'s mean reward of a task, 1 is {CEILING}'s; over all the interquartile mean \
-         over the worlds of all tasks.\n\n{scores}\n\n\
-         Log-likelihood of a visited cell (higher is better):\n\n{}\n\nBrier score (lower is better):\n\n{}\n",
-        belief(|run| run.log_likelihood),
-        belief(|run| run.brier),
-    )
+    let beliefs = [
+        (
+            "Log-likelihood of a visited cell (higher is better):",
+            belief(|run| run.log_likelihood),
+        ),
+        ("Brier score (lower is better):", belief(|run| run.brier)),
+    ];
+    let scores = [
+        (SCORES, table(tasks, Some("score [95 %]"), complete)),
+        (PARTIAL, table(tasks, None, partial)),
+    ];
+    let parts = scores.into_iter().chain(beliefs);
+    let parts = parts.filter_map(|(words, table)| Some(format!("{words}\n\n{}\n", table?)));
+    parts.collect::<Vec<_>>().join("\n")
 }
 
-/// The cells of a policy's row: its mean score of each task, and over all.
-fn scores(tasks: &[TaskRuns], (policy, score): (&str, Option<Aggregate>)) -> Vec<String> {
-    let mean = |task: &TaskRuns| {
-        Estimate::of(&task.scores(policy)).map_or(NOTHING.into(), |it| number(it.mean, 3))
-    };
-    [policy.to_owned()]
-        .into_iter()
-        .chain(tasks.iter().map(mean))
-        .chain([told(score)])
-        .collect()
+/// A policy's mean of each task; `None` if it has none.
+fn belief_row(
+    tasks: &[TaskRuns],
+    policy: &str,
+    value: fn(&PolicyRun) -> Option<f64>,
+) -> Option<Vec<String>> {
+    let means: Vec<Option<f64>> = tasks.iter().map(|task| task.mean(policy, value)).collect();
+    let cell = |mean: &Option<f64>| mean.map_or(NOTHING.into(), |mean| number(mean, 4));
+    let is_any = means.iter().any(Option::is_some);
+    is_any.then(|| row(policy, means.iter().map(cell)))
+}
+
+/// A table with a column for each task; `None` without rows.
+fn table(tasks: &[TaskRuns], last: Option<&str>, rows: Vec<Vec<String>>) -> Option<Table> {
+    let names = tasks.iter().map(|task| &*task.task);
+    let headings: Vec<&str> = ["policy"].into_iter().chain(names).chain(last).collect();
+    (!rows.is_empty()).then(|| markdown(&headings, rows.into_iter()))
+}
+
+fn row(policy: &str, cells: impl Iterator<Item = String>) -> Vec<String> {
+    [policy.to_owned()].into_iter().chain(cells).collect()
+}
+
+/// Rows of policies that have all tasks, and the other rows.
+pub(super) fn by_completeness(
+    rows: impl Iterator<Item = (bool, Vec<String>)>,
+) -> (Vec<Vec<String>>, Vec<Vec<String>>) {
+    let (complete, partial): (Vec<_>, Vec<_>) = rows.partition(|(is_complete, _)| *is_complete);
+    let rows = |rows: Vec<(bool, _)>| rows.into_iter().map(|(_, row)| row).collect();
+    (rows(complete), rows(partial))
 }
 
 /// All policies with their scores over tasks, the highest first; then those that lack a task, by name.
@@ -153,12 +188,8 @@ pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
         .flat_map(|task| task.runs.iter().map(|run| &*run.policy));
     let names: BTreeSet<&str> = names.collect();
     let score = |name: &str| {
-        Aggregate::of(
-            &tasks
-                .iter()
-                .map(|task| task.scores(name))
-                .collect::<Vec<_>>(),
-        )
+        let rewards = tasks.iter().map(|task| task.rewards(name));
+        Aggregate::of(&rewards.collect::<Vec<_>>())
     };
     let mut all: Vec<_> = names.into_iter().map(|name| (name, score(name))).collect();
     let mean = |score: Option<Aggregate>| score.map_or(f64::NEG_INFINITY, |score| score.mean);
@@ -167,19 +198,28 @@ pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
 }
 
 /// A score with its interval, as tables and figures show it.
-pub fn told(score: Option<Aggregate>) -> String {
-    let Some(Aggregate { mean, interval }) = score else {
-        return NOTHING.into();
-    };
+pub fn told(Aggregate { mean, interval }: Aggregate) -> String {
     let mean = number(mean, 3);
     match interval.map(|ends| ends.map(|it| number(it, 3))) {
         Some([low, high]) => format!("{mean} [{low}, {high}]"),
-        None => format!("{mean} (one world)"),
+        None => format!("{mean} (no interval)"),
     }
 }
 
-fn reward(run: &PolicyRun) -> Option<f64> {
-    Some(run.mean_reward)
+/// The interquartile mean of all worlds' scores; `None` without tasks, or if one has no scores.
+fn score(tasks: impl Iterator<Item = impl Iterator<Item = WorldRewards>>) -> Option<f64> {
+    let scores = tasks.map(|worlds| scaled(&worlds.collect::<Vec<_>>()));
+    let scores = scores.collect::<Option<Vec<_>>>()?.concat();
+    (!scores.is_empty()).then(|| interquartile_mean(scores))
+}
+
+/// Each world's score on the scale of their means; `None` if the ceiling is not above the floor.
+fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
+    let n = worlds.len() as f64;
+    let floor = worlds.iter().map(|it| it.floor).sum::<f64>() / n;
+    let ceiling = worlds.iter().map(|it| it.ceiling).sum::<f64>() / n;
+    let score = |it: &WorldRewards| (it.policy - floor) / (ceiling - floor);
+    (ceiling > floor).then(|| worlds.iter().map(score).collect())
 }
 
 /// The mean of what is left when a quarter of the numbers, rounded down, goes at each end.
@@ -201,12 +241,22 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 mod tests {
     use super::*;
 
+    /// Worlds whose rewards are scores.
+    fn worlds(scores: &[f64]) -> Vec<WorldRewards> {
+        let world = |&policy: &f64| WorldRewards {
+            floor: 0.0,
+            ceiling: 1.0,
+            policy,
+        };
+        scores.iter().map(world).collect()
+    }
+
     #[test]
     fn the_score_is_that_of_rliable() {
         let tasks = [
-            vec![0.21, 0.21, 0.33, 0.07, -0.03, 0.13, 0.24, 0.34],
-            vec![0.57, 0.49, 0.79, 0.48, 0.56, 0.49, 0.81, 0.47],
-            vec![1.09, 1.01, 0.69, 0.91, 0.53, 0.81, 0.86, 1.01],
+            worlds(&[0.21, 0.21, 0.33, 0.07, -0.03, 0.13, 0.24, 0.34]),
+            worlds(&[0.57, 0.49, 0.79, 0.48, 0.56, 0.49, 0.81, 0.47]),
+            worlds(&[1.09, 1.01, 0.69, 0.91, 0.53, 0.81, 0.86, 1.01]),
         ];
         let Aggregate { mean, interval } = Aggregate::of(&tasks).expect("scores");
         let [low, high] = interval.expect("eight worlds");
@@ -215,8 +265,43 @@ mod tests {
         assert!((low - 0.478).abs() < 0.003, "{low}");
         assert!((high - 0.621).abs() < 0.003, "{high}");
         assert_eq!(Aggregate::of(&tasks), Aggregate::of(&tasks));
-        assert_eq!(Aggregate::of(&[vec![1.0], vec![]]), None);
+        assert_eq!(Aggregate::of(&[worlds(&[1.0]), vec![]]), None);
         assert_eq!(interquartile_mean(vec![9.0, 1.0, 3.0, 2.0, -7.0]), 2.0);
+    }
+
+    #[test]
+    fn a_draw_of_worlds_draws_the_ends_of_the_scale_with_the_policy() {
+        let world = |policy: f64| WorldRewards {
+            floor: policy / 2.0,
+            ceiling: 2.0 * policy,
+            policy,
+        };
+        // The ratio of a world is the same in all, so that only the mixture of worlds varies.
+        let equal = [vec![world(1.0), world(1.0), world(1.0), world(1.0)]];
+        let point = Aggregate::of(&equal).expect("scores");
+        assert_eq!(point.interval, Some([point.mean; 2]));
+        let mixed: Vec<_> = (1..=8).map(|reward| world(reward.into())).collect();
+        let exact = |it: &WorldRewards| WorldRewards {
+            floor: 2.25,
+            ceiling: 9.0,
+            ..*it
+        };
+        let width = |worlds: Vec<WorldRewards>| {
+            let score = Aggregate::of(&[worlds]).expect("scores");
+            let [low, high] = score.interval.expect("eight worlds");
+            high - low
+        };
+        let with_exact_ends = width(mixed.iter().map(exact).collect());
+        assert!(width(mixed) < 0.5 * with_exact_ends);
+        // Half of the draws of these two worlds have no scale.
+        let reversed = WorldRewards {
+            floor: 1.0,
+            ceiling: 0.0,
+            policy: 0.5,
+        };
+        let score = Aggregate::of(&[vec![world(2.0), reversed]]).expect("scores");
+        let ends = score.interval.expect("two worlds");
+        assert!(ends.iter().all(|end| end.is_finite()), "{ends:?}");
     }
 
     #[test]
@@ -226,16 +311,17 @@ mod tests {
             vec![vec![0.5], vec![0.5]],
             vec![vec![0.5], vec![0.4, 0.5, 0.6]],
         ] {
+            let tasks: Vec<_> = tasks.iter().map(|scores| worlds(scores)).collect();
             let score = Aggregate::of(&tasks).expect("scores");
             let expected = Aggregate {
                 mean: 0.5,
                 interval: None,
             };
             assert_eq!(score, expected, "{tasks:?}");
-            assert_eq!(told(Some(score)), "0.500 (one world)");
+            assert_eq!(told(score), "0.500 (no interval)");
         }
         // Worlds of equal scores are an observation: their interval is a point.
-        let equal = Aggregate::of(&[vec![0.5, 0.5]]).expect("scores");
-        assert_eq!(told(Some(equal)), "0.500 [0.500, 0.500]");
+        let equal = Aggregate::of(&[worlds(&[0.5, 0.5])]).expect("scores");
+        assert_eq!(told(equal), "0.500 [0.500, 0.500]");
     }
 }

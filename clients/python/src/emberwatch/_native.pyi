@@ -437,6 +437,53 @@ class Transition:
 
     def __getnewargs__(self) -> tuple[str, int, int]: ...
 
+class Estimators:
+    """Beliefs of one kind about some worlds. `chosen` is a mask of worlds, `(n,)`."""
+
+    @staticmethod
+    def known(model: str, prior: NDArray[np.float32], kind: str, n_worlds: int) -> Estimators:
+        """Of a model file's text; `prior` is that of each world, `(S, H, W)`."""
+
+    @staticmethod
+    def load(
+        checkpoint: str,
+        grid: tuple[int, int],
+        kind: str | None,
+        model: str | None,
+        n_worlds: int,
+    ) -> Estimators:
+        """Of a checkpoint; `grid` is height and width, `model` a model file's text."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def state_names(self) -> list[str]: ...
+    @property
+    def target_state(self) -> int: ...
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of worlds, height and width."""
+
+    def belief(self) -> NDArray[np.float32]:
+        """`(S, n, H, W)`, a new array."""
+
+    def entropy(self) -> NDArray[np.float32]:
+        """Nats, `(n, H, W)`, a new array."""
+
+    def reset(self, chosen: NDArray[np.bool_], keeps_correlations: bool) -> None: ...
+    def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None:
+        """With frames of all worlds, `(n, H, W)`."""
+
+    def predict(self, chosen: NDArray[np.bool_]) -> None: ...
+    def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
+        """Log loss, Brier score and accuracy against states `(n, H, W)`, `(n,)` each."""
+
+    def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
+        """Log-likelihood of frames `(n, H, W)` and number of seen cells, `(n,)` each."""
+
+def belief_kinds() -> list[tuple[str, str]]:
+    """The name of each kind of belief that frames correct, and what it is."""
+
 def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
     """Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
 

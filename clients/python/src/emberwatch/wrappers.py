@@ -1,4 +1,4 @@
-"""`BeliefObservation`: what the known-model filter makes of the frames, as the observation.
+"""`BeliefObservation`: what a filter or another belief makes of the frames, as the observation.
 
 A frame shows a path; the belief is what all frames so far say about every cell. For learning
 without memory, the belief is the better observation.
@@ -16,7 +16,7 @@ from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.belief import Filter
+from emberwatch.belief import Belief, known, load
 from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.common.arguments import as_json
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
@@ -24,7 +24,7 @@ from emberwatch.model import Model
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
-    """Runs the known-model filter beside an environment and observes its belief.
+    """Runs a belief beside an environment and observes it: by default the known model's filter.
 
     For single environments: wrap those of a vector one by one. `terminated` and `truncated` pass
     through; only `reset` begins a new belief. Where ``info["step"]`` tells the world's k, as in
@@ -36,8 +36,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     After `reset`, the prior about ``X_0``, the world after its burn-in. A step moves the world from
     ``X_k`` to ``X_{k+1}`` and its frame shows ``X_{k+1}``: the filter predicts, then corrects, and
     the observation is the posterior about ``X_{k+1}`` given all frames (eqs. 5 and 6). The Rust
-    agent's filter does the same; its planner then looks one step further ahead, at the predictor
-    of what the next path will meet: `emberwatch.belief.Transition` makes it from this observation.
+    agent's belief has the same numbers; its planner then looks one step further ahead, at the
+    predictor of what the next path will meet: `emberwatch.belief.Transition` makes it from this
+    observation.
 
     - ``dtype="float32"``: `Box` of 0 to 1, shape (S, H, W), each cell's sum one.
     - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S): an image for convolutional
@@ -56,7 +57,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     ## Arguments
     `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
     ``"frame"``. `model`, a `Model`, its name, or the path or the text of its file, is for servers
-    that do not reveal theirs; else it is ``env.unwrapped.model``.
+    that do not reveal theirs; else it is ``env.unwrapped.model``. `kind` is one of
+    `emberwatch.belief.kinds`. With `checkpoint`, a file of `emberwatch-agent train`, the belief is
+    the learned one, as of `emberwatch.belief.load`: it has its own prior and S, and needs no model.
     """
 
     def __init__(
@@ -67,34 +70,50 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         dtype: Literal["float32", "uint8"] = "float32",
         prior: PriorKind | ArrayLike | None = None,
         model: Model | str | Path | None = None,
+        kind: str | None = None,
+        checkpoint: str | Path | None = None,
     ) -> None:
         text = model.toml if isinstance(model, Model) else as_json(model)
         RecordConstructorArgs.__init__(
-            self, keep=keep, dtype=dtype, prior=as_json(prior), model=text
+            self,
+            keep=keep,
+            dtype=dtype,
+            prior=as_json(prior),
+            model=text,
+            kind=kind,
+            checkpoint=as_json(checkpoint),
         )
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
             raise invalid("dtype", "'float32' or 'uint8'", repr(dtype))
         self._keep, self._dtype = keep, dtype
-        self._model = _model_of(env, model)
         original = _parts_of(env.observation_space, spaces.Dict)
         height, width = _grid_of(original)
-        burn_in = int(getattr(env.unwrapped, "burn_in", 0))
-        grid = {"height": height, "width": width, "burn_in": burn_in}
-        self._prior = prior_of(prior, self._model, **grid)
-        Filter(self._model, prior=self._prior)  # refuses what does not fit, now
-        self._filter: Filter | None = None
+        grid = {"height": height, "width": width}
+        if checkpoint is None:
+            burn_in = int(getattr(env.unwrapped, "burn_in", 0))
+            known_model = _model_of(env, model)
+            first = prior_of(prior, known_model, **grid, burn_in=burn_in)
+            self._belief = known(known_model, prior=first, kind=kind or "known")
+        elif prior is not None:
+            raise invalid("prior", "none beside a checkpoint, which has its own", prior)
+        else:
+            is_hidden = model is None and getattr(env.unwrapped, "model", None) is None
+            found = None if is_hidden else _model_of(env, model)
+            self._belief = load(checkpoint, **grid, kind=kind, model=found)
+        #: Whether an episode has begun, and no step is unfinished.
+        self._is_begun = False
         self._step = 0
         self.observation_space = self._space(original, height, width)
 
     @property
-    def filter(self) -> Filter:
-        """The filter of the current episode, for its entropy or its belief in double precision."""
-        if self._filter is None:
+    def filter(self) -> Belief:
+        """The belief of the current episode, for its entropy or its states."""
+        if not self._is_begun:
             raise gymnasium.error.ResetNeeded(
                 "BeliefObservation: call reset first, also after a step that did not finish"
             )
-        return self._filter
+        return self._belief
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -102,9 +121,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         with self._between():
             observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
-        belief = Filter(self._model, prior=self._prior)
-        belief.correct(_frame_of(observation))  # empty, but where an episode is resumed
-        self._filter = belief
+        self._belief.reset()
+        self._belief.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        self._is_begun = True
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -116,17 +135,17 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             belief.predict()
         if self._step > before:
             belief.correct(_frame_of(observation))
-        self._filter = belief
+        self._is_begun = True
         return self._observe(observation), reward, terminated, truncated, info
 
     @contextmanager
     def _between(self) -> Generator[None]:
         """Without a belief until what the environment does now is taken in; a refusal keeps it."""
-        belief, self._filter = self._filter, None
+        was_begun, self._is_begun = self._is_begun, False
         try:
             yield
         except (EmberwatchError, gymnasium.error.Error):
-            self._filter = belief
+            self._is_begun = was_begun
             raise
 
     def _observe(self, observation: Any) -> Any:
@@ -134,14 +153,12 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         if self._dtype == "uint8":
             image = np.rint(255.0 * belief).astype(np.uint8)
             belief = np.ascontiguousarray(image.transpose(1, 2, 0))
-        else:
-            belief = belief.astype(np.float32)
         return {**_parts_of(observation), "belief": belief} if self._keep else belief
 
     def _space(
         self, original: dict[str, spaces.Space[Any]], height: int, width: int
     ) -> spaces.Space[Any]:
-        n_states = self._model.n_states
+        n_states = len(self._belief.state_names)
         if self._dtype == "uint8":
             belief = spaces.Box(0, 255, (height, width, n_states), np.uint8)
         else:

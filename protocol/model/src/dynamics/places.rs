@@ -7,7 +7,7 @@ use super::super::grid::Shape;
 use super::super::parameters::Model;
 use super::lanes::LANES;
 
-/// The state of places off the grid.
+/// The state of places off the grid, which add no weight.
 pub(super) const OFF_GRID: u8 = 255;
 
 #[derive(Debug, Clone)]
@@ -15,7 +15,7 @@ pub(super) struct Places {
     width: usize,
     pub(super) stride: usize,
     margins: [usize; 2],
-    /// `X_k`, and [`OFF_GRID`] in the margin.
+    /// `X_k`, and in the margin the model's edge state or [`OFF_GRID`].
     pub(super) states: Vec<u8>,
     /// By home: random bytes, then states and marks of undecided cells, then `X_{k+1}`.
     pub(super) next: Vec<u8>,
@@ -29,7 +29,7 @@ impl Places {
             width: shape.width(),
             stride: shape.width() + kernel_width - 1,
             margins: [kernel_height / 2, kernel_width / 2],
-            states: vec![OFF_GRID; n_places],
+            states: vec![model.edge().map_or(OFF_GRID, |edge| edge as u8); n_places],
             next: vec![0; n_homes],
         }
     }

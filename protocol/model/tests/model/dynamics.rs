@@ -2,6 +2,7 @@
 
 use super::models::{
     check_draws, hash_after, model, one_hot, predicted, random_model, random_states, shape,
+    with_edge,
 };
 use super::statistics;
 use emberwatch_model::{Dynamics, Grid, Model};
@@ -43,6 +44,23 @@ fn random_models_are_drawn_from_phi() {
         &random_states(9, 2, (2, 3)),
         100_000,
     );
+}
+
+#[test]
+fn cells_beyond_the_edge_in_a_state_are_drawn_from_phi() {
+    let latent = with_edge(&Model::wildfire(), 1);
+    check(&latent, &random_states(1, 3, (2, 6)), 200_000);
+    let random = with_edge(&random_model(6, 6, [3, 7]), 3);
+    check(&random, &random_states(7, 6, (4, 3)), 100_000);
+    // Where nothing is left of a cell's weights without its neighbours beyond the edge.
+    let weight = |to, from, row, _| f64::from(u8::from(row == 0 && to == from));
+    let shift_down = model(3, [3, 1], weight, |_| 0.0);
+    let error = Dynamics::new(&shift_down, shape(3, 2)).expect_err("no weight in row 0");
+    assert!(error.to_string().contains("(0, 0)"), "{error}");
+    let mut dynamics = Dynamics::new(&with_edge(&shift_down, 2), shape(3, 2)).expect("weights");
+    let mut states = ndarray::array![[0, 1], [1, 2], [2, 0]];
+    dynamics.step(1, 0, &mut states);
+    assert_eq!(states, ndarray::array![[2, 2], [0, 1], [1, 2]]);
 }
 
 #[test]

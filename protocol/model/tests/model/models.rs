@@ -44,6 +44,14 @@ pub fn model(
     Model::new(file).expect("test models are valid")
 }
 
+/// The same with cells outside the grid that are always in a state.
+pub fn with_edge(model: &Model, key: u64) -> Model {
+    let mut file = model.file().clone();
+    let state = key as usize % model.n_states();
+    file.edge = Some(file.states[state].name.clone());
+    Model::new(file).expect("test models are valid")
+}
+
 /// Random weights, a third of them zero, and random biases.
 pub fn random_model(key: u64, n_states: usize, [height, width]: [usize; 2]) -> Model {
     let weight = |to, from, row, col| {

@@ -1,6 +1,6 @@
 //! `Phi` on beliefs against its formula (paper eqs. 2-4), for any model and grid.
 
-use super::models::{check_predictions, random_belief, random_model, shape};
+use super::models::{check_predictions, random_belief, random_model, shape, with_edge};
 use emberwatch_model::{Model, Transition};
 use ndarray::{Array3, Axis};
 use proptest::prelude::*;
@@ -15,10 +15,13 @@ fn formula(model: &Model, belief: &Array3<f64>) -> Array3<f64> {
             for (a, c) in ndarray::indices((kernel_height, kernel_width)) {
                 let (i, j) = (row + a, col + c);
                 let (up, left) = (kernel_height / 2, kernel_width / 2);
-                if (up..height + up).contains(&i) && (left..width + left).contains(&j) {
-                    let belief = belief[[from, i - up, j - left]];
-                    weight += model.kernel()[[to, from, a, c]] * belief;
-                }
+                let belief = if (up..height + up).contains(&i) && (left..width + left).contains(&j)
+                {
+                    belief[[from, i - up, j - left]]
+                } else {
+                    f64::from(u8::from(model.edge() == Some(from)))
+                };
+                weight += model.kernel()[[to, from, a, c]] * belief;
             }
         }
         weight
@@ -41,6 +44,7 @@ proptest! {
     ) {
         let kernel_size = [2 * half_kernel.0 + 1, 2 * half_kernel.1 + 1];
         let model = random_model(key, n_states, kernel_size);
+        let model = if key.is_multiple_of(2) { with_edge(&model, key) } else { model };
         let belief = random_belief(key, n_states, side);
         check_predictions(&model, &belief, &formula(&model, &belief));
     }

@@ -1,9 +1,12 @@
-"""The Bayes filter for a known model (paper section III.A, masked as in section III.C).
+"""Beliefs about worlds: what the frames so far say about every cell.
 
-A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5); the transition turns that
-into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent given the
-frames, so this is an approximation even with the true model. `wrappers.BeliefObservation` runs it
-beside an environment.
+`known` and `load` make a `Belief` of any kind that the Rust agent has; `score` says how well one
+fits recorded worlds. `wrappers.BeliefObservation` runs one beside an environment.
+
+The plain one is the Bayes filter of a known model (paper section III.A, masked as in section
+III.C): a frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5), and the transition
+turns that into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent
+given the frames, so this is an approximation even with the true model.
 
 Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
 """
@@ -14,6 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import emberwatch._native as _native
+from emberwatch.belief.estimators import Belief as Belief
+from emberwatch.belief.estimators import kinds as kinds
+from emberwatch.belief.estimators import known as known
+from emberwatch.belief.estimators import load as load
+from emberwatch.belief.scoring import BeliefScores as BeliefScores
+from emberwatch.belief.scoring import score as score
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 from emberwatch.errors import invalid
 from emberwatch.model import Model
@@ -21,46 +30,12 @@ from emberwatch.model import Model
 _SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
 
 
-class Filter:
-    """Filter of one world: `correct` with each frame, and `predict` for each step of the world."""
-
-    def __init__(self, model: Model, *, prior: NDArray[np.floating]) -> None:
-        """Begins with the prior: predictor ``u_0``, shape (S, H, W), each cell a distribution."""
-        self._belief = _distribution(prior, n_states=model.n_states)
-        _, height, width = self._belief.shape
-        self._transition = Transition(model, height=height, width=width)
-        self._likelihood = np.ascontiguousarray(model.observation_matrix)
-
-    @property
-    def belief(self) -> NDArray[np.float64]:
-        """A copy, shape (S, H, W): the posterior after `correct`, the predictor after `predict`."""
-        return self._belief.copy()
-
-    def correct(self, frame: NDArray[np.uint8]) -> None:
-        """Bayes' rule on the observed cells (eq. 5); the others keep their belief.
-
-        ``p = B(y) u / (b(y)' u)`` with ``b(y)`` the column of the observation matrix for ``y``, and
-        ``B(y)`` the diagonal matrix of it. An impossible frame leaves the belief as it was.
-
-        Args:
-            frame: Observed values below O, 255 where nothing was observed; shape (H, W).
-        """
-        if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
-            expected = f"shape {self._belief.shape[1:]} and type uint8"
-            raise invalid("frame", expected, f"{frame.shape} and {frame.dtype}")
-        _native.correct(self._belief[:, np.newaxis], self._likelihood, frame[np.newaxis])
-
-    def predict(self) -> None:
-        """The predictor of the next step, ``u_{k+1} = Phi(p_k)`` (eq. 6)."""
-        self._belief = self._transition.apply(self._belief)
-
-    def entropy(self) -> NDArray[np.float64]:
-        """Shannon entropy of each cell in nats (eq. 14), shape (H, W), 0 to log S."""
-        return entropy(self._belief)
-
-
 class Filters:
-    """The filters of many worlds, stepped together. Beliefs have shape (S, n_worlds, H, W)."""
+    """The plain filters of many worlds in double precision, for the environments' observations.
+
+    Beliefs have shape (S, n_worlds, H, W). The recorded bytes of observations depend on these
+    numbers; for anything else, `known` makes the agent's, which are single precision.
+    """
 
     def __init__(self, model: Model, prior: NDArray[np.floating], n_worlds: int) -> None:
         """`prior`, shape (S, H, W), is that of each world."""
@@ -136,7 +111,7 @@ def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
     return np.full((model.n_states, height, width), 1.0 / model.n_states)
 
 
-def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
+def entropy(belief: NDArray[np.floating]) -> NDArray[np.float64]:
     """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
     total = np.zeros(belief.shape[1:])
     # State by state, as memory for all is got and given back in each call, which takes most time.

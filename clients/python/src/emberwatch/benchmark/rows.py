@@ -59,11 +59,19 @@ class Row:
     worlds_fingerprint: str = ""
     #: Identifies the policy and all settings that its actions depend on. Empty in old files.
     policy_fingerprint: str = ""
+    #: Processor seconds of training for the world's task. None: only `emberwatch-agent suite` says.
+    training_seconds: float | None = None
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: First columns that older files lack: fingerprints, likelihoods, figures of merit, or teams.
-_LATER: Final = ("worlds_fingerprint", "log_likelihood", "steps_to_detection", "robots")
+#: First columns that older files lack: training, fingerprints, likelihoods, merit, or teams.
+_LATER: Final = (
+    "training_seconds",
+    "worlds_fingerprint",
+    "log_likelihood",
+    "steps_to_detection",
+    "robots",
+)
 _HEADERS: Final = [_HEADER, *(_HEADER[: _HEADER.index(column)] for column in _LATER)]
 
 

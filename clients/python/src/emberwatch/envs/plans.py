@@ -20,8 +20,13 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 Estimator: TypeAlias = Literal[
     "known_model",
     "spatial_filter",
+    "second_order_filter",
+    "cavity_filter",
+    "spatial_cavity_filter",
     "learned_filter",
     "learned_spatial_filter",
+    "learned_cavity_filter",
+    "learned_spatial_cavity_filter",
     "neural_belief",
 ]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]

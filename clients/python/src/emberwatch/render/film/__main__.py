@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from emberwatch.belief import Filter
+from emberwatch.belief import Belief, known
 from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.client import recording
 from emberwatch.client.observer import Frame
@@ -167,11 +167,11 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
     return model
 
 
-def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Filter:
+def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Belief:
     """The filter before the frame of step k, the first that is known."""
     burn_in = min(server.burn_in + k, _MOST_SIMULATED)
     grid = {"height": server.height, "width": server.width, "burn_in": burn_in}
-    return Filter(model, prior=prior_of(prior, model, **grid))
+    return known(model, prior=prior_of(prior, model, **grid))
 
 
 def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterator[Scene]) -> None:

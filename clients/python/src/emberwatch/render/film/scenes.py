@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import Filter
+from emberwatch.belief import Belief
 from emberwatch.client.observer import Frame, Truth
 from emberwatch.client.recording import Record
 from emberwatch.client.replies import ServerInfo
@@ -103,23 +103,23 @@ class Scene:
     k: int
     is_gap: bool = False
     paths: list[NDArray[np.intp]] | None = None
-    belief: NDArray[np.float64] | None
+    belief: NDArray[np.float32] | None
     since: int
     n_lost: int
     mean_reward: float = 0.0
 
 
 def scenes(
-    steps: Iterable[Step], selection: Selection, begin: Callable[[int], Filter] | None
+    steps: Iterable[Step], selection: Selection, begin: Callable[[int], Belief] | None
 ) -> Iterator[Scene]:
     """The scenes to show.
 
     Args:
         steps: Every step there is, also those that are not shown.
         selection: Which to show.
-        begin: The filter before the frame of a step k; None where no model is known.
+        begin: The belief before the frame of a step k; None where no model is known.
     """
-    known: Filter | None = None
+    known: Belief | None = None
     since = n_lost = n_rewards = 0
     total = 0.0
     for step in steps:
@@ -155,7 +155,7 @@ def scenes(
             )
 
 
-def _predict(known: Filter | None, n_steps: int) -> None:
+def _predict(known: Belief | None, n_steps: int) -> None:
     if known is not None:
         for _ in range(n_steps):
             known.predict()

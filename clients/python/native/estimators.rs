@@ -1,0 +1,431 @@
+//! Beliefs of every kind about some worlds: the agent's own estimators, fed with frames from Python.
+
+use crate::detached::detached;
+use crate::errors::check_memory;
+use crate::model::{model_of, shape_of};
+use crate::origin::{Origin, kind_of, no_prior, unfit};
+use crate::refusal::{failed, invalid, refused};
+use crate::threads::{Pool, Threads};
+use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
+use emberwatch_belief::estimation::SpatialFilter;
+use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
+use emberwatch_belief::estimation::scoring::score;
+use emberwatch_learning::beliefs::WorldForm;
+use emberwatch_learning::learned::Learned;
+use emberwatch_learning::learners;
+use emberwatch_learning::options::usual;
+use emberwatch_model::frame::FrameError;
+use emberwatch_model::{Frame, Grid, Model, Shape};
+use emberwatch_network::Device;
+use numpy::ndarray::{Array1, Array3, Array4, ArrayView3, Axis};
+use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
+use pyo3::prelude::*;
+use std::any::Any;
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, TryLockError};
+
+/// One number for each world.
+type Numbers<'py> = Bound<'py, PyArray1<f64>>;
+
+/// Beliefs about some worlds. Threads cannot share them.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct Estimators {
+    #[pyo3(get)]
+    kind: &'static str,
+    #[pyo3(get)]
+    state_names: Vec<String>,
+    /// The state that pays most.
+    #[pyo3(get)]
+    target_state: usize,
+    n_observations: usize,
+    n_worlds: usize,
+    shape: Shape,
+    origin: Origin,
+    state: Mutex<State>,
+}
+
+struct State {
+    worlds: Vec<Box<dyn Estimator>>,
+    threads: Pool,
+}
+
+fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
+    let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
+    let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
+    if let (Some(from), Some(to)) = (from, to) {
+        to.set_correlations(from.correlations().clone());
+    }
+}
+
+#[pymethods]
+impl Estimators {
+    /// Of a known model; `prior` is the first belief in each world, `[S, H, W]`.
+    #[staticmethod]
+    fn known(
+        py: Python<'_>,
+        model: &str,
+        prior: PyReadonlyArray3<'_, f32>,
+        kind: &str,
+        n_worlds: usize,
+    ) -> PyResult<Self> {
+        let kind = kind_of(py, kind, true)?;
+        let (model, prior) = (model_of(model)?, prior.as_array());
+        let (n_states, height, width) = prior.dim();
+        if n_states != model.n_states() {
+            let expected = format!("shape ({}, H, W)", model.n_states());
+            return Err(invalid(py, "prior", expected, format!("{:?}", prior.dim())));
+        }
+        let shape = shape_of(py, height, width)?;
+        let prior = Belief::from_probabilities(prior.to_owned());
+        let prior = prior.map_err(|error| no_prior(py, error))?;
+        let origin = Origin {
+            kind,
+            model: Some(model),
+            prior: Some(prior),
+            learned: Learned::default(),
+            shape,
+        };
+        Self::new(py, origin, n_worlds)
+    }
+
+    /// Of a checkpoint; without `kind`, of the belief that it holds. With a model, the checkpoint must fit its worlds.
+    #[staticmethod]
+    fn load(
+        py: Python<'_>,
+        checkpoint: PathBuf,
+        grid: (usize, usize),
+        kind: Option<&str>,
+        model: Option<&str>,
+        n_worlds: usize,
+    ) -> PyResult<Self> {
+        let shape = shape_of(py, grid.0, grid.1)?;
+        let kind = kind.map(|name| kind_of(py, name, false)).transpose()?;
+        let model = model.map(model_of).transpose()?;
+        let learned = py.detach(|| learners::read([&*checkpoint], &Device::Cpu));
+        let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
+        let kind = kind.unwrap_or_else(|| usual(&learned));
+        if kind.knows_model {
+            let got = format!("one on the belief '{}': use known(model)", kind.name);
+            return Err(invalid(py, "checkpoint", "a learned belief", got));
+        }
+        let form = model.as_ref().map(|model| WorldForm::of(model, shape));
+        let fits = form.map_or(Ok(()), |form| kind.check(&learned, &form));
+        fits.map_err(|error| refused(py, format!("{error:#}")))?;
+        let origin = Origin {
+            kind,
+            model,
+            prior: None,
+            learned,
+            shape,
+        };
+        Self::new(py, origin, n_worlds)
+    }
+
+    /// Number of worlds, height and width.
+    #[getter]
+    fn shape(&self) -> (usize, usize, usize) {
+        (self.n_worlds, self.shape.height(), self.shape.width())
+    }
+
+    /// The beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
+    fn belief<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray4<f32>>> {
+        let state = self.state(py)?;
+        let (height, width) = self.shape.dim();
+        let dim = (self.state_names.len(), state.worlds.len(), height, width);
+        let mut out = Array4::zeros(dim);
+        for (world, mut out) in state.worlds.iter().zip(out.axis_iter_mut(Axis(1))) {
+            out.assign(&world.belief().view());
+        }
+        Ok(out.into_pyarray(py))
+    }
+
+    /// The entropy of each cell in nats, `[n, H, W]`.
+    fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
+        let state = self.state(py)?;
+        let (height, width) = self.shape.dim();
+        let mut out = Array3::zeros((state.worlds.len(), height, width));
+        for (world, mut out) in state.worlds.iter().zip(out.outer_iter_mut()) {
+            out.assign(&world.belief().entropy(EntropyKind::Sum));
+        }
+        Ok(out.into_pyarray(py))
+    }
+
+    /// Begins again in the chosen worlds, with the first belief. `keeps_correlations`: with what spatial filters have
+    /// learned of how cells vary together.
+    fn reset(
+        &self,
+        py: Python<'_>,
+        chosen: PyReadonlyArray1<'_, bool>,
+        keeps_correlations: bool,
+    ) -> PyResult<()> {
+        let mut state = self.state(py)?;
+        let chosen = chosen.as_slice()?;
+        self.check_worlds(py, "worlds", chosen.len())?;
+        let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
+        let State { worlds, threads } = &mut *state;
+        let n_numbers = n_chosen * self.n_numbers();
+        let made = detached(py, n_numbers, || self.origin.estimators(threads, n_chosen));
+        let made = made.map_err(|error| raise(py, &error))?;
+        let places = worlds.iter_mut().zip(chosen);
+        let places = places.filter(|(_, chosen)| **chosen);
+        for ((place, _), mut made) in places.zip(made) {
+            if keeps_correlations {
+                keep_correlations(&**place, &mut *made);
+            }
+            *place = made;
+        }
+        Ok(())
+    }
+
+    /// Corrects the chosen worlds with their frames; `frames` are those of all, `[n, H, W]`.
+    fn correct(
+        &self,
+        py: Python<'_>,
+        frames: PyReadonlyArray3<'_, u8>,
+        chosen: PyReadonlyArray1<'_, bool>,
+    ) -> PyResult<()> {
+        let mut state = self.state(py)?;
+        let frames = self.frames(py, frames.as_array(), chosen.as_slice()?)?;
+        let State { worlds, threads } = &mut *state;
+        let is_short = self.origin.is_short(worlds.len());
+        let n_numbers = worlds.len() * self.n_numbers();
+        let corrected = detached(py, n_numbers, || {
+            threads.work(is_short, |threads| {
+                threads.each(worlds.iter_mut().zip(frames), |(world, frame)| {
+                    frame.map_or(Ok(()), |frame| world.correct(&frame))
+                })
+            })
+        });
+        let n_worlds = corrected.len();
+        let refused = corrected.into_iter().enumerate();
+        let mut refused = refused.filter_map(|(world, result)| Some((world, result.err()?)));
+        refused.next().map_or(Ok(()), |(world, error)| {
+            let error = anyhow::Error::from(error);
+            let of_world = format!("world {world}");
+            let error = if n_worlds > 1 {
+                error.context(of_world)
+            } else {
+                error
+            };
+            Err(raise(py, &error))
+        })
+    }
+
+    /// Moves the beliefs about the chosen worlds one step ahead.
+    fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
+        let mut state = self.state(py)?;
+        let chosen = chosen.as_slice()?;
+        self.check_worlds(py, "worlds", chosen.len())?;
+        let State { worlds, threads } = &mut *state;
+        let is_short = self.origin.is_short(worlds.len());
+        let worlds = worlds.iter_mut().zip(chosen);
+        let worlds = worlds.filter_map(|(world, &chosen)| chosen.then_some(&mut **world));
+        let worlds: Vec<&mut dyn Estimator> = worlds.collect();
+        let n_numbers = worlds.len() * self.n_numbers();
+        detached(py, n_numbers, || {
+            threads.work(is_short, |threads| predict_all(worlds, threads));
+        });
+        Ok(())
+    }
+
+    /// How well the beliefs fit hidden states `[n, H, W]`: negative log-likelihood, Brier score of the state `target`,
+    /// share of cells whose most probable state is right.
+    fn scores<'py>(
+        &self,
+        py: Python<'py>,
+        states: PyReadonlyArray3<'py, u8>,
+        target: usize,
+    ) -> PyResult<(Numbers<'py>, Numbers<'py>, Numbers<'py>)> {
+        let state = self.state(py)?;
+        let states = states.as_array();
+        self.check_dim(py, "states", states.dim())?;
+        let n_states = self.state_names.len();
+        if let Some(got) = states.iter().find(|state| usize::from(**state) >= n_states) {
+            return Err(invalid(
+                py,
+                "states",
+                format!("values below {n_states}"),
+                got,
+            ));
+        }
+        let truths: Vec<Grid<u8>> = states.outer_iter().map(|it| it.to_owned()).collect();
+        let pairs = || state.worlds.iter().map(|it| it.belief()).zip(&truths);
+        let own = self.target_state;
+        let losses: Array1<f64> = pairs()
+            .map(|(belief, truth)| log_loss(belief, truth))
+            .collect();
+        let brier: Array1<f64> = pairs()
+            .map(|(belief, truth)| brier_score(belief, truth, target, own))
+            .collect();
+        let right: Array1<f64> = pairs()
+            .map(|(belief, truth)| accuracy(belief, truth))
+            .collect();
+        Ok((
+            losses.into_pyarray(py),
+            brier.into_pyarray(py),
+            right.into_pyarray(py),
+        ))
+    }
+
+    /// How well the beliefs predict frames `[n, H, W]`: log-likelihood, summed over the seen cells, and their number.
+    fn score_frames<'py>(
+        &self,
+        py: Python<'py>,
+        frames: PyReadonlyArray3<'py, u8>,
+    ) -> PyResult<(Numbers<'py>, Numbers<'py>)> {
+        let state = self.state(py)?;
+        let all = vec![true; state.worlds.len()];
+        let frames = self.frames(py, frames.as_array(), &all)?;
+        let scores = state.worlds.iter().zip(frames.iter().flatten());
+        let scores = scores
+            .filter_map(|(world, frame)| Some(score(world.belief(), &*world.likelihood()?, frame)));
+        let (sums, seen): (Vec<f64>, Vec<f64>) = scores
+            .map(|score| (score.log_likelihood, score.n_seen as f64))
+            .unzip();
+        Ok((sums.into_pyarray(py), seen.into_pyarray(py)))
+    }
+}
+
+impl Estimators {
+    fn new(py: Python<'_>, origin: Origin, n_worlds: usize) -> PyResult<Self> {
+        let (kind, shape, mut threads) = (origin.kind, origin.shape, Pool::default());
+        let conditions = origin.conditions();
+        let names = kind
+            .state_names(&conditions)
+            .and_then(|names| Ok((names, kind.target(&conditions)?)));
+        let (state_names, target_state) = names.map_err(|error| unfit(py, &error))?;
+        // A belief, its predictor and work space.
+        let of_world = 4 * state_names.len() * shape.n_cells() * size_of::<f32>();
+        let n_bytes = n_worlds.saturating_mul(of_world);
+        check_memory(
+            py,
+            format_args!("the beliefs about {n_worlds} worlds"),
+            n_bytes,
+        )?;
+        let worlds = py.detach(|| origin.estimators(&mut threads, n_worlds));
+        let worlds = worlds.map_err(|error| unfit(py, &error))?;
+        let first = worlds
+            .first()
+            .map(|world| (world.belief().shape(), world.likelihood()));
+        let (own, likelihood) = first.unwrap_or((shape, None));
+        if own != shape {
+            return Err(invalid(
+                py,
+                "checkpoint",
+                format!("a belief on {shape}"),
+                own,
+            ));
+        }
+        let of_model = origin.model.as_ref().map(Model::n_observations);
+        let of_belief = likelihood.map(|likelihood| likelihood.ncols());
+        Ok(Self {
+            kind: kind.name,
+            n_observations: of_model.or(of_belief).unwrap_or(state_names.len()),
+            state_names,
+            target_state,
+            n_worlds,
+            shape,
+            state: Mutex::new(State { worlds, threads }),
+            origin,
+        })
+    }
+
+    /// Numbers of the belief about a world.
+    fn n_numbers(&self) -> usize {
+        self.state_names.len() * self.shape.n_cells()
+    }
+
+    /// The worlds, for this thread.
+    fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
+        match self.state.try_lock() {
+            Ok(state) => Ok(state),
+            Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
+            Err(TryLockError::WouldBlock) => {
+                let expected = "one for each thread";
+                Err(invalid(py, "belief", expected, "one in use by another"))
+            }
+        }
+    }
+
+    fn check_worlds(&self, py: Python<'_>, what: &str, got: usize) -> PyResult<()> {
+        if got == self.n_worlds {
+            return Ok(());
+        }
+        Err(invalid(
+            py,
+            what,
+            format!("one for each of {} worlds", self.n_worlds),
+            got,
+        ))
+    }
+
+    fn check_dim(&self, py: Python<'_>, what: &str, got: (usize, usize, usize)) -> PyResult<()> {
+        let expected = (self.n_worlds, self.shape.height(), self.shape.width());
+        if got == expected {
+            return Ok(());
+        }
+        Err(invalid(
+            py,
+            what,
+            format!("shape {expected:?}"),
+            format!("{got:?}"),
+        ))
+    }
+
+    /// The frames of the chosen worlds.
+    fn frames(
+        &self,
+        py: Python<'_>,
+        frames: ArrayView3<'_, u8>,
+        chosen: &[bool],
+    ) -> PyResult<Vec<Option<Frame>>> {
+        self.check_dim(py, "frame", frames.dim())?;
+        self.check_worlds(py, "worlds", chosen.len())?;
+        let frames = frames.as_standard_layout();
+        let worlds = frames.outer_iter().zip(chosen);
+        let frame = |(frame, &chosen): (numpy::ndarray::ArrayView2<'_, u8>, &bool)| {
+            let bytes = frame.to_slice().expect("invariant: row-major");
+            let frame = chosen.then(|| Frame::from_bytes(self.shape, self.n_observations, bytes));
+            frame.transpose().map_err(|error| self.no_frame(py, &error))
+        };
+        worlds.map(frame).collect()
+    }
+
+    fn no_frame(&self, py: Python<'_>, error: &FrameError) -> PyErr {
+        let FrameError::Value {
+            index,
+            value,
+            n_observations,
+        } = error
+        else {
+            return refused(py, error);
+        };
+        let subject = format!("frame: cell {}", self.shape.cell(*index));
+        let expected = format!("a value below {n_observations}, or 255");
+        invalid(py, subject, expected, value)
+    }
+}
+
+fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
+    match worlds.first().and_then(|first| first.predict_together()) {
+        Some(together) => together(worlds),
+        None => {
+            threads.each(worlds.iter_mut(), |world| world.predict());
+        }
+    }
+}
+
+/// The error of a belief that did not take a frame.
+pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
+    let is_impossible = matches!(
+        error.downcast_ref::<EstimatorError>(),
+        Some(EstimatorError::ZeroEvidence(_))
+    );
+    let code = if is_impossible {
+        "impossible_frame"
+    } else {
+        "program"
+    };
+    failed(py, &format!("{error:#}"), code)
+}

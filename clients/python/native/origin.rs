@@ -1,0 +1,93 @@
+//! What beliefs of every kind are made from: a model and a first belief, or a checkpoint.
+
+use crate::belief::vanishing;
+use crate::refusal::{invalid, refused};
+use crate::threads::Pool;
+use emberwatch_belief::estimation::belief::{Belief, BeliefError};
+use emberwatch_belief::estimation::estimator::Estimator;
+use emberwatch_learning::beliefs::{
+    AUTOENCODER, BELIEFS, BeliefKind, Conditions, Input, KNOWN, NEURAL, named,
+};
+use emberwatch_learning::learned::Learned;
+use emberwatch_model::{Model, ModelError, Shape};
+use pyo3::prelude::*;
+
+/// What the beliefs are made from.
+pub struct Origin {
+    pub kind: &'static BeliefKind,
+    pub model: Option<Model>,
+    pub prior: Option<Belief>,
+    pub learned: Learned,
+    pub shape: Shape,
+}
+
+/// The name of each kind of belief that frames correct, and what it is.
+#[pyfunction]
+pub fn belief_kinds() -> Vec<(&'static str, &'static str)> {
+    of_frames().map(|kind| (kind.name, kind.about)).collect()
+}
+
+impl Origin {
+    pub fn conditions(&self) -> Conditions<'_> {
+        Conditions {
+            shape: self.shape,
+            model: self.model.as_ref(),
+            prior: self.prior.as_ref(),
+            learned: &self.learned,
+        }
+    }
+
+    /// Beliefs before the first frame.
+    pub fn estimators(
+        &self,
+        threads: &mut Pool,
+        n_worlds: usize,
+    ) -> anyhow::Result<Vec<Box<dyn Estimator>>> {
+        let built = threads.work(self.is_short(n_worlds), |threads| {
+            threads.each(0..n_worlds, |_| (self.kind.build)(&self.conditions()))
+        });
+        built.into_iter().collect()
+    }
+
+    /// Whether a step is too short for other threads: that of the plain filter, and of one world, but for networks, whose
+    /// own threads must be among the pool's.
+    pub fn is_short(&self, n_worlds: usize) -> bool {
+        let is_network = [&NEURAL, &AUTOENCODER].contains(&self.kind);
+        *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
+    }
+}
+
+fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
+    let kinds = BELIEFS.iter().copied();
+    kinds.filter(|kind| kind.input == Input::Frames)
+}
+
+/// The kind of a name, or of a label, among those that know the model or those that were learned.
+pub fn kind_of(py: Python<'_>, name: &str, knows_model: bool) -> PyResult<&'static BeliefKind> {
+    let serves =
+        |kind: &&BeliefKind| kind.input == Input::Frames && kind.knows_model == knows_model;
+    named(name).filter(serves).ok_or_else(|| {
+        let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
+        let expected = format!("one of {}", names.join(", "));
+        invalid(py, "kind", expected, format!("'{name}'"))
+    })
+}
+
+/// The error of a first belief that is none.
+pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
+    match error {
+        BeliefError::Simplex { cell, got } => {
+            let (subject, got) = (format!("prior: cell {cell}"), format!("{got:?}"));
+            invalid(py, subject, "probabilities >= 0 with sum 1", got)
+        }
+        other => refused(py, format!("prior: {other}")),
+    }
+}
+
+/// The error of a model or a checkpoint that gives no belief.
+pub fn unfit(py: Python<'_>, error: &anyhow::Error) -> PyErr {
+    match error.downcast_ref::<ModelError>() {
+        Some(error) => vanishing(py, error),
+        None => refused(py, format!("{error:#}")),
+    }
+}

@@ -1,0 +1,98 @@
+"""How well a belief fits recorded sequences of frames and hidden states."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.belief.estimators import Belief
+from emberwatch.common.arguments import as_array
+from emberwatch.errors import invalid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeliefScores:
+    """Figures of each step: shape (K,), or (K, n_worlds) of a belief about several worlds."""
+
+    #: Mean over all cells of ``-log p`` in nats, with `p` the posterior probability of the cell's
+    #: state: 0 is perfect; infinite where a state was ruled out that is there.
+    log_loss: NDArray[np.float64]
+    #: Mean over all cells of ``(p - 1[state is the target])**2``, with `p` the posterior
+    #: probability of the target state: 0 is perfect, 1 the worst.
+    brier: NDArray[np.float64]
+    #: Share of the cells whose most probable state is the true one, 0 to 1.
+    accuracy: NDArray[np.float64]
+    #: Of the predictor, before the frame: mean over the seen cells of ``-log P(y)`` in nats; NaN in
+    #: steps without a seen cell.
+    predicted_log_loss: NDArray[np.float64]
+    #: Seen cells.
+    n_seen: NDArray[np.int64]
+
+    def mean(self) -> dict[str, Any]:
+        """The mean of each figure over the steps, by name; one for each world if there are several.
+
+        Steps count alike; for `predicted_log_loss`, seen cells do.
+        """
+        figures = ("log_loss", "brier", "accuracy")
+        means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}
+        sums = np.where(self.n_seen > 0, self.predicted_log_loss * self.n_seen, 0.0).sum(axis=0)
+        n_seen = self.n_seen.sum(axis=0)
+        means["predicted_log_loss"] = np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)[()]
+        return means
+
+
+def score(
+    belief: Belief,
+    observations: NDArray[np.uint8],
+    states: NDArray[np.uint8],
+    *,
+    target: int | None = None,
+    keep_correlations: bool = False,
+) -> BeliefScores:
+    """Scores a belief on a recorded sequence, or on one for each of its worlds.
+
+    The belief is reset first. In each step k it is corrected with frame k, its posterior is scored
+    against state k, and it predicts step k + 1. All cells count, seen or not.
+
+    A learned belief numbers its states itself: `log_loss` and `accuracy` mean something only if its
+    state numbers are those of `states`. `brier` compares the belief's own target state with
+    `target`.
+
+    Args:
+        belief: Made by `known` or `load`, for one world, or for as many as there are sequences.
+        observations: Frames, shape (K, H, W), or (K, n_worlds, H, W); 255 where nothing was
+            observed. K is at least 1.
+        states: Hidden states of the same shape.
+        target: The number in `states` of the state that pays most; None: the belief's own.
+        keep_correlations: As of `Belief.reset`: what a belief with `+spatial` learned on earlier
+            sequences stays.
+
+    Raises:
+        InvalidArgumentError: If shapes differ, or a value is no observation or no state of the
+            belief.
+        EmberwatchError: Code ``"impossible_frame"``: the belief rules a frame out.
+    """
+    frames = as_array(observations, "observations", "an array")
+    truths = as_array(states, "states", "an array")
+    if truths.shape != frames.shape:
+        raise invalid("states", f"shape {frames.shape}, that of observations", truths.shape)
+    if frames.ndim not in (3, 4) or not len(frames):
+        raise invalid("observations", "shape (K, H, W) or (K, n_worlds, H, W)", frames.shape)
+    belief.reset(keep_correlations=keep_correlations)
+    rows = list[tuple[Any, ...]]()
+    for frame, truth in zip(frames, truths, strict=True):
+        predicted = belief.score_frames(frame)
+        belief.correct(frame)
+        rows.append((*predicted, *belief.score_states(truth, target=target)))
+        belief.predict()
+    sums, n_seen, losses, briers, accuracies = (
+        np.stack(column) for column in zip(*rows, strict=True)
+    )
+    return BeliefScores(
+        log_loss=losses,
+        brier=briers,
+        accuracy=accuracies,
+        predicted_log_loss=np.where(n_seen > 0, -sums / np.maximum(n_seen, 1.0), np.nan),
+        n_seen=n_seen.astype(np.int64),
+    )

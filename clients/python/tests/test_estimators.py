@@ -1,0 +1,297 @@
+"""Beliefs of every kind: the Rust agent's numbers, many worlds as each alone, and refusals."""
+
+import subprocess
+import textwrap
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import golden_options
+import numpy as np
+import pytest
+from failures import fails, refuses
+from numpy.typing import NDArray
+from processes import find
+
+import emberwatch
+from emberwatch import _native, belief
+from emberwatch.belief import Belief, initial_prior
+from emberwatch.belief.prior import simulated_prior
+from emberwatch.model import Model
+from emberwatch.model.airspace import Airspace
+
+MODEL = Model.named("wildfire-small")
+GRID = {"height": 16, "width": 16}
+PRIOR = simulated_prior(MODEL, **GRID, burn_in=100)
+N_WORLDS = 3
+KNOWN = [name for name in belief.kinds() if name.startswith("known")]
+LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
+
+#: Kinds, and the checkpoints of those that were learned.
+CASES: list[tuple[str, str | None]] = [
+    *((kind, None) for kind in KNOWN),
+    *((kind, "learned_filter") for kind in LEARNED),
+    *((kind, "own_kernels") for kind in LEARNED if "+" not in kind or kind == "learned+spatial"),
+    ("neural", "neural_belief"),
+]
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("checkpoints")
+    golden = np.load(golden_options.FILE)
+    for name in ("learned_filter", "own_kernels", "neural_belief"):
+        (folder / name).write_bytes(golden[f"checkpoint {name}"].tobytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def flown() -> list[tuple[NDArray[np.void], NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Results, frames and hidden states of some worlds: after a reset, and after each step."""
+    rng, moves = np.random.default_rng(7), (N_WORLDS, 16)
+    world = {**GRID, "model": "wildfire-small", "moves": 16, "burn_in": 100}
+    with emberwatch.embed(worlds=N_WORLDS, publish_truth=True, **world) as client:
+        lease = client.acquire(0, N_WORLDS)
+        lease.reset([1000, 1001, 1002])
+        answers = [lease.observe()]
+        truths = [states(client)]
+        for _ in range(12):
+            answers.append(lease.step(rng.integers(0, 4, moves)))
+            truths.append(states(client))
+    return [
+        (it.results.copy(), it.frames.copy(), truth)
+        for it, truth in zip(answers, truths, strict=True)
+    ]
+
+
+def states(client: Any) -> NDArray[np.uint8]:
+    truths = client.truths(range(N_WORLDS))
+    return np.stack([np.asarray(truth["states"]) for truth in truths])
+
+
+def made(kind: str, checkpoint: Path | None, n_worlds: int | None = None) -> Belief:
+    if checkpoint is None:
+        return belief.known(MODEL, prior=PRIOR, kind=kind, n_worlds=n_worlds)
+    return belief.load(checkpoint, **GRID, kind=kind, model=MODEL, n_worlds=n_worlds)
+
+
+def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArray[np.float32]]:
+    """The beliefs before each step of agents whose estimator is of a kind, `(S, n, H, W)`."""
+    spec = types.SimpleNamespace(
+        **GRID,
+        n_moves=16,
+        n_observations=MODEL.n_observations,
+        burn_in=100,
+        model=MODEL,
+        description=None,
+        airspace=Airspace(),
+    )
+    path = None if checkpoint is None else str(checkpoint)
+    options = _native.Options(spec, N_WORLDS, kind, path, "simulated", None)
+    worlds = list(range(N_WORLDS))
+    options.begin(worlds, [1000, 1001, 1002])
+    for results, frames, _ in flown:
+        options.see(worlds, results.view(np.uint8).ravel(), frames)
+        left = [options.left(world) for world in worlds]
+        numbers = [np.frombuffer(data[: 4 * 3 * 256], np.float32) for _, data in left]
+        yield np.stack([it.reshape(3, 16, 16) for it in numbers], axis=1)
+
+
+@pytest.mark.parametrize(("kind", "checkpoint"), CASES)
+def test_beliefs_are_the_agents_to_the_bit(
+    kind: str, checkpoint: str | None, checkpoints: Path, flown: Any
+) -> None:
+    path = checkpoints / checkpoint if checkpoint else None
+    many, alone = made(kind, path, N_WORLDS), [made(kind, path) for _ in range(N_WORLDS)]
+    assert many.kind == kind and len(many.state_names) == 3 and many.target_state == 2
+    for expected, (_, frames, _) in zip(of_agents(kind, path, flown), flown, strict=True):
+        many.correct(frames)
+        for world, single in enumerate(alone):
+            single.correct(frames[world])
+            assert (many.belief[:, world] == single.belief).all()
+            single.predict()
+            # Bit for bit, as the agent's.
+            assert single.belief.tobytes() == expected[:, world].tobytes()
+        many.predict()
+        assert many.belief.tobytes() == expected.tobytes()
+        for world, single in enumerate(alone):
+            assert (many.entropy()[world] == single.entropy()).all()
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_some_worlds_move_and_begin_again(kind: str, flown: Any) -> None:
+    kept, fresh = made(kind, None, N_WORLDS), made(kind, None)
+    first = kept.belief
+    for _, frames, _ in flown[1:4]:
+        kept.correct(frames, [0, 2])
+        kept.predict(np.array([True, False, True]))
+    assert (kept.belief[:, 1] == first[:, 1]).all()
+    assert (kept.belief[:, 0] != first[:, 0]).any()
+    kept.reset([2])
+    assert (kept.belief[:, 2] == first[:, 2]).all() and (kept.belief[:, 0] != first[:, 0]).any()
+    for _, frames, _ in flown[1:5]:  # nothing of the former episode is left
+        kept.correct(frames, 2)
+        fresh.correct(frames[2])
+        assert (kept.belief[:, 2] == fresh.belief).all()
+        kept.predict(slice(2, 3))
+        fresh.predict()
+    kept.reset()
+    assert (kept.belief == first).all()
+
+
+def test_spatial_beliefs_learn_while_they_run(flown: Any) -> None:
+    """A frame corrects neighbours of seen cells once frames have shown how cells vary together."""
+    kept, changed = made("known+spatial", None), list[bool]()
+    for _, frames, _ in flown:
+        unseen, before = frames[0] == 255, kept.belief
+        kept.correct(frames[0])
+        changed.append(bool((kept.belief != before)[:, unseen].any()))
+        kept.predict()
+    assert not changed[0] and changed[-1]
+    kept.reset()
+    assert (kept.belief == PRIOR).all()
+
+
+def test_a_learned_belief_is_the_one_of_its_checkpoint(checkpoints: Path) -> None:
+    expected = {"learned_filter": "learned", "own_kernels": "learned", "neural_belief": "neural"}
+    for name, kind in expected.items():
+        found = belief.load(checkpoints / name, height=5, width=9)
+        assert found.kind == kind and found.belief.shape == (3, 5, 9)
+        assert found.belief.dtype == np.float32
+        with refuses("frame: cell .0, 2.: expected a value below 3, or 255, got 3"):
+            found.correct(np.full((5, 9), 255, np.uint8) - 252 * np.eye(5, 9, 2, dtype=np.uint8))
+
+
+@pytest.mark.parametrize("n_worlds", [None, N_WORLDS])
+def test_scores_follow_their_definition(n_worlds: int | None, flown: Any) -> None:
+    frames, truths = (np.stack(column) for column in list(zip(*flown, strict=True))[1:])
+    if n_worlds is None:
+        frames, truths = frames[:, 0], truths[:, 0]
+    kept, again = (made("known", None, n_worlds) for _ in range(2))
+    scores = belief.score(kept, frames, truths)
+    matrix = MODEL.observation_matrix
+    for k, (frame, truth) in enumerate(zip(frames, truths, strict=True)):
+        seen = frame != 255
+        shown = np.tensordot(matrix.T, again.belief.astype(np.float64), axes=1)
+        evidence = np.take_along_axis(shown, np.where(seen, frame, 0)[np.newaxis], 0)[0]
+        again.correct(frame)
+        posterior = again.belief.astype(np.float64)
+        true = np.take_along_axis(posterior, truth[np.newaxis], 0)[0]
+        axes = (-2, -1)
+        np.testing.assert_allclose(scores.log_loss[k], -np.log(true).mean(axis=axes), rtol=1e-9)
+        squares = (posterior[2] - (truth == 2)) ** 2
+        np.testing.assert_allclose(scores.brier[k], squares.mean(axis=axes), rtol=1e-9)
+        right = (posterior.argmax(axis=0) == truth).mean(axis=axes)
+        np.testing.assert_allclose(scores.accuracy[k], right)
+        assert (scores.n_seen[k] == seen.sum(axis=axes)).all()
+        with np.errstate(invalid="ignore"):
+            loss = -np.where(seen, np.log(evidence), 0).sum(axis=axes) / seen.sum(axis=axes)
+        np.testing.assert_allclose(scores.predicted_log_loss[k], loss, rtol=1e-5)
+        again.predict()
+    means = scores.mean()
+    assert np.shape(means["log_loss"]) == (() if n_worlds is None else (N_WORLDS,))
+    assert 0 < np.mean(means["brier"]) < 0.25 and 0.5 < np.mean(means["accuracy"]) <= 1
+    assert np.isfinite(means["predicted_log_loss"]).all()
+    repeated = belief.score(kept, frames, truths)
+    assert (repeated.log_loss == scores.log_loss).all(), "it begins again"
+
+
+def test_certainty_that_is_wrong_costs_infinitely_much() -> None:
+    prior = np.zeros((3, 1, 2))
+    prior[0] = 1
+    kept = belief.known(MODEL, prior=prior)
+    nothing = np.full((1, 1, 2), 255, np.uint8)
+    scores = belief.score(kept, nothing, np.array([[[0, 2]]], np.uint8))
+    assert scores.log_loss.tolist() == [np.inf] and scores.accuracy.tolist() == [0.5]
+    assert scores.brier.tolist() == [0.5] and np.isnan(scores.predicted_log_loss).all()
+    assert np.isnan(scores.mean()["predicted_log_loss"])
+    assert belief.score(kept, nothing, np.array([[[0, 2]]], np.uint8), target=0).brier[0] == 0.5
+
+
+def test_arguments_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Path) -> None:
+    frame = np.full((16, 16), 255, np.uint8)
+    kept, many = made("known", None), made("known", None, N_WORLDS)
+    with refuses(f"kind: expected one of {', '.join(KNOWN)}, got 'learned'".replace("+", r"\+")):
+        made("learned", None)
+    with refuses("kind: expected one of learned, .*, got 'known'"):
+        made("known", checkpoints / "learned_filter")
+    with refuses("n_worlds: expected an integer within 1 to"):
+        made("known", None, 0)
+    with refuses(r"frame: expected shape \(3, 16, 16\) and type uint8, got \(16, 16\)"):
+        many.correct(frame)
+    for worlds in (3, [0, 3], [True, False], [0.5]):
+        with refuses("worlds: expected a mask or indices of 3 worlds"):
+            many.predict(worlds)
+    with refuses("states: expected values below 3, got 255"):
+        kept.score_states(frame)
+    with refuses("states: expected shape .*, that of observations"):
+        belief.score(kept, frame[np.newaxis], frame)
+    with refuses("observations: expected shape"):
+        belief.score(kept, frame, frame)
+    # No checkpoint, one of another kind, and one that fits other worlds.
+    (tmp_path / "text").write_text("no checkpoint")
+    with refuses("checkpoint .*text: expected a whole safetensors file"):
+        belief.load(tmp_path / "text", **GRID)
+    with refuses("checkpoint .*missing: No such file"):
+        belief.load(tmp_path / "missing", **GRID)
+    with refuses("checkpoint.*of `train --learner neural`, got none|expected one of a neural"):
+        belief.load(checkpoints / "learned_filter", **GRID, kind="neural")
+    two = Model.from_toml(MODEL.toml + "[sensor]\nradius = 1\n")
+    assert belief.load(checkpoints / "learned_filter", **GRID, model=two).kind == "learned"
+
+
+def test_an_impossible_frame_names_its_world() -> None:
+    prior = np.zeros((3, 1, 2))
+    prior[0] = 1
+    text = MODEL.toml.replace(str(MODEL.observation_matrix[0].tolist()), "[1.0, 0.0, 0.0]", 1)
+    sharp = Model.from_toml(text)
+    assert sharp.observation_matrix[0].tolist() == [1, 0, 0]
+    many = belief.known(sharp, prior=prior, n_worlds=2)
+    with fails("impossible_frame", match=r"world 1: frame: cell \(0, 1\): .* allows, got 2"):
+        many.correct(np.array([[[0, 255]], [[255, 2]]], np.uint8))
+    one = belief.known(sharp, prior=prior)
+    with fails("impossible_frame", match=r"^frame: cell \(0, 1\)"):
+        one.correct(np.array([[255, 2]], np.uint8))
+    assert (one.belief == prior).all()
+
+
+def test_an_autoencoder_knows_one_grid(tmp_path: Path) -> None:
+    settings = tmp_path / "agent.toml"
+    settings.write_text("[autoencoder]\nwindow = 2\n")
+    command = [find("emberwatch-agent"), "train", "--learner=autoencoder", "--height=8"]
+    command += ["--width=8", "--steps=6", "--moves=4", f"--out={tmp_path / 'out'}"]
+    command += [f"--config={settings}"]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    checkpoint = tmp_path / "out" / "checkpoint.safetensors"
+    kept = belief.load(checkpoint, height=8, width=8)
+    assert kept.kind == "autoencoder"
+    kept.correct(np.full((8, 8), 2, np.uint8))
+    kept.predict()
+    assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4)
+    for model in (None, MODEL):
+        with refuses("checkpoint: expected .*16 x 16"):
+            belief.load(checkpoint, **GRID, model=model)
+
+
+def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
+    section = page.split("## Beliefs\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("    ") or not line]
+    exec(compile(textwrap.dedent("\n".join(lines)), "README.md", "exec"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in printed] == ["known", "known+spatial"]
+
+
+@pytest.mark.parametrize("name", sorted(_native.built_in("models")))
+def test_every_kind_takes_every_built_in_model(name: str) -> None:
+    model = Model.named(name)
+    height, width = (
+        (64, 64) if model.zones is not None or model.airspace.no_fly is not None else (5, 4)
+    )
+    prior = initial_prior(model, height=height, width=width)
+    for kind in KNOWN:
+        kept = belief.known(model, prior=prior, kind=kind)
+        kept.correct(np.zeros((height, width), np.uint8))
+        kept.predict()
+        assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4), kind
