@@ -54,6 +54,11 @@ EXAMPLES = [
         r"ppo_marginal: \d\S* \+- \S+ a step on 8 worlds\nvisited twice: \d",
     ),
     ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
+    (
+        "filter_benchmark.py",
+        "--simulate 2",
+        r"seen: window\n(.*\n)*\| known\+spatial\+cavities \| 0\.\d+ \| 0\.\d+ \| -0\.\d+ ±",
+    ),
     ("swap.py", "--steps 50", r"Python takes over\n(.*\n)*.*code 3 .*\n.*second Rust agent flew"),
     ("live_plot.py", "--start --instance plot --frames 60 --out OUT/plot.png", ""),
 ]

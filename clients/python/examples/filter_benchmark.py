@@ -1,0 +1,201 @@
+"""Filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
+
+    python filter_benchmark.py                          # on fires that are simulated here
+    python filter_benchmark.py --fires fires-all.npz    # on recorded ones
+
+25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with 1 - (1 - a)**f, where f of
+its four neighbours burn and a rises from .1 in the first column to .4 in the last; a burning one
+burns out with 1 - exp(-1/10). At first 4 x 4 trees in the middle burn, which every filter knows. A
+tree that is seen shows its state with .9, and each other with .05. The table has, over all steps
+but the first:
+
+- accuracy: the share of the trees whose most probable state is the true one, its median over steps,
+  as in the paper; the mean over fires;
+- NLL: the mean of -log p of the true state, which also tells how sure a filter is;
+- difference: NLL without that of the first filter, paired by fire, with its standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch import belief
+from emberwatch.model import Model
+
+SIDE = 25
+HEALTHY, BURNING, BURNT = range(3)
+RATES = np.linspace(0.1, 0.4, SIDE)  # of ignition, by column
+BURNS_ON = float(np.exp(-0.1))
+Fire = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # states and frames, both [K, 25, 25]
+
+
+def model() -> Model:
+    """The fire as a model file.
+
+    Weights give P(ignite) = f / (A f + B), which is exact for f = 1 and f = 4 and off by .015 at
+    most between. Trees beyond the edge are healthy. Each column is a zone, as its rate differs.
+    """
+    zones, kernels = [], []
+    for column, rate in enumerate(RATES.tolist()):
+        one, four = rate, 1.0 - (1.0 - rate) ** 4
+        slope = (4.0 / four - 1.0 / one) / 3.0
+        rest = 1.0 / one - slope - 4.0 * (1.0 - slope)
+        zones.append(f'[[zones]]\nname = "{column}"\ncolor = "#b7a57a"\n')
+        for own, start, to, near, centre in [
+            ("healthy", "burning", "burning", 1.0, 0.0),
+            ("healthy", "healthy", "healthy", 1.0 - slope, rest),
+            ("healthy", "burnt", "healthy", 1.0 - slope, 0.0),
+            ("burning", "burning", "burning", 0.0, BURNS_ON),
+            ("burning", "burning", "burnt", 0.0, 1.0 - BURNS_ON),
+            ("burnt", "burnt", "burnt", 0.0, 1.0),
+        ]:
+            weights = [[0.0, near, 0.0], [near, centre, near], [0.0, near, 0.0]]
+            kernels.append(
+                f'[[kernel]]\nzone = "{column}"\nown = "{own}"\nfrom = "{start}"\nto = "{to}"\n'
+                f"weights = {weights}\n"
+            )
+    states = [
+        ("healthy", "#2e8b57", 609 / 625, [0.9, 0.05, 0.05]),
+        ("burning", "#c8371b", 16 / 625, [0.05, 0.9, 0.05]),
+        ("burnt", "#4a4a4a", 0.0, [0.05, 0.05, 0.9]),
+    ]
+    tables = [
+        f'[[states]]\nname = "{name}"\ncolor = "{color}"\ninitial = {initial}\n'
+        f"reward = {float(name == 'burning')}\nobserved_as = {seen}\n"
+        f'[[observations]]\nname = "{name}"\ncolor = "{color}"\n'
+        for name, color, initial, seen in states
+    ]
+    zone_map = [list(range(SIDE))] * SIDE
+    top = f'name = "forest"\nkernel_size = [3, 3]\nedge = "healthy"\nzone_map = {zone_map}\n'
+    return Model.from_toml("\n".join([top, *tables, *zones, *kernels]))
+
+
+def burn(random: np.random.Generator) -> NDArray[np.uint8]:
+    """The states of one fire until nothing burns."""
+    state = np.zeros((SIDE, SIDE), np.uint8)
+    state[11:15, 11:15] = BURNING
+    states = [state]
+    while (state == BURNING).any():
+        burning = np.pad(state == BURNING, 1).astype(int)
+        near = burning[:-2, 1:-1] + burning[2:, 1:-1] + burning[1:-1, :-2] + burning[1:-1, 2:]
+        ignites = random.random(state.shape) < 1.0 - (1.0 - RATES) ** near
+        burns_out = random.random(state.shape) > BURNS_ON
+        next_state = state.copy()
+        next_state[(state == HEALTHY) & ignites] = BURNING
+        next_state[(state == BURNING) & burns_out] = BURNT
+        states.append(state := next_state)
+    return np.stack(states)
+
+
+def observe(
+    states: NDArray[np.uint8], seen: NDArray[np.bool_], random: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Frames of the trees that are seen."""
+    shown = (states + random.choice(3, states.shape, p=[0.9, 0.05, 0.05])) % 3
+    return np.where(seen, shown, 255).astype(np.uint8)
+
+
+def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
+    """What a camera sees of 9 x 9 trees that flies to one point of the forest after another."""
+    seen = np.zeros((steps, SIDE, SIDE), bool)
+    at, goal = np.array([12, 12]), np.array([12, 12])
+    for step in range(steps):
+        while (at == goal).all():
+            goal = random.integers(4, SIDE - 4, 2)
+        at = at + np.sign(goal - at)
+        seen[step, at[0] - 4 : at[0] + 5, at[1] - 4 : at[1] + 5] = True
+    return seen
+
+
+def simulated(which: str, n_fires: int, seed: int) -> Iterator[Fire]:
+    """Fires with their frames: `which` is "all", "tenth" or "window"."""
+    for fire in range(n_fires):
+        random = np.random.default_rng([seed, fire])
+        states = burn(random)
+        seen = np.ones(states.shape, bool)
+        if which == "tenth":
+            seen = random.random(states.shape) < 0.1
+        elif which == "window":
+            seen = window(len(states), random)
+        yield states, observe(states, seen, random)
+
+
+def recorded(path: Path) -> Iterator[Fire]:
+    """Fires of an .npz file with `states_N` and `frames_N` for each fire N."""
+    with np.load(path) as arrays:
+        for name in sorted(name for name in arrays.files if name.startswith("states_")):
+            yield arrays[name], arrays[name.replace("states_", "frames_")]
+
+
+def score(fires: list[Fire], kinds: list[str]) -> None:
+    """Prints the table of some kinds of belief."""
+    forest = model()
+    losses: dict[str, NDArray[np.float64]] = {}
+    print("| filter | accuracy | NLL | difference | us a step |\n|---|--:|--:|--:|--:|")
+    for kind in kinds:
+        accuracy, loss, micros = np.array(figures(forest, fires, kind)).T
+        losses[kind] = loss
+        by = loss - losses[kinds[0]]
+        error = by.std(ddof=1) / np.sqrt(len(by)) if len(by) > 1 else np.nan
+        print(
+            f"| {kind} | {accuracy.mean():.4f} | {loss.mean():.4f} "
+            f"| {by.mean():+.4f} ± {error:.4f} | {micros.mean():.0f} |"
+        )
+
+
+def figures(forest: Model, fires: list[Fire], kind: str) -> list[tuple[float, float, float]]:
+    """Accuracy, NLL and microseconds of a step, of each fire.
+
+    All fires begin alike. A spatial filter has learned how cells vary together from all of them
+    before: they are filtered twice, and the second time counts.
+    """
+    exact = np.eye(3)[fires[0][0][0]].transpose(2, 0, 1)
+    it = belief.known(forest, prior=exact, kind=kind)
+    for _, frames in fires if "spatial" in kind else ():
+        it.reset(keep_correlations=True)
+        run(it, frames)
+    found = []
+    for states, frames in fires:
+        scores = belief.score(it, frames, states, keep_correlations=True)
+        it.reset(keep_correlations=True)
+        start = time.perf_counter()
+        run(it, frames)
+        micros = 1e6 * (time.perf_counter() - start) / len(frames)
+        found.append((np.median(scores.accuracy[1:]), scores.log_loss[1:].mean(), micros))
+    return found
+
+
+def run(it: belief.Belief, frames: NDArray[np.uint8]) -> None:
+    """Filters one fire."""
+    for frame in frames:
+        it.correct(frame)
+        it.predict()
+
+
+def main() -> None:
+    """Scores filters of the known model on simulated or recorded fires."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fires", type=Path, action="append", help="file of fires (.npz)")
+    parser.add_argument("--simulate", type=int, default=12, metavar="N", help="number of fires")
+    parser.add_argument("--seed", type=int, default=0, help="of the simulated fires")
+    kinds = [kind for kind in belief.kinds() if kind.startswith("known")]
+    parser.add_argument("--kinds", default=",".join(kinds), help="kinds of belief")
+    args = parser.parse_args()
+    for path in args.fires or []:
+        print(f"\n{path.name}\n")
+        score(list(recorded(path)), args.kinds.split(","))
+    for which in ("all", "tenth", "window") if args.fires is None else ():
+        print(f"\n{args.simulate} simulated fires, seen: {which}\n")
+        score(list(simulated(which, args.simulate, args.seed)), args.kinds.split(","))
+
+
+if __name__ == "__main__":
+    main()

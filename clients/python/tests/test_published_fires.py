@@ -1,0 +1,40 @@
+"""Filters on twelve fires of a published benchmark (docs/filters.md)."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FIRES = Path(__file__).parent / "data" / "fires"
+BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "filter_benchmark.py"))
+
+#: NLL of each kind, where trees are seen: all, a tenth of them, a window. Measured, and .002 more.
+BOUNDS = {
+    "known": (0.026, 0.3065, 0.4435),
+    "known+second-order": (0.026, 0.2625, 0.3855),
+    "known+cavities": (0.026, 0.2320, 0.3485),
+    "known+spatial+cavities": (0.0275, 0.1910, 0.3420),
+}
+
+
+@pytest.mark.parametrize(("at", "which"), list(enumerate(["all", "tenth", "window"])))
+def test_each_cure_takes_off_what_it_did(at: int, which: str) -> None:
+    fires = list(BENCHMARK["recorded"](FIRES / f"fires-{which}.npz"))
+    assert len(fires) == 12
+    for kind, bounds in BOUNDS.items():
+        figures = BENCHMARK["figures"](BENCHMARK["model"](), fires, kind)
+        loss = np.mean([loss for _, loss, _ in figures])
+        assert bounds[at] - 0.004 < loss < bounds[at], f"{kind}: {loss}"
+
+
+def test_simulated_fires_are_like_the_published_ones() -> None:
+    own = [states for states, _ in BENCHMARK["simulated"]("all", 12, 0)]
+    published = [s for s, _ in BENCHMARK["recorded"](FIRES / "fires-all.npz")]
+    assert np.array_equal(own[0][0], published[0][0])
+    for of in (len, lambda states: (states[-1] == BENCHMARK["BURNT"]).sum()):
+        a, b = (np.array([of(states) for states in fires], float) for fires in (own, published))
+        error = np.sqrt(a.var(ddof=1) / 12 + b.var(ddof=1) / 12)
+        assert abs(a.mean() - b.mean()) < 4 * error + 1
