@@ -305,19 +305,13 @@ impl Estimators {
         )?;
         let worlds = py.detach(|| origin.estimators(&mut threads, n_worlds));
         let worlds = worlds.map_err(|error| unfit(py, &error))?;
-        let first = worlds
-            .first()
-            .map(|world| (world.belief().shape(), world.likelihood()));
-        let (own, likelihood) = first.unwrap_or((shape, None));
-        if own != shape {
-            return Err(invalid(
-                py,
-                "checkpoint",
-                format!("a belief on {shape}"),
-                own,
-            ));
+        let mut shapes = worlds.iter().map(|world| world.belief().shape());
+        if let Some(own) = shapes.find(|own| *own != shape) {
+            let expected = format!("a belief on {shape}");
+            return Err(invalid(py, "checkpoint", expected, own));
         }
         let of_model = origin.model.as_ref().map(Model::n_observations);
+        let likelihood = worlds.first().and_then(|world| world.likelihood());
         let of_belief = likelihood.map(|likelihood| likelihood.ncols());
         Ok(Self {
             kind: kind.name,

@@ -237,8 +237,11 @@ def test_arguments_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Path
         belief.load(tmp_path / "missing", **GRID)
     with refuses("checkpoint.*of `train --learner neural`, got none|expected one of a neural"):
         belief.load(checkpoints / "learned_filter", **GRID, kind="neural")
-    two = Model.from_toml(MODEL.toml + "[sensor]\nradius = 1\n")
-    assert belief.load(checkpoints / "learned_filter", **GRID, model=two).kind == "learned"
+    rings = "[{ observed_as = [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]] }]"
+    ringed = Model.from_toml(f"{MODEL.toml}\n[sensor]\nradius = 1\nrings = {rings}\n")
+    for name in ("learned_filter", "neural_belief"):
+        with refuses("checkpoint: expected 6 observations as the world's, got 3"):
+            belief.load(checkpoints / name, **GRID, model=ringed)
 
 
 def test_an_impossible_frame_names_its_world() -> None:
