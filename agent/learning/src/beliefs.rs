@@ -18,7 +18,7 @@ pub use self::known::{
     KNOWN, KNOWN_CAVITIES, KNOWN_SECOND_ORDER, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES,
 };
 pub use self::learned::{LEARNED, LEARNED_CAVITIES, LEARNED_SPATIAL, LEARNED_SPATIAL_CAVITIES};
-pub use self::neural::NEURAL;
+pub use self::neural::{NEURAL, NEURAL_SENSOR};
 pub use self::truth::{NEXT_TRUTH, NONE, TRUTH};
 pub use self::world_form::WorldForm;
 
@@ -35,6 +35,7 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &LEARNED_CAVITIES,
     &LEARNED_SPATIAL_CAVITIES,
     &NEURAL,
+    &NEURAL_SENSOR,
     &AUTOENCODER,
     &TRUTH,
     &NEXT_TRUTH,
@@ -46,13 +47,16 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
     kinds.find(|kind| kind.name == name || kind.label == name)
 }
 
-/// As [`named`], of those on which options can be learned: frames change them, and no network decides on their hidden
-/// vector.
+/// As [`named`], of those on which options can be learned: frames change them, they know a model or were learned, not both,
+/// and no network decides on their hidden vector.
 ///
 /// # Errors
 /// Names them all.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
-    let serves = |kind: &&BeliefKind| kind.input == Input::Frames && !kind.decides();
+    let serves = |kind: &&BeliefKind| {
+        let is_of_one_source = !kind.knows_model || kind.learned_by.is_none();
+        kind.input == Input::Frames && is_of_one_source && !kind.decides()
+    };
     named(name).filter(serves).ok_or_else(|| {
         let kinds = BELIEFS.iter().copied().filter(serves);
         let names: Vec<&str> = kinds.map(|kind| kind.label).collect();

@@ -69,7 +69,7 @@ impl Estimators {
         kind: &str,
         n_worlds: usize,
     ) -> PyResult<Self> {
-        let kind = kind_of(py, kind, true)?;
+        let kind = kind_of(py, kind, false)?;
         let (model, prior) = (model_of(model)?, prior.as_array());
         let (n_states, height, width) = prior.dim();
         if n_states != model.n_states() {
@@ -100,12 +100,12 @@ impl Estimators {
         n_worlds: usize,
     ) -> PyResult<Self> {
         let shape = shape_of(py, grid.0, grid.1)?;
-        let kind = kind.map(|name| kind_of(py, name, false)).transpose()?;
+        let kind = kind.map(|name| kind_of(py, name, true)).transpose()?;
         let model = model.map(model_of).transpose()?;
         let learned = py.detach(|| learners::read([&*checkpoint], &Device::Cpu));
         let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
         let kind = kind.unwrap_or_else(|| usual(&learned));
-        if kind.knows_model {
+        if kind.learned_by.is_none() {
             let got = format!("one on the belief '{}': use known(model)", kind.name);
             return Err(invalid(py, "checkpoint", "a learned belief", got));
         }

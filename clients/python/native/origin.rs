@@ -6,7 +6,7 @@ use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
 use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::beliefs::{
-    AUTOENCODER, BELIEFS, BeliefKind, Conditions, Input, KNOWN, NEURAL, named,
+    AUTOENCODER, BELIEFS, BeliefKind, Conditions, Input, KNOWN, NEURAL, NEURAL_SENSOR, named,
 };
 use emberwatch_learning::learned::Learned;
 use emberwatch_model::{Model, ModelError, Shape};
@@ -52,7 +52,7 @@ impl Origin {
     /// Whether a step is too short for other threads: that of the plain filter, and of one world, but for networks, whose
     /// own threads must be among the pool's.
     pub fn is_short(&self, n_worlds: usize) -> bool {
-        let is_network = [&NEURAL, &AUTOENCODER].contains(&self.kind);
+        let is_network = [&NEURAL, &NEURAL_SENSOR, &AUTOENCODER].contains(&self.kind);
         *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
     }
 }
@@ -62,10 +62,10 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
     kinds.filter(|kind| kind.input == Input::Frames)
 }
 
-/// The kind of a name, or of a label, among those that know the model or those that were learned.
-pub fn kind_of(py: Python<'_>, name: &str, knows_model: bool) -> PyResult<&'static BeliefKind> {
+/// The kind of a name, or of a label, among those that were learned or the others.
+pub fn kind_of(py: Python<'_>, name: &str, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
-        |kind: &&BeliefKind| kind.input == Input::Frames && kind.knows_model == knows_model;
+        |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
     named(name).filter(serves).ok_or_else(|| {
         let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
         let expected = format!("one of {}", names.join(", "));

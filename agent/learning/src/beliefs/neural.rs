@@ -1,14 +1,15 @@
 //! The neural belief as an estimator: what each cell showed and when, and what a network makes of it, alone or as a
 //! correction of a filter's belief.
 //!
-//! The belief is about observations, S = O: after a frame, visited cells are what they showed.
+//! The belief is about observations, S = O: after a frame, visited cells are what they showed. With a known sensor it is
+//! about states: what a cell will show is traced back to what it is, and a frame corrects that by Bayes' rule (eq. 5).
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::{LearnedModel, SavedModel, check_target};
 use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check};
 use crate::parallel::in_parallel;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::{correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
@@ -16,7 +17,7 @@ use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, MAX_VALUES, Shape};
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
-use ndarray::Array2;
+use ndarray::{Array2, Axis, s};
 use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::borrow::Cow;
@@ -44,6 +45,24 @@ pub const NEURAL: BeliefKind = BeliefKind {
         Ok(Box::new(estimator.context("checkpoint")?))
     },
 };
+
+pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
+    name: "neural+sensor",
+    label: "neural_sensor_belief",
+    about: "the same about states, with the true model's observation matrix",
+    knows_model: true,
+    build: |conditions| {
+        let model = conditions.learned.get::<NeuralModel>();
+        let model = model.context("checkpoint: expected one of a neural belief, got none")?;
+        let estimator = model.estimator(conditions.shape).context("checkpoint")?;
+        let likelihood = conditions.model()?.likelihood().clone();
+        Ok(Box::new(estimator.seen_through(likelihood)?))
+    },
+    ..NEURAL
+};
+
+/// What is traced back to a state is at least this.
+const LEAST: f64 = 1e-6;
 
 /// A neural belief that was learned: all that acting on it needs.
 #[derive(Debug, Clone)]
@@ -173,8 +192,10 @@ pub struct NeuralEstimator {
     sightings: Sightings,
     /// What frames of the present step will show; after a frame, what it showed at visited cells.
     belief: Belief,
-    /// `P(y | x)`: a cell shows what it is believed to show.
+    /// `P(y | x)`: a cell shows what it is believed to show, or what a known sensor makes of its state.
     likelihood: Array2<f64>,
+    /// The inverse of that, if the sensor is known.
+    from_shown: Option<Array2<f64>>,
     /// Why the last prediction failed, if it did.
     failure: Option<NetworkError>,
 }
@@ -195,8 +216,37 @@ impl NeuralEstimator {
             base,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
+            from_shown: None,
             failure: None,
         })
+    }
+
+    /// The same about states, which a sensor shows with `P(y | x)`, shape `[S, S]`.
+    ///
+    /// # Errors
+    /// If the matrix has another shape, or no inverse.
+    pub fn seen_through(mut self, likelihood: Array2<f64>) -> Result<Self> {
+        let (expected, got) = (self.likelihood.dim(), likelihood.dim());
+        ensure!(
+            expected == got,
+            "the sensor: expected as many observations as states, {}, got a matrix {got:?}",
+            expected.0
+        );
+        let inverse = inverse(&likelihood);
+        let inverse = inverse
+            .context("the sensor: expected states that look different, got some that look alike")?;
+        self.likelihood = likelihood;
+        self.from_shown = Some(inverse);
+        self.predicted(self.belief.probabilities().clone());
+        Ok(self)
+    }
+
+    /// Takes the distribution of what each cell will show, `[O, H, W]`.
+    fn predicted(&mut self, mut shown: Probabilities) {
+        if let Some(inverse) = &self.from_shown {
+            trace_back(&mut shown, inverse);
+        }
+        self.belief = belief(shown);
     }
 }
 
@@ -252,7 +302,16 @@ impl Handover for NeuralEstimator {
         let checksum = crc32fast::hash(&bytes);
         let filter = self.filter.as_ref().and_then(|it| it.handover());
         let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
-        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
+        let sensor = if self.from_shown.is_some() {
+            let numbers = self.likelihood.iter().flat_map(|p| p.to_le_bytes());
+            let checksum = crc32fast::hash(&numbers.collect::<Vec<u8>>());
+            format!(" through {checksum:08x}")
+        } else {
+            String::new()
+        };
+        format!(
+            "neural_belief {checksum:08x}{sensor}, probabilities [O, H, W] as f32, sightings{filter}"
+        )
     }
 
     fn to_bytes(&self) -> Vec<u8> {
@@ -328,7 +387,7 @@ impl NeuralEstimator {
         match predicted {
             Ok(predicted) => {
                 for (estimator, probabilities) in all.iter_mut().zip(predicted) {
-                    estimator.belief = belief(probabilities);
+                    estimator.predicted(probabilities);
                 }
             }
             Err(failure) => {
@@ -338,6 +397,45 @@ impl NeuralEstimator {
             }
         }
     }
+}
+
+/// Turns the distribution of what each cell shows into that of what it is, by the inverse of `P(y | x)`. No state is ruled
+/// out, as what a network predicts is no exact mixture of what states show.
+fn trace_back(shown: &mut Probabilities, inverse: &Array2<f64>) {
+    let (n, height, width) = shown.dim();
+    let mut states = vec![0.0; n];
+    for (row, col) in (0..height * width).map(|cell| (cell / width, cell % width)) {
+        for (state, p) in states.iter_mut().enumerate() {
+            let parts =
+                (0..n).map(|seen| f64::from(shown[[seen, row, col]]) * inverse[[seen, state]]);
+            *p = parts.sum::<f64>().max(LEAST);
+        }
+        let total: f64 = states.iter().sum();
+        for (state, p) in states.iter().enumerate() {
+            shown[[state, row, col]] = (p / total) as f32;
+        }
+    }
+}
+
+/// The inverse of a square matrix, by Gauss and Jordan's elimination with pivots; `None` if it has none.
+fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
+    let n = matrix.nrows();
+    let mut both = ndarray::concatenate![Axis(1), *matrix, Array2::<f64>::eye(n)];
+    for col in 0..n {
+        let size = |row: &usize| both[[*row, col]].abs();
+        let pivot = (col..n).max_by(|a, b| size(a).total_cmp(&size(b)))?;
+        if size(&pivot) < 1e-9 {
+            return None;
+        }
+        (0..2 * n).for_each(|at| both.swap([col, at], [pivot, at]));
+        let own = &both.row(col) / both[[col, col]];
+        for row in 0..n {
+            let factor = if row == col { 0.0 } else { both[[row, col]] };
+            both.row_mut(row).scaled_add(-factor, &own);
+        }
+        both.row_mut(col).assign(&own);
+    }
+    Some(both.slice(s![.., n..]).to_owned())
 }
 
 fn belief(probabilities: Probabilities) -> Belief {
@@ -388,6 +486,26 @@ mod tests {
             (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
             "nothing is learned"
         );
+    }
+
+    #[test]
+    fn a_known_sensor_makes_it_the_filter_that_an_unlearned_network_leaves_alone() {
+        let model = emberwatch_model::Model::wildfire();
+        let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
+        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+        let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
+            .expect("a belief")
+            .seen_through(model.likelihood().clone())
+            .expect("an inverse");
+        let mut expected = filter();
+        for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
+            own.correct(&frame(&values)).expect("possible");
+            expected.correct(&frame(&values)).expect("possible");
+            let off = (&own.belief().view() - &expected.belief().view()).mapv(f32::abs);
+            assert!(off.iter().all(|off| *off < 1e-4), "{off}");
+            own.predict();
+            expected.predict();
+        }
     }
 
     #[test]

@@ -73,7 +73,8 @@ def load(
     """A belief that was learned, from a checkpoint of `emberwatch-agent train`.
 
     Its states are those that its learner found: `Belief.state_names` has numbers, and
-    `Belief.target_state` is the one that pays most. A neural belief is about what cells show.
+    `Belief.target_state` is the one that pays most. A neural belief is about what cells show;
+    ``"neural+sensor"`` traces that back to states with the observation matrix of `model`.
 
     Args:
         checkpoint: The file. Filters and neural beliefs fit any grid; an autoencoder its own.
@@ -82,7 +83,7 @@ def load(
         kind: One of `kinds` that was learned, such as ``"learned+spatial"``; None: the belief that
             the checkpoint is about.
         model: The model of the worlds, if the checkpoint should be checked against it: number of
-            observed values and of observation matrices.
+            observed values and of observation matrices. Needed by ``"neural+sensor"``.
         n_worlds: Number of worlds, at least 1; None: a single one, without an axis for worlds.
 
     Raises:
