@@ -93,6 +93,10 @@ impl BayesFilter {
         if let Some(prediction) = &mut self.prediction {
             let before = self.predictor.as_slice().expect("invariant: row-major");
             prediction.correct(before, self.belief.as_slice());
+            if prediction.has_cavities() {
+                // What a further correction of the same step begins with.
+                self.predictor.assign(self.belief.probabilities());
+            }
         }
     }
 
@@ -234,6 +238,32 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 mod tests {
     use super::*;
     use emberwatch_model::grid::Shape;
+
+    #[test]
+    fn two_parts_of_a_frame_correct_as_the_whole() {
+        let shape = Shape::new(3, 4).expect("test shape");
+        let model = Model::built_in("wildfire-burnout").expect("built in");
+        let filter = || {
+            let prior = Belief::uniform(model.n_states(), shape);
+            let filter = BayesFilter::known(&model, prior).expect("valid model");
+            filter.predicting_known(&model, PredictionKind::Cavities)
+        };
+        let (mut whole, mut parts) = (filter(), filter());
+        let mut values = [255; 12];
+        (values[1], values[6]) = (1, 2);
+        for _ in 0..3 {
+            whole.correct(&frame(shape, &values)).expect("possible");
+            for cell in [1, 6] {
+                let mut part = [255; 12];
+                part[cell] = values[cell];
+                parts.correct(&frame(shape, &part)).expect("possible");
+            }
+            whole.predict();
+            parts.predict();
+        }
+        let off = (&whole.belief().view() - &parts.belief().view()).mapv(f32::abs);
+        assert!(off.iter().all(|off| *off < 1e-5), "{off}");
+    }
 
     fn frame(shape: Shape, values: &[u8]) -> Frame {
         Frame::from_bytes(shape, 3, values).expect("test frame")

@@ -29,8 +29,8 @@ use emberwatch_model::vectors::vectorised;
 use lanes::{LANES, Lanes, Planes, add_product, lanes_from};
 use serde::{Deserialize, Serialize};
 
-/// A belief that is divided by is at least this.
-const LEAST: f32 = 1e-9;
+/// A correction multiplies no belief by more.
+const MOST: f32 = 1e30;
 
 /// How a predictor is computed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -276,16 +276,19 @@ impl Prediction {
     fn correct_cells(&mut self, [row, col]: [usize; 2], before: &[f32], after: &[f32]) {
         let (n_cells, first) = (self.shape.n_cells(), row * self.shape.width() + col);
         let n_lanes = LANES.min(self.shape.width() - col);
-        let mut is_changed = false;
+        let mut is_changed = [false; LANES];
         for (state, factor) in self.factors.iter_mut().enumerate() {
             *factor = [1.0; LANES];
             let at = state * n_cells + first;
-            for (factor, at) in factor.iter_mut().zip(at..at + n_lanes) {
-                is_changed |= after[at] != before[at];
-                *factor = after[at] / before[at].max(LEAST);
+            for lane in 0..n_lanes {
+                let (before, after) = (before[at + lane], after[at + lane]);
+                is_changed[lane] |= after != before;
+                if after != before && before > 0.0 {
+                    factor[lane] = (after / before).min(MOST);
+                }
             }
         }
-        if !is_changed {
+        if !is_changed.contains(&true) {
             return;
         }
         let place = self.planes.place([row, col]);
@@ -300,7 +303,7 @@ impl Prediction {
             for (state, factor) in self.factors.iter().enumerate() {
                 let beliefs = &mut self.beliefs[at + state * self.planes.length..][..n_lanes];
                 for (lane, belief) in beliefs.iter_mut().enumerate() {
-                    if total[lane] > 0.0 {
+                    if is_changed[lane] && total[lane] > 0.0 {
                         *belief *= factor[lane] / total[lane];
                     }
                 }

@@ -91,8 +91,10 @@ impl Work {
         } else {
             let mean = self.mean_total(act, reading.slots);
             self.distributions[index].fill([0.0; LANES]);
-            for held in &mut self.held {
-                held[..n].fill([0.0; LANES]);
+            if is_held {
+                for held in &mut self.held {
+                    held[..n].fill([0.0; LANES]);
+                }
             }
             let nodes: &[(f32, f32)] = if is_exact { &MEAN_FIELD } else { &NODES };
             for node in nodes {

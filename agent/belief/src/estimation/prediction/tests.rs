@@ -341,3 +341,70 @@ fn the_second_order_is_closer_for_the_papers_kernels() {
         assert_eq!(off[1], off[2], "no cavities without own kernels");
     }
 }
+
+/// Neighbours act on every own state, most on the second of three, as in learned kernels.
+fn learned_like() -> Vec<Array4<f64>> {
+    let kernel = |own: usize| {
+        Array4::from_shape_fn((3, 3, 3, 3), |(m, n, row, col)| {
+            let number =
+                (split_mix(9, (((own * 3 + m) * 3 + n) * 9 + row * 3 + col) as u64) >> 40) as f64;
+            let scale = if own == 1 { 1.0 } else { 0.05 };
+            let centre = if (row, col) == (1, 1) { 1.0 } else { 0.0 };
+            0.01 + scale * number / (1 << 24) as f64 + centre
+        })
+    };
+    (0..3).map(kernel).collect()
+}
+
+#[test]
+fn cavities_stay_distributions_where_several_own_states_act() {
+    let (kernels, bias) = (learned_like(), [0.0; 3]);
+    let weights = Weights {
+        kernels: &kernels,
+        bias: &bias,
+        zones: (None, 1),
+        edge: None,
+    };
+    let shape = Shape::new(4, 35).expect("shape");
+    let mut belief = belief(3, shape, 3);
+    let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
+    assert_eq!(prediction.held, Some(1), "not the last own state");
+    for _ in 0..4 {
+        predict(&mut prediction, &mut belief);
+        for cavity in 0..prediction.offsets.len() {
+            for (row, col) in [(0, 0), (2, 17), (3, 34)] {
+                let place = prediction.planes.place([row, col]);
+                let plane = |state| (cavity * 3 + state) * prediction.planes.length + place;
+                let sum: f32 = (0..3).map(|state| prediction.beliefs[plane(state)]).sum();
+                assert!((sum - 1.0).abs() < 1e-4, "{cavity} ({row}, {col}): {sum}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_correction_changes_the_cavities_of_its_cells_alone() {
+    let (kernels, bias) = (fire(), [0.0; 3]);
+    let weights = Weights {
+        kernels: &kernels,
+        bias: &bias,
+        zones: (None, 1),
+        edge: None,
+    };
+    let shape = Shape::new(1, 5).expect("shape");
+    let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
+    let mut belief = Belief::from_states(&states, 3).expect("states");
+    let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
+    predict(&mut prediction, &mut belief);
+    let (before, cavities) = (belief.as_slice().to_vec(), prediction.beliefs.clone());
+    let mut after = before.clone();
+    (0..3).for_each(|state| after[state * 5] = [0.1, 0.8, 0.1][state]);
+    prediction.correct(&before, &after);
+    let planes = prediction.beliefs.chunks_exact(prediction.planes.length);
+    for (new, old) in planes.zip(cavities.chunks_exact(prediction.planes.length)) {
+        for col in 1..5 {
+            let place = prediction.planes.place([0, col]);
+            assert_eq!(new[place], old[place], "column {col}");
+        }
+    }
+}
