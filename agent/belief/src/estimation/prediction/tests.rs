@@ -391,7 +391,6 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
         zones: (None, 1),
         edge: None,
     };
-    let shape = Shape::new(1, 5).expect("shape");
     let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
     let mut belief = Belief::from_states(&states, 3).expect("states");
     let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
