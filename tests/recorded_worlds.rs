@@ -401,6 +401,13 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     let other =
         "--model: expected the recorded states unburnt, burning, burnt, got normal, latent, fire";
     check(AGENT, &format!("{compare} --model wildfire"), other);
+    let unpaid = place.folder.path().join("unpaid.toml");
+    std::fs::write(&unpaid, STILL.replace("reward = 1.0", "reward = 2.0")).expect("write");
+    check(
+        AGENT,
+        &format!("{compare} --model {}", unpaid.display()),
+        "--model: expected the rewards of the recorded states, [0.0, 1.0, 0.0], got [0.0, 2.0, 0.0]",
+    );
     let train = format!(
         "train --states {} --model wildfire",
         place.folder.path().display()

@@ -258,11 +258,11 @@ fn html_and_markdown_in_an_entry_are_refused_by_their_column() {
         "by: expected",
     );
     board.check(
-        replace("agent/src/policy/named.rs", "`code`"),
+        replace("agent/learning/src/policy/names.rs", "`code`"),
         "code: expected",
     );
     board.check(
-        replace("agent/src/policy/named.rs", "javascript:alert(1)"),
+        replace("agent/learning/src/policy/names.rs", "javascript:alert(1)"),
         "code: expected",
     );
     board.check(replace(",none,", ",<b>none</b>,"), "estimator: expected");
@@ -270,7 +270,10 @@ fn html_and_markdown_in_an_entry_are_refused_by_their_column() {
         replace(",small,", ",<img src=x>,"),
         "task: expected 1 to 64 letters",
     );
-    board.check(replace("be807c7", "<i>be807c7"), "commit: expected 7 to 40");
+    board.check(
+        replace("e82395e7", "<i>e82395e7"),
+        "commit: expected 7 to 40",
+    );
     let about = "--policy mine --by <svg> --code here --commit abcdef0 --training-seconds 0";
     let out = board.0.path().join("out");
     std::fs::create_dir(&out).expect("a folder");
@@ -291,6 +294,18 @@ fn an_entry_without_the_worlds_fingerprint_is_refused() {
     };
     board.check(without, "worlds_fingerprint | got none");
     agent(&board.command()).check_prints("| coverage ");
+}
+
+#[test]
+fn the_ends_of_the_scale_have_one_kind_of_team() {
+    let board = Board::new();
+    let path = board.0.path().join("oracle_ahead.csv");
+    let entry = read(&path);
+    std::fs::write(&path, entry.replace(",joint,", ",shared,")).expect("write");
+    let words = "entry oracle_ahead, task team: expected team joint, as in the entry of random_walk, got shared";
+    check(AGENT, &board.command(), words);
+    std::fs::write(&path, entry.replace(",4,joint,", ",2,joint,")).expect("write");
+    check(AGENT, &board.command(), "robots: expected 4, got 2");
 }
 
 #[test]
@@ -366,15 +381,15 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let recorded = "name = \"fires\"\nstates = \"jacksboro\"\nmoves = 8\nmax_steps = 10\n\
                     test_seeds = { start = 0, end = 2 }\n";
     std::fs::write(path("fires.toml"), recorded).expect("write");
-    let suite = |steps: u64| {
+    let suite = |flags: &str| {
         let [tiny, fires, out, runs] = ["tiny.toml", "fires.toml", "out", "runs"].map(path);
         let policies = "learned_beam,learned_policy,neural_beam,beam_exploit,known/options/learned";
         agent(&format!(
-            "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} --train --train-steps {steps}"
+            "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} {flags}"
         ))
         .check(0)
     };
-    let first = suite(64);
+    let first = suite("--train --train-steps 64");
     first.check_says("task tiny: training filter for learned_beam, 0 of 64 world steps done");
     first.check_says("task fires: training decisions for learned_policy, 0 of 64 world steps");
     for policy in ["beam_exploit", "known/options/learned"] {
@@ -391,12 +406,22 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
         assert!(seconds(task, "learned_policy") >= seconds(task, "learned_beam"));
         assert_eq!(seconds(task, "random_walk"), 0.0);
     }
-    let again = suite(64);
+    let again = suite("--train --train-steps 64");
     again.check_says("3 rows of learned_policy kept");
     assert!(!again.stderr.contains("training"), "{}", again.stderr);
-    let longer = suite(96);
+    let narrow = suite("--train --train-steps 64 --beam-width 3");
+    narrow.check_says("runs/tiny/filter is kept, although it was trained with other settings");
+    let untrained = suite("");
+    untrained.check_says("the trainings of neural_beam are unfinished: 64 of 48000 world steps");
+    let longer = suite("--train --train-steps 96");
     longer.check_says("task tiny: training neural for neural_beam, 64 of 96 world steps done");
     longer.check_says("3 rows of neural_beam are run again");
+    longer.check_says("tiny/decisions-learned_filter was learned on another belief than");
+    assert!(
+        !longer.stdout.contains("learned_policy"),
+        "{}",
+        longer.stdout
+    );
 }
 
 #[test]

@@ -145,20 +145,28 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
     // The replay keeps 54 cells of a step, where a path of five moves shows at most six.
     let size = |out: &str| bytes(&place.checkpoint(out)).len();
     assert!(2 * size("full") > 3 * size("path"));
-    place.train(
+    // On a new server the replay begins empty, and fills with full frames again.
+    place.train("full", &format!("{WORLDS} --steps 120 --resume"));
+    assert!(2 * size("full") > 3 * size("path"));
+    let refused = place.words(
         "full",
-        &format!("{WORLDS} --steps 20 --coverage full --resume"),
+        &format!("{WORLDS} --steps 20 --resume --coverage path"),
+    );
+    check(
+        AGENT,
+        &refused,
+        "--coverage: expected the checkpoint's, full",
     );
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let name = server.instance.name();
     for (flags, words) in [
         (
             format!("--instance {name} --worlds 1"),
-            "--coverage full: expected a server with --coverage client or full, got path",
+            "learning.full_frames: expected a server with --coverage client or full, got path",
         ),
         (
             format!("{WORLDS} --learner neural"),
-            "--coverage full: expected --learner filter, got neural",
+            "--coverage applies only with --learner filter, got neural",
         ),
     ] {
         let refused = place.words("refused", &format!("{flags} --coverage full"));

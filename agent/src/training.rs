@@ -18,7 +18,7 @@ use self::events::Events;
 use crate::client::info::connect;
 use crate::training::metrics::{FROZEN, METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::learners::{Beginning, Learner, LearnerKind, ModelUpdate, Worlds};
@@ -28,7 +28,7 @@ use emberwatch_protocol::Client;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::control::{CoverageRule, WorldSeed};
+use emberwatch_protocol::control::WorldSeed;
 use emberwatch_protocol::feed::Feed;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -110,8 +110,10 @@ impl TrainingLoop {
         contents: Option<Contents>,
     ) -> Result<Self> {
         let stopwatch = Stopwatch::start(&spec.out, spec.resume)?;
-        if let Some(contents) = &contents {
-            warn_of_other_settings(spec, contents)?;
+        if let Some(contents) = &contents
+            && spec.has_other_settings(contents)?
+        {
+            tracing::warn!("settings: they differ from the checkpoint's, and replace them");
         }
         let connection = connect(instance)?;
         let claim = Claim {
@@ -119,10 +121,6 @@ impl TrainingLoop {
             takeover: spec.takeover,
             time_to_live: Some(LEASE),
         };
-        ensure!(
-            !spec.full_frames || connection.info().coverage != CoverageRule::Path,
-            "--coverage full: expected a server with --coverage client or full, got path"
-        );
         let mut client = Client::acquire(connection, &claim)?;
         let kind = spec.learner()?;
         let mut learner = begin(spec, kind, &client, contents.as_ref())?;
@@ -163,7 +161,7 @@ impl TrainingLoop {
         let is_over = || spec.deadline.is_some_and(|end| Instant::now() >= end);
         let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let tick = self.step(spec);
+            let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             let start = Instant::now();
             let updates = if spec.freeze {
@@ -190,8 +188,8 @@ impl TrainingLoop {
     }
 
     /// One step of each robot; worlds at the end of their episodes begin again.
-    fn step(&mut self, spec: &TrainingSpec) -> Result<Tick> {
-        let shows_all = spec.full_frames || self.learner.wants_full_frames();
+    fn step(&mut self) -> Result<Tick> {
+        let shows_all = self.learner.wants_full_frames();
         let learner = &mut *self.learner;
         let mut acting = Acting::new(learner, self.kind, &mut self.feed, &self.client);
         let mut served = Served::new(&mut self.client, shows_all);
@@ -295,15 +293,6 @@ fn begin(
             learner.with_context(|| format!("resume {}", place.display()))
         }
     }
-}
-
-fn warn_of_other_settings(spec: &TrainingSpec, contents: &Contents) -> Result<()> {
-    if toml::to_string(&spec.config)? != contents.settings {
-        tracing::warn!(
-            "settings: other than the checkpoint was trained with; these hold from here on"
-        );
-    }
-    Ok(())
 }
 
 /// What the client's robots show, in new episodes where the last ones have ended.

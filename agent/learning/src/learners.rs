@@ -42,6 +42,19 @@ pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     })
 }
 
+/// The learner that writes checkpoints with a name.
+///
+/// # Errors
+/// Lists the names of all checkpoints.
+pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
+    let mut kinds = LEARNERS.iter().copied();
+    let kind = kinds.find(|kind| kind.checkpoints.contains(&name));
+    kind.with_context(|| {
+        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoints[0]));
+        format!("expected a checkpoint of one of {names}, got one of {name}")
+    })
+}
+
 /// What some checkpoints hold, of each kind one at most; networks compute on `device`.
 pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> Result<Learned> {
     let mut learned = Learned::default();
@@ -62,12 +75,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Learned> {
 }
 
 fn add(learned: &mut Learned, name: &str, contents: &Contents, device: &Device) -> Result<()> {
-    let mut kinds = LEARNERS.iter();
-    let kind = kinds.find(|kind| kind.checkpoints.contains(&name));
-    let kind = kind.with_context(|| {
-        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoints[0]));
-        format!("expected a checkpoint of one of {names}, got one of {name}")
-    })?;
+    let kind = of_checkpoint(name)?;
     let is_other = (kind.read)(contents, device, learned)?;
     ensure!(!is_other, "expected one checkpoint of {name}, got two");
     learned.digests.push(contents.digest());

@@ -193,12 +193,17 @@ fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     Ok(())
 }
 
-/// Refuses a model for filters of recorded worlds with other states or another sensor.
+/// Checks that a model for filters has the states, rewards and sensor of recorded worlds.
 pub fn check_recorded(info: &ServerInfo, states: &Model, model: &Model) -> Result<()> {
     let [expected, got] = [states, model].map(|model| model.state_names().join(", "));
     ensure!(
         got == expected,
         "--model: expected the recorded states {expected}, got {got}"
+    );
+    let [expected, got] = [states, model].map(|model| model.reward().to_vec());
+    ensure!(
+        got == expected,
+        "--model: expected the rewards of the recorded states, {expected:?}, got {got:?}"
     );
     check_sensor(info, model)?;
     Ok(model.check_on(info.shape()?)?)

@@ -9,6 +9,7 @@ use crate::benchmark::report::common_worlds::CommonWorlds;
 use crate::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
 use crate::benchmark::report::{PolicyRun, RunsFile};
 use crate::benchmark::team::Team;
+use crate::client::errors::is_outage;
 use crate::client::launch::OwnServer;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
@@ -190,6 +191,7 @@ impl SuiteCommand {
             let (task, name) = (&plan.task.name, &policy.name);
             match plan.prepare(policy, trainings) {
                 Ok(lesson) => ready.push((policy, lesson)),
+                Err(reason) if is_outage(&reason) => return Err(reason),
                 Err(reason) => {
                     check_stop(trainings)?;
                     tracing::warn!("task {task}: {name} is not run: {reason:#}");
@@ -293,7 +295,14 @@ impl Plan {
                 trainings.complete(&self.task, policy)?;
                 self.lesson(policy)
             }
-            _ => found,
+            _ => found.inspect(|lesson| self.warn_of_unfinished(policy, lesson)),
+        }
+    }
+
+    fn warn_of_unfinished(&self, policy: &Policy, lesson: &Lesson) {
+        if let Some(steps) = lesson.unfinished(&self.comparison.config) {
+            let (task, name) = (&self.task.name, &policy.name);
+            tracing::warn!("task {task}: the trainings of {name} are unfinished: {steps}");
         }
     }
 

@@ -7,7 +7,7 @@ use crate::client::launch::OwnServer;
 use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
 use emberwatch_learning::checkpoint::Contents;
 use emberwatch_learning::config::{AgentConfig, KernelKind};
@@ -27,14 +27,15 @@ use std::time::{Duration, Instant};
 /// Worlds of a training, unless its learner follows one alone.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// What frames show.
-#[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
-enum Coverage {
-    /// The cells in sight of the path
-    Path,
-    /// Every cell, where the server's coverage is `client` or `full`
-    Full,
-}
+/// Names of the frames that a filter learns from.
+const COVERAGES: [(bool, &str, &str); 2] = [
+    (false, "path", "The cells in sight of the path"),
+    (
+        true,
+        "full",
+        "Every cell, where the server's coverage is `client` or `full`",
+    ),
+];
 
 /// Learn a model while acting on a server's worlds.
 #[derive(Args)]
@@ -76,9 +77,9 @@ pub struct TrainCommand {
     /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
     #[arg(long)]
     resume: bool,
-    /// What the frames that a filter learns from show
-    #[arg(long, value_name = "CELLS", default_value = "path")]
-    coverage: Coverage,
+    /// Cells that the frames show to a filter that is learned [default: path, or the checkpoint's with --resume]
+    #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
+    full_frames: Option<bool>,
     /// Act on the checkpoint's parameters without learning
     #[arg(long, requires = "resume")]
     freeze: bool,
@@ -138,12 +139,14 @@ impl TrainCommand {
             config.decisions.estimator = estimator.label.into();
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
-        let full_frames = self.coverage == Coverage::Full;
-        ensure!(
-            !full_frames || *kind == FILTER,
-            "--coverage full: expected --learner filter, got {}",
-            kind.name
-        );
+        if let Some(full_frames) = self.full_frames {
+            ensure!(
+                *kind == FILTER,
+                "--coverage applies only with --learner filter, got {}",
+                kind.name
+            );
+            config.learning.full_frames = full_frames;
+        }
         let n_worlds = self
             .worlds
             .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
@@ -161,7 +164,6 @@ impl TrainCommand {
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
-            full_frames,
             learned,
             device,
             config,
@@ -236,6 +238,12 @@ impl TrainCommand {
                 got.is_none_or(|got| got == expected),
                 "--kernels: expected {expected} as in the checkpoint, got {}",
                 got.unwrap_or(expected)
+            );
+            let (expected, got) = (training.config.learning.full_frames, self.full_frames);
+            ensure!(
+                got.is_none_or(|got| got == expected),
+                "--coverage: expected the checkpoint's, {}",
+                COVERAGES[usize::from(expected)].1
             );
             if decides(kind) {
                 let belief = contents.state::<SavedDecisions>()?.kind()?;

@@ -1,17 +1,19 @@
-//! What policies of a suite learn of each task: where it is, and the trainings that are missing.
+//! The trainings of a suite's policies: finds their checkpoints, and runs missing trainings.
 //!
-//! `FOLDER/TASK` has a folder for each training: `filter`, `neural` and `autoencoder` for beliefs,
-//! `decisions-BELIEF` for decisions on a belief. What `train --out FOLDER/TASK` left there itself counts, too.
+//! `FOLDER/TASK` has a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
+//! `decisions-BELIEF` for decisions on a belief. A policy without a folder of its own uses the checkpoint that
+//! `train --out FOLDER/TASK` wrote.
 
 use super::train::{N_WORLDS, learn, start_server};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::beliefs::WorldForm;
+use emberwatch_learning::checkpoint;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners;
 use emberwatch_learning::learners::decisions::DECISIONS;
 use emberwatch_learning::learners::filter::FILTER;
+use emberwatch_learning::learners::{self, LearnerKind};
 use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::building;
 use emberwatch_network::Device;
@@ -21,20 +23,34 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-/// What a policy acts on.
+/// The checkpoints of a policy on one task.
 #[derive(Debug, Default)]
 pub struct Lesson {
     pub learned: Learned,
-    /// Processor seconds of its trainings; `None` if one of them kept none.
+    /// Processor seconds of all its trainings; `None` if one of them has no record of them.
     pub seconds: Option<f64>,
-    /// Whether it is used as it is: nothing was learned, or `train` was called by hand.
+    /// Whether `suite --train` leaves it alone: the policy needs no checkpoint, or the user ran `train`.
     pub is_final: bool,
+    /// The learner of each training and its world steps.
+    steps: Vec<(&'static LearnerKind, u64)>,
 }
 
-/// Finds what a policy acts on in a folder of checkpoints.
+impl Lesson {
+    /// Lists the trainings that are shorter than the settings say.
+    pub fn unfinished(&self, config: &AgentConfig) -> Option<String> {
+        let short = self.steps.iter().filter_map(|(kind, done)| {
+            let all = steps_of_settings(kind, config);
+            (*done < all).then(|| format!("{done} of {all} world steps of the {}", kind.name))
+        });
+        let short: Vec<String> = short.collect();
+        (!short.is_empty()).then(|| short.join(", "))
+    }
+}
+
+/// Reads a policy's checkpoints from a folder.
 ///
 /// # Errors
-/// Says what `train` has to learn, or why a checkpoint cannot be used.
+/// If a checkpoint is missing or cannot be used.
 pub fn find(
     folder: Option<&Path>,
     task: &Task,
@@ -52,18 +68,12 @@ pub fn find(
     if let Some(folder) = folder {
         let folder = folder.join(&task.name);
         let own: Vec<PathBuf> = trainings(&folder, policy).map(|(_, own)| own).collect();
-        let by_hand = [folder.clone(), folder.join("belief")];
-        // Decisions, which are learned last, hold the belief that they are made on.
-        if own
-            .last()
-            .is_some_and(|last| last.join(CHECKPOINT).exists())
-        {
-            lesson = read(&own)?;
-        } else if folder.join(CHECKPOINT).exists() {
-            let is_there = |folder: &&PathBuf| folder.join(CHECKPOINT).exists();
-            let mut folders: Vec<PathBuf> = by_hand.iter().filter(is_there).cloned().collect();
-            folders.reverse();
-            lesson = read(&folders)?;
+        let has_checkpoint = |folder: &PathBuf| folder.join(CHECKPOINT).exists();
+        if own.last().is_some_and(has_checkpoint) {
+            lesson = read(own.into_iter().filter(has_checkpoint))?;
+        } else if has_checkpoint(&folder) {
+            let by_hand = [folder.join("belief"), folder];
+            lesson = read(by_hand.into_iter().filter(has_checkpoint))?;
             lesson.is_final = true;
         }
     }
@@ -71,7 +81,7 @@ pub fn find(
     Ok(lesson)
 }
 
-/// The trainings of a policy in their order: the learner's name and the folder.
+/// A policy's trainings, the belief first: the learner's name and the folder.
 fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static str, PathBuf)> {
     let belief = policy.belief.learned_by.as_ref();
     let belief = belief.map(|by| (by.learner, folder.join(by.learner)));
@@ -82,23 +92,51 @@ fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static s
     belief.into_iter().chain(decisions)
 }
 
-/// What the last of some trainings left, and the seconds of all.
-fn read(folders: &[PathBuf]) -> Result<Lesson> {
+/// Reads the checkpoints of trainings, that of the belief first.
+///
+/// # Errors
+/// If decisions were learned on another belief.
+fn read(folders: impl Iterator<Item = PathBuf>) -> Result<Lesson> {
+    let folders: Vec<PathBuf> = folders.collect();
     let seconds = folders.iter().map(|folder| seconds::read(folder));
     let seconds = seconds.collect::<Result<Vec<_>>>()?;
-    let last = folders.last().map(|folder| folder.join(CHECKPOINT));
+    let places: Vec<PathBuf> = folders.iter().map(|it| it.join(CHECKPOINT)).collect();
+    let steps = places.iter().map(|place| {
+        let (name, contents) = checkpoint::read(place)?;
+        let kind = learners::of_checkpoint(&name)?;
+        Ok((kind, (kind.done)(&contents)?))
+    });
+    let steps = steps.collect::<Result<Vec<_>>>()?;
+    let learned = learners::read(places.iter().map(|place| &**place), &Device::Cpu);
+    let learned = learned.with_context(|| match folders.as_slice() {
+        [belief, decisions] => format!(
+            "{} was learned on another belief than {}: remove it to learn it again",
+            decisions.display(),
+            belief.display()
+        ),
+        _ => "cannot use the training".into(),
+    })?;
     Ok(Lesson {
-        learned: learners::read(last.as_deref(), &Device::Cpu)?,
+        learned,
         seconds: seconds.into_iter().sum(),
         is_final: false,
+        steps,
     })
 }
 
-/// Trains what policies lack.
+/// The world steps of a training by the settings.
+fn steps_of_settings(kind: &LearnerKind, config: &AgentConfig) -> u64 {
+    match (kind.steps)(config) {
+        0 if *kind == FILTER => config.decisions.filter_steps,
+        steps => steps,
+    }
+}
+
+/// Runs the missing trainings of a suite.
 pub struct Trainings<'a> {
     pub folder: &'a Path,
     pub config: &'a AgentConfig,
-    /// World steps of each training; `None`: those of the settings.
+    /// World steps of each training, summed over its worlds; `None`: the number in the settings.
     pub steps: Option<u64>,
     pub server: Option<PathBuf>,
     pub stop: Arc<AtomicBool>,
@@ -125,29 +163,32 @@ impl<'a> Trainings<'a> {
         self.stop.load(Relaxed)
     }
 
-    /// Makes or completes the trainings that a policy acts on; those that are complete are left as they are.
+    /// Starts or resumes a policy's trainings. Complete ones stay as they are.
     ///
     /// # Errors
-    /// If a learner cannot learn in the task's worlds.
+    /// If a learner cannot learn in the task's worlds, or decisions were learned on another belief.
     pub fn complete(&self, task: &Task, policy: &Policy) -> Result<()> {
         let mut config = self.config.clone();
-        config.decisions.estimator = policy.belief.label.into();
         let mut learned = Learned::default();
+        let mut belief = None;
         for (learner, out) in trainings(&self.folder.join(&task.name), policy) {
+            if learner == DECISIONS.name {
+                config.decisions.estimator = policy.belief.label.into();
+                if out.join(CHECKPOINT).exists() {
+                    read(belief.take().into_iter().chain([out.clone()]))?;
+                }
+            }
             config.learner = learner.into();
-            let trained = self.train(task, policy, self.spec(&config, out, learned)?);
+            let trained = self.train(task, policy, self.spec(&config, out.clone(), learned)?);
             learned = trained.with_context(|| format!("train --learner {learner}"))?;
+            belief = Some(out);
         }
         Ok(())
     }
 
     fn spec(&self, config: &AgentConfig, out: PathBuf, learned: Learned) -> Result<TrainingSpec> {
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
-        let of_settings = match (kind.steps)(config) {
-            0 if *kind == FILTER => config.decisions.filter_steps,
-            steps => steps,
-        };
-        let steps = self.steps.unwrap_or(of_settings);
+        let steps = self.steps.unwrap_or(steps_of_settings(kind, config));
         ensure!(
             steps > 0,
             "expected --train-steps, as the {} has no default length",
@@ -161,24 +202,27 @@ impl<'a> Trainings<'a> {
             resume: out.join(CHECKPOINT).exists(),
             out,
             freeze: false,
-            full_frames: false,
             device: Device::Cpu,
             config: config.clone(),
             learned,
         })
     }
 
-    /// Trains for the steps that are left; returns what was learned.
+    /// Trains for the remaining steps, and reads the checkpoint.
     fn train(&self, task: &Task, policy: &Policy, mut training: TrainingSpec) -> Result<Learned> {
         let kind = training.learner()?;
         let contents = training.check()?;
         let done = contents.as_ref().map(kind.done).transpose()?.unwrap_or(0);
         let all = training.steps;
         training.steps = all.saturating_sub(done);
-        if training.steps > 0 {
-            if let Some(contents) = &contents {
-                (kind.adopt)(contents, &mut training.config);
+        if let Some(contents) = &contents {
+            (kind.adopt)(contents, &mut training.config);
+            if training.steps == 0 && training.has_other_settings(contents)? {
+                let place = training.out.display();
+                tracing::warn!("{place} is kept, although it was trained with other settings");
             }
+        }
+        if training.steps > 0 {
             std::fs::create_dir_all(&training.out)
                 .with_context(|| format!("create {}", training.out.display()))?;
             tracing::info!(

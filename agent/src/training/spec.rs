@@ -30,8 +30,6 @@ pub struct TrainingSpec {
     pub out: PathBuf,
     pub resume: bool,
     pub freeze: bool,
-    /// Whether all frames show every cell.
-    pub full_frames: bool,
     pub device: Device,
     pub config: AgentConfig,
     /// What was learned before, for decisions on it.
@@ -65,6 +63,11 @@ impl TrainingSpec {
             kind.checkpoints[0]
         );
         Ok(Some(contents))
+    }
+
+    /// Whether a checkpoint was trained with settings other than these.
+    pub fn has_other_settings(&self, contents: &Contents) -> Result<bool> {
+        Ok(toml::to_string(&self.config)? != contents.settings)
     }
 
     /// What the settings say that learns.

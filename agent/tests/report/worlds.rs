@@ -110,7 +110,7 @@ fn an_entry_has_nothing_but_plain_words_and_web_addresses() {
         entry.check().map_err(|error| format!("{error:#}"))
     };
     assert_eq!(entry(|_| ()), Ok(()));
-    let wrong: [(Change<Entry>, &str); 14] = [
+    let wrong: [(Change<Entry>, &str); 15] = [
         (|it| it.about.policy = "<b>mine</b>".into(), "policy: "),
         (|it| it.about.policy = "../mine".into(), "policy: "),
         (|it| it.about.by = "<svg onload=alert(2)>".into(), "by: "),
@@ -131,6 +131,7 @@ fn an_entry_has_nothing_but_plain_words_and_web_addresses() {
             |it| it.tasks[0].runs[2].estimator = "<i>none".into(),
             "estimator: ",
         ),
+        (|it| it.tasks[0].runs[1].team = "<i>".into(), "team: "),
     ];
     for (change, words) in wrong {
         let refusal = entry(change).expect_err(words);

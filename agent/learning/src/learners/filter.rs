@@ -17,11 +17,12 @@ use crate::learners::update::ModelUpdate;
 use crate::parallel::in_parallel;
 use crate::policy::Policy;
 use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::Plan;
+use emberwatch_messages::control::CoverageRule;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use std::collections::BTreeMap;
@@ -50,6 +51,9 @@ pub const FILTER: LearnerKind = LearnerKind {
     done: |contents| Ok(contents.state::<SavedFilter>()?.fit.world_steps),
     adopt: |contents, config| {
         config.kernels = KernelKind::of(sees_own_state(&contents.part("")));
+        if let Ok(settings) = contents.settings() {
+            config.learning.full_frames = settings.learning.full_frames;
+        }
     },
     read: |contents, _, learned| {
         let mut fit = contents.state::<SavedFilter>()?.fit;
@@ -62,6 +66,10 @@ pub const FILTER: LearnerKind = LearnerKind {
 
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     let dimensions = dimensions(on.config, &on.worlds)?;
+    ensure!(
+        !on.config.learning.full_frames || on.info.coverage != CoverageRule::Path,
+        "learning.full_frames: expected a server with --coverage client or full, got path"
+    );
     Ok(Box::new(match on.contents {
         Some(contents) => FilterLearner::resume(contents, dimensions, on.worlds, on.config)?,
         None => FilterLearner::new(dimensions, on.worlds, on.config),
@@ -215,6 +223,10 @@ impl Actor for FilterLearner {
 }
 
 impl Learning for FilterLearner {
+    fn wants_full_frames(&self) -> bool {
+        self.config.learning.full_frames
+    }
+
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
         let rollout = self.begun(robot, observation)?;
         self.rollouts[(robot - self.worlds.numbers.start) as usize] = rollout;

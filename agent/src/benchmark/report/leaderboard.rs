@@ -3,11 +3,11 @@
 use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::common_worlds::CommonWorlds;
 use crate::benchmark::report::figures::{Height, draw_bars};
-use crate::benchmark::report::number::number;
+use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::suite::{
-    Aggregate, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, told,
+    Aggregate, CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, told,
 };
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::file::{Readers, replace_file};
@@ -50,6 +50,9 @@ struct Row {
     task: String,
     world_seed: u64,
     steps: u64,
+    /// Robots of the world, and their kind of team.
+    robots: u32,
+    team: String,
     mean_reward: f64,
     brier: Option<f64>,
     log_likelihood: Option<f64>,
@@ -101,8 +104,8 @@ impl Entry {
             );
         }
         let runs = || self.tasks.iter().flat_map(|task| &task.runs);
-        let estimators = runs().map(|run| ("estimator", &run.estimator));
-        for (what, text) in [("by", by), ("code", code)].into_iter().chain(estimators) {
+        let columns = runs().flat_map(|run| [("estimator", &run.estimator), ("team", &run.team)]);
+        for (what, text) in [("by", by), ("code", code)].into_iter().chain(columns) {
             ensure!(
                 is_plain(text),
                 "{what}: expected 1 to 200 letters, digits, spaces and {}, or an address that begins with \
@@ -165,6 +168,8 @@ impl Row {
             task: task.into(),
             world_seed: run.world_seed,
             steps: run.steps,
+            robots: run.robots,
+            team: run.team.clone(),
             mean_reward: run.mean_reward,
             brier: run.brier,
             log_likelihood: run.log_likelihood,
@@ -186,8 +191,8 @@ impl Row {
         PolicyRun {
             policy: self.policy,
             estimator: self.estimator,
-            robots: 1,
-            team: ALONE.into(),
+            robots: self.robots,
+            team: self.team,
             world_seed: self.world_seed,
             steps: self.steps,
             mean_reward: self.mean_reward,
@@ -224,6 +229,7 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
     let floor = all.find(|entry| entry.about.policy == FLOOR);
     let floor = floor.with_context(|| format!("expected an entry of {FLOOR}"))?;
     let mut known = BTreeSet::new();
+    check_scale(entries)?;
     for entry in entries {
         let policy = &entry.about.policy;
         ensure!(
@@ -235,6 +241,29 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
             let checked = worlds(floor, task).and_then(|worlds| worlds.check(policy, &runs));
             checked.with_context(|| format!("entry {policy}, task {task}"))?;
         }
+    }
+    Ok(())
+}
+
+/// Checks that both ends of the scale were measured with the same kind of team.
+fn check_scale(entries: &[Entry]) -> Result<()> {
+    let teams = |name: &str| {
+        let entry = entries.iter().find(|entry| entry.about.policy == name);
+        let mut teams: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+        for TaskRuns { task, runs } in entry.iter().flat_map(|entry| &entry.tasks) {
+            teams.insert(task, runs.iter().map(|run| &*run.team).collect());
+        }
+        teams
+    };
+    let floor = teams(FLOOR);
+    for (task, got) in teams(CEILING) {
+        let expected = floor.get(task).unwrap_or(&got);
+        ensure!(
+            *expected == got,
+            "entry {CEILING}, task {task}: expected team {}, as in the entry of {FLOOR}, got {}",
+            joined(expected),
+            joined(&got)
+        );
     }
     Ok(())
 }
@@ -256,7 +285,7 @@ fn worlds(floor: &Entry, task: &str) -> Result<CommonWorlds> {
         seeds,
         steps: runs[0].steps,
         moves: None,
-        robots: None,
+        robots: Some(runs[0].robots),
         recent_steps: None,
     })
 }
@@ -282,6 +311,7 @@ pub fn render_page(entries: &[Entry]) -> String {
         let row = vec![
             policy.into(),
             score.map_or_else(|| n_tasks(entry.tasks.len(), &tasks), told),
+            teams(entry),
             number(about.training_seconds, 0),
             about.by.clone(),
             about.code.clone(),
@@ -293,7 +323,15 @@ pub fn render_page(entries: &[Entry]) -> String {
     let mut parts = Vec::new();
     for (words, heading, rows) in [("", "score [95 %]", complete), (PARTIAL, "tasks", partial)] {
         if !rows.is_empty() {
-            let headings = ["policy", heading, "training, s", "by", "code", "commit"];
+            let headings = [
+                "policy",
+                heading,
+                "team",
+                "training, s",
+                "by",
+                "code",
+                "commit",
+            ];
             let table = markdown(&headings, rows.into_iter()).to_string();
             parts.extend([words.to_owned(), table]);
         }
@@ -301,6 +339,23 @@ pub fn render_page(entries: &[Entry]) -> String {
     parts.push(render_suite(&tasks));
     parts.retain(|part| !part.is_empty());
     parts.join("\n\n")
+}
+
+/// The kinds of team that an entry's robots flew in.
+fn teams(entry: &Entry) -> String {
+    let runs = entry.tasks.iter().flat_map(|task| &task.runs);
+    let teams = runs.filter(|run| run.robots > 1).map(|run| &*run.team);
+    let teams: BTreeSet<&str> = teams.collect();
+    if teams.is_empty() {
+        NOTHING.into()
+    } else {
+        joined(&teams)
+    }
+}
+
+fn joined(names: &BTreeSet<&str>) -> String {
+    let names: Vec<&str> = names.iter().copied().collect();
+    names.join(", ")
 }
 
 fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
@@ -318,6 +373,8 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
             Some(PolicyRun {
                 world_seed: index as u64,
                 mean_reward: mean,
+                robots: 1,
+                team: ALONE.into(),
                 ..any?.clone()
             })
         };
