@@ -416,7 +416,7 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     check(
         AGENT,
         &format!("{train} --out {out}"),
-        "--model: expected none beside --states",
+        "--model cannot be used with --states",
     );
     check(
         AGENT,

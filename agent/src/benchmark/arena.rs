@@ -36,9 +36,9 @@ pub struct Arena {
     client: Client,
     /// Where the hidden states are published.
     truth: Option<TruthFeed>,
-    /// Of recorded worlds: one in which the states do not change.
+    /// The worlds' model. For recorded worlds, a model whose states never change.
     model: Model,
-    /// With which beliefs predict in recorded worlds, if one was given.
+    /// The model given for beliefs on recorded worlds.
     known: Option<Model>,
     main: Range<u32>,
     scouts: Range<u32>,
@@ -111,7 +111,7 @@ impl Arena {
     /// Gives beliefs a model for recorded worlds.
     ///
     /// # Errors
-    /// If its states or its sensor are not those of the worlds.
+    /// If states, rewards or sensor differ from the worlds'.
     pub fn know(&mut self, model: Model) -> Result<()> {
         check_recorded(self.info(), &self.model, &model)?;
         self.known = Some(model);

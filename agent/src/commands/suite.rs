@@ -50,7 +50,7 @@ pub struct SuiteCommand {
     /// First train what the policies need and --checkpoints lacks; continues trainings that were stopped
     #[arg(long, requires = "checkpoints")]
     train: bool,
-    /// World steps of each training, of all worlds together [default: those of the settings]
+    /// World steps of each training, summed over its worlds [default: from the settings]
     #[arg(long, value_name = "STEPS", requires = "train", value_parser = clap::value_parser!(u64).range(1..))]
     train_steps: Option<u64>,
     /// A folder for results, a CSV file a task; rows that it has are kept, unless the checkpoint, the settings or

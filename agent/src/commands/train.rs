@@ -297,7 +297,7 @@ impl TrainCommand {
         let of_states = self.grid.model_of_states()?;
         ensure!(
             of_states.is_none(),
-            "--model: expected none beside --states, as training uses no model"
+            "--model cannot be used with --states: training uses no model"
         );
         self.grid.check()?;
         ensure!(

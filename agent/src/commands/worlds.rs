@@ -73,7 +73,7 @@ pub struct GridFlags {
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
     #[arg(long, value_name = "NAME|FILE|FOLDER", conflicts_with_all = ["instance", "height", "width"],
-        help = format!("Recorded states in the place of simulated ones, for the server that is started: {} or a .npz or .npy \
+        help = format!("Recorded states for the started server, instead of simulated ones: {} or a .npz or .npy \
             file or folder", listed(state_names())))]
     states: Option<String>,
     /// World seeds choose among the symmetries of the grid, too
@@ -186,7 +186,7 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// The model, if it can be simulated on the grid; of recorded states that which was given.
+    /// Checks that the model fits the grid. For recorded states, returns the model given for beliefs.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),
@@ -201,7 +201,7 @@ impl GridFlags {
         Ok(Some(model))
     }
 
-    /// The model that was given for recorded states, with the server's sensor.
+    /// The model given for beliefs on recorded states, with the server's sensor.
     pub fn model_of_states(&self) -> Result<Option<Model>> {
         let model = self.model.as_deref().filter(|_| self.states.is_some());
         let model = model.map(|model| with_sensor(model_named(model)?, self.radius()));

@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 /// The file's name in the folder of a training.
 const SECONDS: &str = "processor_seconds.txt";
 
-/// Counts the processor seconds of this process during a training, and adds those of the runs that it resumes.
+/// Counts the processor seconds of a training, including earlier runs that it resumes.
 pub struct Stopwatch {
     path: PathBuf,
-    /// Of earlier runs; `None` if a run that is resumed kept none.
+    /// Seconds of earlier runs; `None` if a resumed run has no record.
     before: Option<f64>,
     start: f64,
 }
@@ -26,7 +26,7 @@ impl Stopwatch {
         })
     }
 
-    /// Writes the seconds so far, unless those of earlier runs are unknown.
+    /// Writes the seconds so far, unless an earlier run has no record.
     pub fn write(&self) -> Result<()> {
         let Some(before) = self.before else {
             return Ok(());

@@ -115,8 +115,8 @@ impl TaskRuns {
     }
 }
 
-/// Each policy's score of each task and over all, then those of policies that lack a task, then how well beliefs
-/// predict: a row a policy, a column a task.
+/// Renders the scores of all policies, a column per task, and the likelihood and Brier score of their beliefs. Policies
+/// that lack a task have a table of their own.
 pub fn render_suite(tasks: &[TaskRuns]) -> String {
     let policies = by_score(tasks);
     let scores = policies.iter().map(|(policy, score)| {
