@@ -75,7 +75,7 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
 }
 
 #[test]
-fn a_csv_file_that_another_process_writes_is_refused_before_the_work() {
+fn a_csv_file_that_another_process_writes_is_refused() {
     let folder = TempDir::new().expect("a folder");
     let csv = folder.path().join("out.csv");
     let held = RunsFile::lock(&csv, Duration::ZERO).expect("locked");

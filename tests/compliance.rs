@@ -63,8 +63,8 @@ suite! {
     a_handshake_tells_everything_a_client_needs,
     a_hidden_model_is_not_in_the_handshake,
     a_step_of_wrong_numbers_is_refused_and_changes_nothing,
-    a_step_without_a_lease_on_its_robots_is_refused_and_changes_nothing,
-    a_step_that_is_not_whole_or_not_for_the_present_is_refused_and_changes_nothing,
+    a_step_without_a_lease_changes_nothing,
+    a_damaged_or_outdated_step_changes_nothing,
     a_control_request_is_refused_for_one_reason_and_changes_nothing,
     another_version_is_refused_with_both_versions_and_what_to_do,
     a_step_answer_echoes_its_request_and_fits_its_payload,
@@ -257,7 +257,7 @@ fn a_step_of_wrong_numbers_is_refused_and_changes_nothing(client: Client) {
     steps.check_body(|_| (), &step_body(&[1], &paths), BadMove, 8);
 }
 
-fn a_step_without_a_lease_on_its_robots_is_refused_and_changes_nothing(client: Client) {
+fn a_step_without_a_lease_changes_nothing(client: Client) {
     let steps = Steps::new(client);
     let (theirs, ended) = (steps.table.their_lease, steps.table.ended_lease);
     steps.check(|h| h.lease = 0, NoLease, 0);
@@ -275,7 +275,7 @@ fn a_step_without_a_lease_on_its_robots_is_refused_and_changes_nothing(client: C
     steps.check(|h| h.lease = ended, LeaseLost, us);
 }
 
-fn a_step_that_is_not_whole_or_not_for_the_present_is_refused_and_changes_nothing(client: Client) {
+fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     let steps = Steps::new(client);
     let one = step_body(&[1], &[0; 6]);
     steps.check_body(|h| h.n_robots = 1, &one, Incomplete, 1);

@@ -28,7 +28,7 @@ fn start_agent(instance: &Instance, flags: &str) -> Program {
 }
 
 #[test]
-fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
+fn a_killed_agents_world_is_free_and_unchanged() {
     let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut frames = frames_until(&observer, 0, 0);
@@ -100,7 +100,7 @@ fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
 }
 
 #[test]
-fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
+fn agents_killed_in_turn_change_no_world_and_leak_nothing() {
     let flags = format!("{FLAGS} --coverage full");
     let (server, undisturbed) = (Server::start(&flags), Server::start(&flags));
     let mut before = 0;
@@ -133,7 +133,7 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
 }
 
 #[test]
-fn a_step_whose_client_gave_up_waiting_is_made_once_or_not_and_its_answer_taken_for_no_other() {
+fn an_abandoned_step_is_made_at_most_once() {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0..1).lease;

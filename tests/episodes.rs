@@ -52,7 +52,7 @@ fn the_example_of_a_client_flies_an_episode() {
 }
 
 #[test]
-fn unseeded_resets_go_on_to_other_seeds_and_seeded_ones_repeat_every_byte() {
+fn unseeded_resets_change_seeds_and_seeded_ones_repeat_bytes() {
     let server = Server::start(SMALL);
     let mut client = server.acquire(0..1);
     let unseeded = [seed(0, None)];

@@ -141,7 +141,7 @@ fn kept_frames_are_those_that_were_answered() {
 }
 
 #[test]
-fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() {
+fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));

@@ -47,7 +47,7 @@ fn a_million_random_messages_change_nothing_for_others() {
 }
 
 #[test]
-fn a_server_without_descriptors_says_so_and_hears_who_comes_when_there_are_some() {
+fn a_server_recovers_when_it_has_descriptors_again() {
     let server = Server::start(FLAGS);
     let limit = |current| {
         let pid = Pid::from_raw(server.program.pid() as i32);
@@ -119,7 +119,7 @@ fn a_flood_of_requests_whose_answers_nobody_reads_disturbs_nobody() {
 }
 
 #[test]
-fn answers_and_requests_that_are_held_keep_only_their_holder_from_more() {
+fn held_samples_limit_only_their_holder() {
     besiege(|server, _| {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
@@ -182,7 +182,7 @@ fn old_leases_and_numbers_open_nothing_again() {
 }
 
 #[test]
-fn connections_that_are_left_half_open_take_no_more_than_their_places() {
+fn half_open_connections_use_only_their_own_slots() {
     besiege(|server, _| {
         for _ in 0..4 {
             let mut ports = Vec::new();
@@ -294,7 +294,7 @@ fn the_longest_control_requests_are_answered_in_short() {
 }
 
 #[test]
-fn requests_that_wait_for_a_reset_and_are_given_up_do_not_wear_the_server_out() {
+fn abandoned_requests_during_a_reset_leak_nothing() {
     let server = Server::start_with_endless_resets("");
     let mut bystander = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
@@ -346,7 +346,7 @@ fn messages_of_any_length_are_refused_whole() {
 }
 
 #[test]
-fn clients_that_come_and_go_in_the_middle_of_everything_disturb_nobody() {
+fn clients_that_come_and_go_disturb_nobody() {
     let server = Server::start(FLAGS);
     let mut bystander = server.acquire(0..1);
     for round in 1..=60 {

@@ -6,7 +6,7 @@ use tests::harness::Server;
 use tests::kills::{FLAGS, Kills, files_of, kill_in_loops, look_up_nobody};
 
 #[test]
-fn programs_that_are_killed_at_any_moment_leave_nothing_in_the_way_of_others() {
+fn killed_programs_leave_nothing_in_the_way() {
     let kills = Kills {
         starts: 40,
         ends: 10,

@@ -28,7 +28,7 @@ fn paths(n_robots: usize) -> Vec<Vec<Move>> {
 }
 
 #[test]
-fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
+fn a_takeover_ends_the_lease_and_keeps_the_world() {
     let server = Server::start(SMALL);
     let mut former = server.acquire(0..1);
     let last = fly(&mut former, Paths::new(1).next(6));

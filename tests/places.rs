@@ -33,7 +33,7 @@ fn apart(script: &str) -> Option<Output> {
 }
 
 #[test]
-fn a_server_whose_files_are_removed_says_so_and_ends_and_leaves_its_successor_alone() {
+fn a_server_without_its_files_ends_and_spares_its_successor() {
     let script = format!(
         "$S {SMALL} & first=$!
          until $S status >/dev/null 2>&1; do sleep 0.01; done
@@ -100,7 +100,7 @@ fn a_server_in_another_pid_namespace_is_called_so_and_goes_on() {
 }
 
 #[test]
-fn servers_that_are_both_process_1_of_their_namespaces_are_told_apart() {
+fn two_servers_with_pid_1_are_told_apart() {
     let other = "unshare -p -f --kill-child --mount-proc $S";
     let script = format!(
         "{other} {SMALL} & first=$!

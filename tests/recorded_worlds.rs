@@ -131,7 +131,7 @@ fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
 }
 
 #[test]
-fn what_was_recorded_comes_back_in_every_symmetry_and_at_every_offset() {
+fn recorded_states_replay_in_each_symmetry_and_offset() {
     for (side, n_symmetries) in [((4, 4), 8), ((3, 5), 4)] {
         let place = Place::new(&[5, 8], side);
         for (flags, most_offset) in [("", 0), ("--states-offset 3", 3)] {

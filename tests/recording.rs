@@ -163,7 +163,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
 }
 
 #[test]
-fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
+fn a_killed_recorder_leaves_whole_records() {
     let server = Server::start(SMALL);
     let (_folder, file) = new_file();
     let recorder = start_recorder(&server.instance, &file, "");
@@ -192,7 +192,7 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
 }
 
 #[test]
-fn a_recorder_that_is_told_twice_at_once_to_stop_records_what_was_published_before() {
+fn a_recorder_stopped_twice_keeps_what_was_published() {
     let server = Server::start(&format!("{SMALL} --publish-truth"));
     let (_folder, file) = new_file();
     let recorder = start_recorder(&server.instance, &file, "--truth");
@@ -307,7 +307,7 @@ fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
 }
 
 #[test]
-fn a_damaged_recording_is_replayed_up_to_the_damage_unless_that_is_checked() {
+fn a_damaged_recording_is_replayed_up_to_the_damage() {
     let (_folder, file) = new_file();
     let samples = write_recording(&file, 5, 0);
     let mut bytes = std::fs::read(&file).expect("read");

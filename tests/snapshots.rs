@@ -30,7 +30,7 @@ fn refused(server: &Server, command: &str, words: &str) {
 }
 
 #[test]
-fn a_restored_world_goes_on_bit_for_bit_and_so_does_what_it_remembers() {
+fn a_restored_world_and_its_memory_continue_bit_for_bit() {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("lab.snapshot");
     let file = file.display();

@@ -133,7 +133,7 @@ fn order(mut number: usize, n: usize) -> Vec<usize> {
 }
 
 #[test]
-fn the_same_paths_give_the_same_bytes_whoever_sends_them_in_whatever_order() {
+fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     let together = Server::start(&format!("{FLAGS} --threads 1"));
     let all = 0..4;
     let expected = fly(&together, std::slice::from_ref(&all));
@@ -416,7 +416,7 @@ fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
 }
 
 #[test]
-fn a_stopped_agent_is_late_in_each_step_and_flies_again_when_it_wakes() {
+fn a_stopped_agent_is_late_and_flies_again_when_it_wakes() {
     let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 200");
     let [one, two, mut three] = lab.start_agents();
     three.stop();

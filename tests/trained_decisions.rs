@@ -108,7 +108,7 @@ fn decisions_and_their_filter_are_given_in_either_order() {
 }
 
 #[test]
-fn a_training_that_ends_before_its_filter_is_learned_goes_on_with_it() {
+fn a_training_that_ended_in_its_filter_resumes_there() {
     let place = place();
     let first = format!("{WORLDS} --estimator learned_spatial_filter --kernels own");
     let cut = place.words("out", &format!("{first} --time-limit 0"));
@@ -230,7 +230,7 @@ fn a_filter_that_was_given_is_the_estimator_s() {
 }
 
 #[test]
-fn decisions_of_an_earlier_release_go_on_with_kernels_of_the_cell_s_own_state() {
+fn decisions_of_an_earlier_release_resume_with_own_kernels() {
     let place = place();
     place.train("out", &format!("{WORLDS} --kernels own --steps 20"));
     let path = place.checkpoint("out");

@@ -200,7 +200,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
 }
 
 #[test]
-fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
+fn a_moved_world_begins_a_new_track_and_keeps_the_replay() {
     let place = place();
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let flags = format!("--instance {} --worlds 2", server.instance.name());
@@ -215,7 +215,7 @@ fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
 }
 
 #[test]
-fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
+fn a_number_that_is_not_finite_ends_training_by_name() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
     let checkpoint = place.checkpoint("out");

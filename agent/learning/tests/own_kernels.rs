@@ -131,7 +131,7 @@ fn distance(model: &Model, tables: &Tables) -> f64 {
 }
 
 #[test]
-fn learned_own_kernels_predict_burnout_better_than_they_began_and_than_one_kernel() {
+fn learned_own_kernels_predict_burnout_best() {
     let model = Model::built_in("wildfire-burnout").expect("a built-in model");
     let first = Parameters::first(dimensions(true), 0);
     let before = distance(&model, &first.tables());

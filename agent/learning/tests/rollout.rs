@@ -113,7 +113,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
 }
 
 #[test]
-fn who_missed_steps_believes_what_one_believes_who_saw_nothing_in_them() {
+fn missed_steps_equal_steps_without_a_frame() {
     let mut late = robot("beam_exploit", &CELLS[..1]);
     let mut hovering = robot("beam_exploit", &CELLS[..1]);
     for step in 1..4 {

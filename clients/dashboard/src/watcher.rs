@@ -252,7 +252,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_missing_in_a_row_is_counted_and_another_publisher_begins_a_new_one() {
+    fn gaps_are_counted_per_publisher() {
         let mut gaps = Gaps::default();
         let row = [(1, 7), (1, 8), (1, 11), (1, 11), (2, 90), (2, 92), (1, 12)];
         let missing = row.map(|(publisher, sequence)| gaps.before(Some(publisher), sequence));

@@ -213,7 +213,7 @@ fn a_picture_tells_what_each_robot_did_and_what_all_saw() {
 }
 
 #[test]
-fn of_several_agents_the_one_with_the_first_robot_is_shown_while_it_tells() {
+fn the_agent_with_the_first_robot_is_shown() {
     let told = |step: u64, robot: u32| {
         let mut belief = agent_belief(step);
         (belief.header.first_robot, belief.header.pid) = (robot, robot);

@@ -183,7 +183,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_the_last_and_one_every_five_seconds_survive_a_loss_of_power() {
+    fn first_last_and_five_second_snapshots_survive_power_loss() {
         let (soon, late) = (SYNC_INTERVAL / 2, SYNC_INTERVAL);
         assert_eq!(durability(None, false), Durability::PowerLoss);
         assert_eq!(durability(Some(soon), false), Durability::Kill);

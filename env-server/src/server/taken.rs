@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dead_process_has_is_tried_again_and_what_a_living_one_has_is_not() {
+    fn resources_of_dead_processes_are_tried_again() {
         let mut child = Command::new("true").spawn().expect("a process");
         child.wait().expect("its end");
         assert_eq!(tries(child.id()), 2);

@@ -193,7 +193,7 @@ fn what_was_written_is_read_with_its_losses() {
 }
 
 #[test]
-fn a_recording_cut_anywhere_is_read_up_to_its_last_whole_record_and_says_so() {
+fn a_cut_recording_is_read_to_its_last_whole_record() {
     let bytes = written(&example());
     let ends: Vec<usize> = (0..=example().len())
         .map(|n_records| length_without_end(&example()[..n_records]))

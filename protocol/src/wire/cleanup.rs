@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dead_process_did_not_finish_is_removed_though_the_other_side_lives() {
+    fn remains_of_a_dead_process_go_while_its_peer_lives() {
         let files = ChannelFiles {
             shared: std::env::temp_dir(),
             ..files_of_test("half-dead")

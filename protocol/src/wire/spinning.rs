@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn after_three_spins_in_vain_waits_block_at_once_until_one_tries_again() {
+    fn after_three_vain_spins_waits_block_at_once() {
         let (mut spinning, begin) = (Spinning::default(), Instant::now());
         for _ in 0..VAIN_SPINS {
             assert_eq!(blocks_at(&mut spinning, begin, &[0, 100]), Some(100));

@@ -2,21 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-/// What bytes claim to be; a campaign counts the two apart.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    /// Something that arrives over shared memory.
-    Message,
-    /// Something that is read from a file.
-    File,
-}
-
 /// A decoder under attack.
 #[derive(Debug, Clone, Copy)]
 pub struct Target {
     /// Also its folder in the corpus, and its program in `fuzz/`.
     pub name: &'static str,
-    pub kind: Kind,
     /// Decodes bytes and panics if something is wrong with the decoder; returns whether they were
     /// accepted.
     pub body: fn(&[u8]) -> bool,

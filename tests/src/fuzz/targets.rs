@@ -3,47 +3,33 @@
 use super::files;
 use super::messages;
 use super::requests;
-use super::target::{Kind, Seed, Target};
+use super::target::{Seed, Target};
 use super::worlds;
 
 /// All of them.
 pub const TARGETS: [Target; 11] = [
-    message("step_request", requests::step, requests::step_seeds),
-    message("control_request", requests::control, Vec::new),
-    message(
+    target("step_request", requests::step, requests::step_seeds),
+    target("control_request", requests::control, Vec::new),
+    target(
         "step_answer",
         messages::step_answer,
         messages::step_answer_seeds,
     ),
-    message("frame", messages::frame, messages::frame_seeds),
-    message("outlook", messages::outlook, messages::outlook_seeds),
-    message("control_reply", messages::control_reply, Vec::new),
-    file("model", files::model, Vec::new),
-    file("checkpoint", files::checkpoint, files::checkpoint_seeds),
-    file("states", worlds::states, worlds::states_seeds),
-    file("snapshot", worlds::snapshot, worlds::snapshot_seeds),
-    file("recording", worlds::recording, worlds::recording_seeds),
+    target("frame", messages::frame, messages::frame_seeds),
+    target("outlook", messages::outlook, messages::outlook_seeds),
+    target("control_reply", messages::control_reply, Vec::new),
+    target("model", files::model, Vec::new),
+    target("checkpoint", files::checkpoint, files::checkpoint_seeds),
+    target("states", worlds::states, worlds::states_seeds),
+    target("snapshot", worlds::snapshot, worlds::snapshot_seeds),
+    target("recording", worlds::recording, worlds::recording_seeds),
 ];
 
 type Body = fn(&[u8]) -> bool;
 type Seeds = fn() -> Vec<Seed>;
 
-const fn message(name: &'static str, body: Body, seeds: Seeds) -> Target {
-    Target {
-        name,
-        kind: Kind::Message,
-        body,
-        seeds,
-    }
-}
-
-const fn file(name: &'static str, body: Body, seeds: Seeds) -> Target {
-    Target {
-        name,
-        kind: Kind::File,
-        body,
-        seeds,
-    }
+const fn target(name: &'static str, body: Body, seeds: Seeds) -> Target {
+    Target { name, body, seeds }
 }
 
 /// The target of a name.
@@ -75,7 +61,7 @@ mod tests {
                 let kept = std::fs::read(&path).unwrap_or_default();
                 assert!(
                     kept == bytes,
-                    "{} is not what it was made of: run `cargo run -p tests --example fuzz -- --seeds`",
+                    "{} is not what it was made of: run `cargo run -p tests --example corpus`",
                     path.display()
                 );
             }

@@ -489,7 +489,7 @@ mod tests {
     }
 
     #[test]
-    fn a_known_sensor_makes_it_the_filter_that_an_unlearned_network_leaves_alone() {
+    fn with_a_known_sensor_an_untrained_network_is_the_filter() {
         let model = emberwatch_model::Model::wildfire();
         let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
         let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");

@@ -136,7 +136,7 @@ mod tests {
     use emberwatch_model::Model;
 
     #[test]
-    fn by_default_shooting_has_the_authors_objective_and_beam_search_a_small_bonus() {
+    fn the_default_bonuses_are_the_authors_and_a_small_one() {
         let (model, config) = (Model::wildfire(), AgentConfig::default());
         let objective = |name: &str| {
             let policy = Policy::named(name, &model).expect("a known name");

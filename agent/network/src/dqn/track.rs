@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn every_step_of_an_episode_becomes_one_transition_however_short_it_is() {
+    fn each_step_of_the_shortest_episode_is_one_transition() {
         // 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6: all up to the last state, 7.
         let last = [
             over(4, 8.0, 3, 0.125),

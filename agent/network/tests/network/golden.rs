@@ -125,7 +125,7 @@ fn numbers(tensor: &Tensor) -> Vec<f32> {
 }
 
 #[test]
-fn an_update_without_dropout_reproduces_loss_gradients_and_parameters() {
+fn updates_without_dropout_reproduce_loss_and_gradients() {
     let mut golden = Golden::open("a4_update_nodropout");
     let mut network = authors_network();
     let frames = frames(&mut golden);

@@ -48,7 +48,7 @@ fn images(dtype: DType) -> Var {
 const CELLS: [[usize; 3]; 5] = [[0, 0, 0], [0, 15, 11], [1, 7, 0], [1, 8, 6], [1, 0, 11]];
 
 #[test]
-fn the_network_and_its_gradients_are_those_of_candles_layers_in_64_bits() {
+fn network_and_gradients_equal_candles_layers_in_64_bits() {
     let (ours, vars) = unet(DType::F32, Operators::Own);
     let (stock, exact) = unet(DType::F64, Operators::Stock);
     let (x, exact_x) = (images(DType::F32), images(DType::F64));

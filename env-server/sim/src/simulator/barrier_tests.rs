@@ -258,7 +258,7 @@ fn a_path_counts_for_its_step_or_not_at_all() {
 }
 
 #[test]
-fn a_deadline_begins_with_the_first_path_and_passes_to_the_nanosecond() {
+fn a_deadline_begins_with_the_first_path() {
     let (mut lab, leases) = Lab::of_three(DEADLINE);
     assert_eq!(lab.simulator.next_deadline(), None);
     let begin = lab.now;
@@ -317,7 +317,7 @@ fn a_process_that_ends_delays_nobody_and_its_path_is_not_flown() {
 }
 
 #[test]
-fn a_request_that_is_given_up_takes_its_path_back_and_may_be_sent_again() {
+fn an_abandoned_request_takes_its_path_back() {
     let (mut lab, leases) = Lab::of_three(DEADLINE);
     let ticket = lab.waits(1, leases[0], (0, 1), 0);
     lab.simulator.cancel_step(lab.now, ticket);

@@ -97,7 +97,7 @@ fn a_lost_lease_names_who_holds_its_own_robots_now() {
 }
 
 #[test]
-fn a_lost_lease_names_who_took_it_over_also_when_that_client_has_left() {
+fn a_lost_lease_names_its_taker_even_after_it_left() {
     let (mut leases, now) = (Leases::new(3), Instant::now());
     give(&mut leases, now, claim(1, 0..3, false), 11);
     give(&mut leases, now, claim(2, 0..1, true), 12);

@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
+    fn reward_counts_distinct_burning_cells_after_the_transition() {
         let rules = rules(0, Start::Centre);
         let mut episode = Episode::new(&rules, 0);
         let mut total = 0;

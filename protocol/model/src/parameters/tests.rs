@@ -135,7 +135,7 @@ fn weights_that_can_vanish_beside_the_largest_are_rejected() {
 }
 
 #[test]
-fn weights_that_can_sum_to_zero_are_rejected_on_the_grid_where_they_can() {
+fn zero_sums_of_weights_are_rejected_where_the_grid_allows_them() {
     let mut file = Model::wildfire().file;
     for entry in &mut file.kernel {
         entry.weights[1][1] = 0.0;

@@ -1,0 +1,6 @@
+//! Writes the generated files of `fuzz/corpus` again, as needed after a change of a format.
+
+fn main() -> std::io::Result<()> {
+    let mut targets = tests::fuzz::TARGETS.iter();
+    targets.try_for_each(tests::fuzz::Target::write_seeds)
+}
