@@ -38,6 +38,7 @@ pub struct Estimators {
     /// The state that pays most.
     #[pyo3(get)]
     target_state: usize,
+    #[pyo3(get)]
     n_observations: usize,
     n_worlds: usize,
     shape: Shape,
@@ -66,10 +67,10 @@ impl Estimators {
         py: Python<'_>,
         model: &str,
         prior: PyReadonlyArray3<'_, f32>,
-        kind: &str,
+        kind: &Bound<'_, PyAny>,
         n_worlds: usize,
     ) -> PyResult<Self> {
-        let kind = kind_of(py, kind, false)?;
+        let kind = kind_of(kind, false)?;
         let (model, prior) = (model_of(model)?, prior.as_array());
         let (n_states, height, width) = prior.dim();
         if n_states != model.n_states() {
@@ -95,12 +96,12 @@ impl Estimators {
         py: Python<'_>,
         checkpoint: PathBuf,
         grid: (usize, usize),
-        kind: Option<&str>,
+        kind: Option<&Bound<'_, PyAny>>,
         model: Option<&str>,
         n_worlds: usize,
     ) -> PyResult<Self> {
         let shape = shape_of(py, grid.0, grid.1)?;
-        let kind = kind.map(|name| kind_of(py, name, true)).transpose()?;
+        let kind = kind.map(|name| kind_of(name, true)).transpose()?;
         let model = model.map(model_of).transpose()?;
         let learned = py.detach(|| learners::read([&*checkpoint], &Device::Cpu));
         let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;

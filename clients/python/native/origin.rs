@@ -63,14 +63,17 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
 }
 
 /// The kind of a name, or of a label, among those that were learned or the others.
-pub fn kind_of(py: Python<'_>, name: &str, is_learned: bool) -> PyResult<&'static BeliefKind> {
+pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
         |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
-    named(name).filter(serves).ok_or_else(|| {
-        let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
-        let expected = format!("one of {}", names.join(", "));
-        invalid(py, "kind", expected, format!("'{name}'"))
-    })
+    // Text that UTF-8 cannot encode is no name either.
+    let found = name.extract::<&str>().ok().and_then(named);
+    if let Some(kind) = found.filter(serves) {
+        return Ok(kind);
+    }
+    let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
+    let expected = format!("one of {}", names.join(", "));
+    Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
 /// The error of a first belief that is none.

@@ -461,6 +461,8 @@ class Estimators:
     @property
     def target_state(self) -> int: ...
     @property
+    def n_observations(self) -> int: ...
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Number of worlds, height and width."""
 

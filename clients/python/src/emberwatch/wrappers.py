@@ -94,7 +94,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             burn_in = int(getattr(env.unwrapped, "burn_in", 0))
             known_model = _model_of(env, model)
             first = prior_of(prior, known_model, **grid, burn_in=burn_in)
-            self._belief = known(known_model, prior=first, kind=kind or "known")
+            self._belief = known(known_model, prior=first, kind="known" if kind is None else kind)
         elif prior is not None:
             raise invalid("prior", "none beside a checkpoint, which has its own", prior)
         else:

@@ -21,13 +21,14 @@ from emberwatch.belief.estimators import Belief as Belief
 from emberwatch.belief.estimators import kinds as kinds
 from emberwatch.belief.estimators import known as known
 from emberwatch.belief.estimators import load as load
+from emberwatch.belief.prior import distribution
+from emberwatch.belief.prior import initial_prior as initial_prior
+from emberwatch.belief.prior import uniform_prior as uniform_prior
 from emberwatch.belief.scoring import BeliefScores as BeliefScores
 from emberwatch.belief.scoring import score as score
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 from emberwatch.errors import invalid
 from emberwatch.model import Model
-
-_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
 
 
 class Filters:
@@ -39,7 +40,9 @@ class Filters:
 
     def __init__(self, model: Model, prior: NDArray[np.floating], n_worlds: int) -> None:
         """`prior`, shape (S, H, W), is that of each world."""
-        self._prior = _distribution(prior, n_states=model.n_states)[:, np.newaxis]
+        first = distribution(prior, n_states=model.n_states)
+        first /= first.sum(axis=0)
+        self._prior = first[:, np.newaxis]
         _, _, height, width = self._prior.shape
         self._transition = Transition(model, height=height, width=width, n_worlds=n_worlds)
         self._likelihood = np.ascontiguousarray(model.observation_matrix)
@@ -101,16 +104,6 @@ class Transition:
         return self._operator.apply(beliefs).reshape(self._shape)
 
 
-def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
-    return np.tile(model.initial[:, None, None], (1, height, width))
-
-
-def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
-    return np.full((model.n_states, height, width), 1.0 / model.n_states)
-
-
 def entropy(belief: NDArray[np.floating]) -> NDArray[np.float64]:
     """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
     total = np.zeros(belief.shape[1:])
@@ -118,18 +111,3 @@ def entropy(belief: NDArray[np.floating]) -> NDArray[np.float64]:
     for probability in belief:
         total += probability * np.log(np.where(probability > 0.0, probability, 1.0))
     return np.maximum(0.0, 0.0 - total)
-
-
-def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:
-    """A copy of the prior, each cell's sum exactly one."""
-    belief = np.array(prior, dtype=np.float64, order="C")
-    if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
-        raise invalid("prior", f"shape ({n_states}, H, W)", belief.shape)
-    total = belief.sum(axis=0)
-    fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
-    if not fine.all():
-        row, col = (int(i) for i in np.argwhere(~fine)[0])
-        got = belief[:, row, col].tolist()
-        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
-    belief /= total
-    return belief

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import as_array, as_count
+from emberwatch.belief.prior import distribution
+from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer, told
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 from emberwatch.model import Model
@@ -51,11 +52,7 @@ def known(
             states than the model; if there is no such kind; or if the model's weights can all be 0.
     """
     model = model if isinstance(model, Model) else Model.named(model)
-    given = as_array(prior, "prior", f"shape ({model.n_states}, H, W)")
-    if given.ndim != 3 or not given.size or given.dtype.kind not in "fiu":
-        expected = f"shape ({model.n_states}, H, W)"
-        raise invalid("prior", expected, f"{given.shape} of {given.dtype}")
-    numbers = np.ascontiguousarray(given, np.float32)
+    numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
     n = _n_worlds(n_worlds)
     native = _native.Estimators.known(model.toml, numbers, kind, n)
     return Belief(native, is_single=n_worlds is None)
@@ -140,6 +137,16 @@ class Belief:
         return self._native.target_state
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of its frames: (H, W), or (n_worlds, H, W)."""
+        return self._shape[1:] if self._is_single else self._shape
+
+    @property
+    def n_observations(self) -> int:
+        """Number of observed values: frames have values below, or 255 where nothing was seen."""
+        return self._native.n_observations
+
+    @property
     def belief(self) -> NDArray[np.float32]:
         """A copy: the posterior after `correct`, the predictor after `predict`."""
         beliefs = self._native.belief()
@@ -159,7 +166,8 @@ class Belief:
             keep_correlations: Whether beliefs with `+spatial` go on with what they have learned of
                 how cells vary together.
         """
-        self._native.reset(self._chosen(worlds), keep_correlations)
+        keeps = as_flag(keep_correlations, "keep_correlations")
+        self._native.reset(self._chosen(worlds), keeps)
 
     def correct(self, frames: NDArray[np.uint8], worlds: ArrayLike | slice | None = None) -> None:
         """Corrects the belief with frames (eq. 5).
@@ -188,8 +196,7 @@ class Belief:
 
         One number each, or one for each world, `(n_worlds,)`.
         """
-        target = self.target_state if target is None else as_count(target, "target", 0, 255)
-        figures = self._native.scores(self._frames(states, "states"), target)
+        figures = self._native.scores(self._frames(states, "states"), target_of(self, target))
         losses, briers, accuracies = (self._of_worlds(figure) for figure in figures)
         return losses, briers, accuracies
 
@@ -203,28 +210,41 @@ class Belief:
     def _frames(self, frames: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         """Frames or states with an axis for worlds."""
         given = as_array(frames, name, "an array")
-        expected = self._shape[1:] if self._is_single else self._shape
-        if given.shape != expected or given.dtype != np.uint8:
+        if given.shape != self.shape or given.dtype != np.uint8:
             got = f"{given.shape} and {given.dtype}"
-            raise invalid(name, f"shape {expected} and type uint8", got)
+            raise invalid(name, f"shape {self.shape} and type uint8", got)
         return given[np.newaxis] if self._is_single else given
 
     def _chosen(self, worlds: ArrayLike | slice | None) -> NDArray[np.bool_]:
         """The mask of the chosen worlds."""
         chosen = np.zeros(self._shape[0], np.bool_)
+        expected = f"a mask or indices of {len(chosen)} worlds, or a slice"
         index = slice(None) if worlds is None else worlds
         if not isinstance(index, slice):
-            index = as_array(index, "worlds", "a mask or indices")
-            index = index.astype(np.intp) if index.size == 0 and index.dtype != np.bool_ else index
+            index = as_array(index, "worlds", expected)
+            is_mask = index.dtype == np.bool_
+            if not index.size and not is_mask:
+                index = index.astype(np.intp)  # NumPy reads [] as float64
+            if index.ndim > 1 or (is_mask and index.shape != chosen.shape):
+                raise invalid("worlds", expected, told(worlds))
         try:
             chosen[index] = True
-        except IndexError as error:
-            expected = f"a mask or indices of {len(chosen)} worlds"
-            raise invalid("worlds", expected, error) from None
+        except (IndexError, TypeError, ValueError):
+            raise invalid("worlds", expected, told(worlds)) from None
         return chosen
 
     def _of_worlds(self, values: NDArray[_Number]) -> NDArray[_Number]:
         return values[0] if self._is_single else values
+
+
+def target_of(belief: Belief, target: int | None) -> int:
+    """Checks the number of a target state; None: the belief's own."""
+    names = belief.state_names
+    number = belief.target_state if target is None else as_integer(target)
+    if number is not None and not isinstance(target, bool) and 0 <= number < len(names):
+        return number
+    expected = f"an integer within 0 to {len(names) - 1} ({', '.join(names)})"
+    raise invalid("target", expected, told(target))
 
 
 def _n_worlds(n_worlds: int | None) -> int:

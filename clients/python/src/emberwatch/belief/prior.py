@@ -7,13 +7,46 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.belief import initial_prior, uniform_prior
-from emberwatch.common.arguments import as_array, as_count
+from emberwatch.common.arguments import as_array, as_count, told
 from emberwatch.errors import invalid
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
 """A prior by name, see `wrappers.BeliefObservation`."""
+
+_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
+
+
+def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
+    return np.tile(model.initial[:, None, None], (1, height, width))
+
+
+def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
+    return np.full((model.n_states, height, width), 1.0 / model.n_states)
+
+
+def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
+    """Checks that a prior has shape (S, H, W) and is a distribution in each cell.
+
+    Returns a copy in double precision.
+    """
+    expected = f"numbers of shape ({n_states}, H, W)"
+    given = as_array(prior, "prior", expected)
+    fits = given.ndim == 3 and given.shape[0] == n_states and given.size > 0
+    if not fits or given.dtype.kind not in "fiu":
+        got = told(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
+        raise invalid("prior", expected, got)
+    with np.errstate(all="ignore"):  # numbers that overflow are no probabilities
+        belief = np.array(given, np.float64, order="C")
+        is_one = np.abs(belief.sum(axis=0) - 1.0) <= _SUM_TOLERANCE
+    fine = is_one & (belief >= 0.0).all(axis=0)
+    if not fine.all():
+        row, col = (int(i) for i in np.argwhere(~fine)[0])
+        got = belief[:, row, col].tolist()
+        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
+    return belief
 
 
 @functools.lru_cache(maxsize=8)

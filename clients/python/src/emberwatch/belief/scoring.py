@@ -1,13 +1,14 @@
 """How well a belief fits recorded sequences of frames and hidden states."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.estimators import Belief
-from emberwatch.common.arguments import as_array
+from emberwatch.belief.estimators import Belief, target_of
+from emberwatch.common.arguments import as_array, told
+from emberwatch.common.codes import UNOBSERVED
 from emberwatch.errors import invalid
 
 
@@ -69,16 +70,17 @@ def score(
             sequences stays.
 
     Raises:
-        InvalidArgumentError: If shapes differ, or a value is no observation or no state of the
-            belief.
+        InvalidArgumentError: If a shape or type does not fit the belief, or a value is no
+            observation or no state of it; the belief has not changed.
         EmberwatchError: Code ``"impossible_frame"``: the belief rules a frame out.
     """
-    frames = as_array(observations, "observations", "an array")
-    truths = as_array(states, "states", "an array")
-    if truths.shape != frames.shape:
-        raise invalid("states", f"shape {frames.shape}, that of observations", truths.shape)
-    if frames.ndim not in (3, 4) or not len(frames):
-        raise invalid("observations", "shape (K, H, W) or (K, n_worlds, H, W)", frames.shape)
+    if not isinstance(cast("object", belief), Belief):
+        raise invalid("belief", "a Belief of `known` or `load`", told(belief))
+    frames = _sequence(observations, "observations", belief, belief.n_observations)
+    truths = _sequence(states, "states", belief, len(belief.state_names))
+    if len(truths) != len(frames):
+        raise invalid("states", f"{len(frames)} steps, as observations", len(truths))
+    target = target_of(belief, target)
     belief.reset(keep_correlations=keep_correlations)
     rows = list[tuple[Any, ...]]()
     for frame, truth in zip(frames, truths, strict=True):
@@ -96,3 +98,23 @@ def score(
         predicted_log_loss=np.where(n_seen > 0, -sums / np.maximum(n_seen, 1.0), np.nan),
         n_seen=n_seen.astype(np.int64),
     )
+
+
+def _sequence(
+    values: NDArray[np.uint8], name: str, belief: Belief, n_values: int
+) -> NDArray[np.uint8]:
+    """Checks the frames, or the hidden states, of K steps."""
+    shape = ", ".join(map(str, belief.shape))
+    expected = f"shape (K, {shape}) with K >= 1, and type uint8"
+    given = as_array(values, name, expected)
+    if given.shape[1:] != belief.shape or not given.size or given.dtype != np.uint8:
+        raise invalid(name, expected, f"{given.shape} and {given.dtype}")
+    is_wrong, unless = given >= n_values, ""
+    if name == "observations":
+        is_wrong &= given != UNOBSERVED
+        unless = f", or {UNOBSERVED}"
+    if is_wrong.any():
+        step, *cell = (int(i) for i in np.argwhere(is_wrong)[0])
+        where = f"{name}: step {step}, cell {tuple(cell[-2:])}"
+        raise invalid(where, f"a value below {n_values}{unless}", given[(step, *cell)])
+    return given

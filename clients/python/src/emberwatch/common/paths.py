@@ -14,6 +14,8 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
     """A path as programs, messages and GDAL take it: in UTF-8, whatever the locale is."""
     try:
         text = os.fsencode(path).decode()
+    except TypeError:
+        raise invalid(subject, "text or a path", repr(path)) from None
     except UnicodeError:
         text = "\0"
     if "\0" in text:
