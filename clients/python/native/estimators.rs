@@ -165,18 +165,22 @@ impl Estimators {
         self.check_worlds(py, "worlds", chosen.len())?;
         let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
         let State { worlds, threads } = &mut *state;
-        let n_numbers = n_chosen * self.n_numbers();
-        let made = detached(py, n_numbers, || self.origin.estimators(threads, n_chosen));
-        let made = made.map_err(|error| raise(py, &error))?;
-        let places = worlds.iter_mut().zip(chosen);
-        let places = places.filter(|(_, chosen)| **chosen);
-        for ((place, _), mut made) in places.zip(made) {
-            if keeps_correlations {
-                keep_correlations(&**place, &mut *made);
-            }
-            *place = made;
-        }
-        Ok(())
+        let chosen = worlds.iter_mut().zip(chosen);
+        let chosen = chosen.filter_map(|(world, &chosen)| chosen.then_some(world));
+        let reset = detached(py, n_chosen * self.n_numbers(), || {
+            threads.work(self.origin.is_short(n_chosen), |threads| {
+                threads.each(chosen, |world| {
+                    let mut new = self.origin.estimator()?;
+                    if keeps_correlations {
+                        keep_correlations(&**world, &mut *new);
+                    }
+                    *world = new;
+                    Ok(())
+                })
+            })
+        });
+        let reset: anyhow::Result<()> = reset.into_iter().collect();
+        reset.map_err(|error| raise(py, &error))
     }
 
     /// Corrects the chosen worlds with their frames; `frames` are those of all, `[n, H, W]`.
@@ -296,15 +300,22 @@ impl Estimators {
             .state_names(&conditions)
             .and_then(|names| Ok((names, kind.target(&conditions)?)));
         let (state_names, target_state) = names.map_err(|error| unfit(py, &error))?;
-        // A belief, its predictor and work space.
-        let of_world = 4 * state_names.len() * shape.n_cells() * size_of::<f32>();
-        let n_bytes = n_worlds.saturating_mul(of_world);
-        check_memory(
-            py,
-            format_args!("the beliefs about {n_worlds} worlds"),
-            n_bytes,
-        )?;
-        let worlds = py.detach(|| origin.estimators(&mut threads, n_worlds));
+        let memory = |of_world: usize| {
+            let what = format_args!("the beliefs about {n_worlds} worlds");
+            check_memory(py, what, n_worlds.saturating_mul(of_world))
+        };
+        // Every kind keeps a belief and its predictor. What else it needs is known once one is built.
+        memory(2 * state_names.len() * shape.n_cells() * size_of::<f32>())?;
+        let first = py.detach(|| origin.estimator());
+        let first = first.map_err(|error| unfit(py, &error))?;
+        memory(first.memory_bytes())?;
+        let others = py.detach(|| {
+            threads.work(origin.is_short(n_worlds), |threads| {
+                threads.each(1..n_worlds, |_| origin.estimator())
+            })
+        });
+        let worlds = std::iter::once(Ok(first)).chain(others);
+        let worlds: anyhow::Result<Vec<_>> = worlds.collect();
         let worlds = worlds.map_err(|error| unfit(py, &error))?;
         let mut shapes = worlds.iter().map(|world| world.belief().shape());
         if let Some(own) = shapes.find(|own| *own != shape) {

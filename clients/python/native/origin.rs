@@ -2,7 +2,6 @@
 
 use crate::belief::vanishing;
 use crate::refusal::{invalid, refused};
-use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
 use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::beliefs::{
@@ -37,16 +36,9 @@ impl Origin {
         }
     }
 
-    /// Beliefs before the first frame.
-    pub fn estimators(
-        &self,
-        threads: &mut Pool,
-        n_worlds: usize,
-    ) -> anyhow::Result<Vec<Box<dyn Estimator>>> {
-        let built = threads.work(self.is_short(n_worlds), |threads| {
-            threads.each(0..n_worlds, |_| (self.kind.build)(&self.conditions()))
-        });
-        built.into_iter().collect()
+    /// Builds the belief about one world before the first frame.
+    pub fn estimator(&self) -> anyhow::Result<Box<dyn Estimator>> {
+        (self.kind.build)(&self.conditions())
     }
 
     /// Whether a step is too short for other threads: that of the plain filter, and of one world, but for networks, whose
