@@ -76,8 +76,8 @@ class Transition:
     """The operator ``Phi`` on beliefs (eqs. 2-4) for one model on one grid.
 
     ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
-    (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
-    over ``m`` (eq. 3).
+    (A, C) the centre of the kernel (eq. 2), then divided by its sum over ``m`` (eq. 3). Outside the
+    grid ``x`` is zero, or one in the model's `edge` state.
 
     Where the weights see the cell's own state ``o``, ``phi[m | o]`` has the weights of ``o``, its
     centre tap sees ``o`` itself, and ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``: a mean

@@ -139,6 +139,8 @@ class Model(Description):
     """``b``, added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
     """Distribution of a cell at the start of the burn-in, shape (S,)."""
+    edge: int | None
+    """The state of the cells outside the grid; None: they add no weight (``edge`` in the file)."""
     zone_names: tuple[str, ...]
     """Of the zones of land; empty where all cells are alike."""
     zone_colors: tuple[Color, ...]
