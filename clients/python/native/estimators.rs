@@ -1,7 +1,6 @@
 //! Beliefs of every kind about some worlds: the agent's own estimators, fed with frames from Python.
 
 use crate::detached::detached;
-use crate::errors::check_memory;
 use crate::model::{model_of, shape_of};
 use crate::origin::{Origin, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
@@ -18,7 +17,7 @@ use emberwatch_learning::options::usual;
 use emberwatch_model::frame::FrameError;
 use emberwatch_model::{Frame, Grid, Model, Shape};
 use emberwatch_network::Device;
-use numpy::ndarray::{Array1, Array3, Array4, ArrayView3, Axis};
+use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::any::Any;
@@ -162,7 +161,6 @@ impl Estimators {
     ) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
         let State { worlds, threads } = &mut *state;
         let chosen = worlds.iter_mut().zip(chosen);
@@ -221,7 +219,6 @@ impl Estimators {
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let State { worlds, threads } = &mut *state;
         let is_short = self.origin.is_short(worlds.len());
         let worlds = worlds.iter_mut().zip(chosen);
@@ -244,7 +241,6 @@ impl Estimators {
     ) -> PyResult<(Numbers<'py>, Numbers<'py>, Numbers<'py>)> {
         let state = self.state(py)?;
         let states = states.as_array();
-        self.check_dim(py, "states", states.dim())?;
         let n_states = self.state_names.len();
         if let Some(got) = states.iter().find(|state| usize::from(**state) >= n_states) {
             return Err(invalid(
@@ -255,22 +251,15 @@ impl Estimators {
             ));
         }
         let truths: Vec<Grid<u8>> = states.outer_iter().map(|it| it.to_owned()).collect();
-        let pairs = || state.worlds.iter().map(|it| it.belief()).zip(&truths);
-        let own = self.target_state;
-        let losses: Array1<f64> = pairs()
-            .map(|(belief, truth)| log_loss(belief, truth))
-            .collect();
-        let brier: Array1<f64> = pairs()
-            .map(|(belief, truth)| brier_score(belief, truth, target, own))
-            .collect();
-        let right: Array1<f64> = pairs()
-            .map(|(belief, truth)| accuracy(belief, truth))
-            .collect();
-        Ok((
-            losses.into_pyarray(py),
-            brier.into_pyarray(py),
-            right.into_pyarray(py),
-        ))
+        let figures = |figure: &dyn Fn(&Belief, &Grid<u8>) -> f64| {
+            let pairs = state.worlds.iter().zip(&truths);
+            let figures = pairs.map(|(world, truth)| figure(world.belief(), truth));
+            PyArray1::from_iter(py, figures)
+        };
+        let brier = |belief: &Belief, truth: &Grid<u8>| {
+            brier_score(belief, truth, target, self.target_state)
+        };
+        Ok((figures(&log_loss), figures(&brier), figures(&accuracy)))
     }
 
     /// How well the beliefs predict frames `[n, H, W]`: log-likelihood, summed over the seen cells, and their number.
@@ -294,34 +283,14 @@ impl Estimators {
 
 impl Estimators {
     fn new(py: Python<'_>, origin: Origin, n_worlds: usize) -> PyResult<Self> {
-        let (kind, shape, mut threads) = (origin.kind, origin.shape, Pool::default());
+        let kind = origin.kind;
         let conditions = origin.conditions();
         let names = kind
             .state_names(&conditions)
             .and_then(|names| Ok((names, kind.target(&conditions)?)));
         let (state_names, target_state) = names.map_err(|error| unfit(py, &error))?;
-        let memory = |of_world: usize| {
-            let what = format_args!("the beliefs about {n_worlds} worlds");
-            check_memory(py, what, n_worlds.saturating_mul(of_world))
-        };
-        // Every kind keeps a belief and its predictor. What else it needs is known once one is built.
-        memory(2 * state_names.len() * shape.n_cells() * size_of::<f32>())?;
-        let first = py.detach(|| origin.estimator());
-        let first = first.map_err(|error| unfit(py, &error))?;
-        memory(first.memory_bytes())?;
-        let others = py.detach(|| {
-            threads.work(origin.is_short(n_worlds), |threads| {
-                threads.each(1..n_worlds, |_| origin.estimator())
-            })
-        });
-        let worlds = std::iter::once(Ok(first)).chain(others);
-        let worlds: anyhow::Result<Vec<_>> = worlds.collect();
-        let worlds = worlds.map_err(|error| unfit(py, &error))?;
-        let mut shapes = worlds.iter().map(|world| world.belief().shape());
-        if let Some(own) = shapes.find(|own| *own != shape) {
-            let expected = format!("a belief on {shape}");
-            return Err(invalid(py, "checkpoint", expected, own));
-        }
+        let mut threads = Pool::default();
+        let worlds = origin.estimators(py, &mut threads, n_worlds, state_names.len())?;
         let of_model = origin.model.as_ref().map(Model::n_observations);
         let likelihood = worlds.first().and_then(|world| world.likelihood());
         let of_belief = likelihood.map(|likelihood| likelihood.ncols());
@@ -331,7 +300,7 @@ impl Estimators {
             state_names,
             target_state,
             n_worlds,
-            shape,
+            shape: origin.shape,
             state: Mutex::new(State { worlds, threads }),
             origin,
         })
@@ -354,31 +323,6 @@ impl Estimators {
         }
     }
 
-    fn check_worlds(&self, py: Python<'_>, what: &str, got: usize) -> PyResult<()> {
-        if got == self.n_worlds {
-            return Ok(());
-        }
-        Err(invalid(
-            py,
-            what,
-            format!("one for each of {} worlds", self.n_worlds),
-            got,
-        ))
-    }
-
-    fn check_dim(&self, py: Python<'_>, what: &str, got: (usize, usize, usize)) -> PyResult<()> {
-        let expected = (self.n_worlds, self.shape.height(), self.shape.width());
-        if got == expected {
-            return Ok(());
-        }
-        Err(invalid(
-            py,
-            what,
-            format!("shape {expected:?}"),
-            format!("{got:?}"),
-        ))
-    }
-
     /// The frames of the chosen worlds.
     fn frames(
         &self,
@@ -386,8 +330,6 @@ impl Estimators {
         frames: ArrayView3<'_, u8>,
         chosen: &[bool],
     ) -> PyResult<Vec<Option<Frame>>> {
-        self.check_dim(py, "frame", frames.dim())?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let frames = frames.as_standard_layout();
         let worlds = frames.outer_iter().zip(chosen);
         let frame = |(frame, &chosen): (numpy::ndarray::ArrayView2<'_, u8>, &bool)| {

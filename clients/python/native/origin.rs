@@ -1,7 +1,9 @@
 //! What beliefs of every kind are made from: a model and a first belief, or a checkpoint.
 
 use crate::belief::vanishing;
+use crate::errors::check_memory;
 use crate::refusal::{invalid, refused};
+use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
 use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::beliefs::{
@@ -39,6 +41,37 @@ impl Origin {
     /// Builds the belief about one world before the first frame.
     pub fn estimator(&self) -> anyhow::Result<Box<dyn Estimator>> {
         (self.kind.build)(&self.conditions())
+    }
+
+    /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states, if there is memory for them.
+    pub fn estimators(
+        &self,
+        py: Python<'_>,
+        threads: &mut Pool,
+        n_worlds: usize,
+        n_states: usize,
+    ) -> PyResult<Vec<Box<dyn Estimator>>> {
+        let memory = |of_world: usize| {
+            let what = format_args!("the beliefs about {n_worlds} worlds");
+            check_memory(py, what, n_worlds.saturating_mul(of_world))
+        };
+        // Every kind keeps a belief and its predictor. The first world, once built, says what it needs in all.
+        memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
+        let first = py.detach(|| self.estimator());
+        let first = first.map_err(|error| unfit(py, &error))?;
+        let (expected, got) = (self.shape, first.belief().shape());
+        if got != expected {
+            let expected = format!("a belief on {expected}");
+            return Err(invalid(py, "checkpoint", expected, got));
+        }
+        memory(first.memory_bytes())?;
+        let others = py.detach(|| {
+            threads.work(self.is_short(n_worlds), |threads| {
+                threads.each(1..n_worlds, |_| self.estimator())
+            })
+        });
+        let worlds: anyhow::Result<Vec<_>> = std::iter::once(Ok(first)).chain(others).collect();
+        worlds.map_err(|error| unfit(py, &error))
     }
 
     /// Whether a step is too short for other threads: that of the plain filter, and of one world, but for networks, whose

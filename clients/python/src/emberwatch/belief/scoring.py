@@ -37,9 +37,8 @@ class BeliefScores:
         """
         figures = ("log_loss", "brier", "accuracy")
         means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}
-        sums = np.where(self.n_seen > 0, self.predicted_log_loss * self.n_seen, 0.0).sum(axis=0)
-        n_seen = self.n_seen.sum(axis=0)
-        means["predicted_log_loss"] = np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)[()]
+        sums = np.nansum(self.predicted_log_loss * self.n_seen, axis=0)
+        means["predicted_log_loss"] = _per_cell(sums, self.n_seen.sum(axis=0))[()]
         return means
 
 
@@ -95,9 +94,14 @@ def score(
         log_loss=losses,
         brier=briers,
         accuracy=accuracies,
-        predicted_log_loss=np.where(n_seen > 0, -sums / np.maximum(n_seen, 1.0), np.nan),
+        predicted_log_loss=_per_cell(-sums, n_seen),
         n_seen=n_seen.astype(np.int64),
     )
+
+
+def _per_cell(sums: NDArray[np.float64], n_seen: NDArray[Any]) -> NDArray[np.float64]:
+    """Divides sums by numbers of seen cells; NaN where no cell was seen."""
+    return np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)
 
 
 def _sequence(
