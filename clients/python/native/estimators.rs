@@ -1,4 +1,4 @@
-//! Beliefs of every kind about some worlds: the agent's own estimators, fed with frames from Python.
+//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which frames correct.
 
 use crate::detached::detached;
 use crate::model::{model_of, shape_of};
@@ -24,17 +24,18 @@ use std::any::Any;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
-/// One number for each world.
+/// One number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
 
-/// Beliefs about some worlds. Threads cannot share them.
+/// Beliefs about `n` worlds. Threads cannot share them. `chosen` is a mask of worlds, `[n]`; the Python class has
+/// checked the shapes of all arrays.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Estimators {
     #[pyo3(get)]
     kind: &'static str,
     #[pyo3(get)]
     state_names: Vec<String>,
-    /// The state that pays most.
+    /// The state that pays most; states are numbered from 0.
     #[pyo3(get)]
     target_state: usize,
     #[pyo3(get)]
@@ -45,11 +46,13 @@ pub struct Estimators {
     state: Mutex<State>,
 }
 
+/// The estimators and their threads, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
     threads: Pool,
 }
 
+/// Copies what a spatial filter has learned about how cells vary together; does nothing for other kinds.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
     let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
@@ -60,7 +63,7 @@ fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
 
 #[pymethods]
 impl Estimators {
-    /// Of a known model; `prior` is the first belief in each world, `[S, H, W]`.
+    /// Builds beliefs of a known model. `prior`: the first belief about each world, `[S, H, W]`.
     #[staticmethod]
     fn known(
         py: Python<'_>,
@@ -89,7 +92,8 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Of a checkpoint; without `kind`, of the belief that it holds. With a model, the checkpoint must fit its worlds.
+    /// Loads beliefs from a checkpoint: of `kind`, or of the kind that the checkpoint is for. With a model, checks that
+    /// the checkpoint fits its worlds.
     #[staticmethod]
     fn load(
         py: Python<'_>,
@@ -106,7 +110,7 @@ impl Estimators {
         let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
         let kind = kind.unwrap_or_else(|| usual(&learned));
         if kind.learned_by.is_none() {
-            let got = format!("one on the belief '{}': use known(model)", kind.name);
+            let got = format!("decisions on the belief '{}': use known(model)", kind.name);
             return Err(invalid(py, "checkpoint", "a learned belief", got));
         }
         let form = model.as_ref().map(|model| WorldForm::of(model, shape));
@@ -122,13 +126,13 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Number of worlds, height and width.
+    /// Returns the number of worlds, the height and the width.
     #[getter]
     fn shape(&self) -> (usize, usize, usize) {
         (self.n_worlds, self.shape.height(), self.shape.width())
     }
 
-    /// The beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
+    /// Returns the beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
     fn belief<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray4<f32>>> {
         let state = self.state(py)?;
         let (height, width) = self.shape.dim();
@@ -140,7 +144,7 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// The entropy of each cell in nats, `[n, H, W]`.
+    /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let state = self.state(py)?;
         let (height, width) = self.shape.dim();
@@ -151,8 +155,8 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Begins again in the chosen worlds, with the first belief. `keeps_correlations`: with what spatial filters have
-    /// learned of how cells vary together.
+    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep what they have
+    /// learned about how cells vary together.
     fn reset(
         &self,
         py: Python<'_>,
@@ -181,7 +185,7 @@ impl Estimators {
         reset.map_err(|error| raise(py, &error))
     }
 
-    /// Corrects the chosen worlds with their frames; `frames` are those of all, `[n, H, W]`.
+    /// Corrects the beliefs about the chosen worlds with their frames; `frames` holds one per world, `[n, H, W]`.
     fn correct(
         &self,
         py: Python<'_>,
@@ -215,7 +219,7 @@ impl Estimators {
         })
     }
 
-    /// Moves the beliefs about the chosen worlds one step ahead.
+    /// Predicts: moves the beliefs about the chosen worlds from X_k to X_{k+1}.
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
@@ -231,8 +235,8 @@ impl Estimators {
         Ok(())
     }
 
-    /// How well the beliefs fit hidden states `[n, H, W]`: negative log-likelihood, Brier score of the state `target`,
-    /// share of cells whose most probable state is right.
+    /// Scores the beliefs against hidden states `[n, H, W]`. Returns the log loss, the Brier score for the state
+    /// `target`, and the share of cells whose most probable state is right.
     fn scores<'py>(
         &self,
         py: Python<'py>,
@@ -262,7 +266,8 @@ impl Estimators {
         Ok((figures(&log_loss), figures(&brier), figures(&accuracy)))
     }
 
-    /// How well the beliefs predict frames `[n, H, W]`: log-likelihood, summed over the seen cells, and their number.
+    /// Scores the beliefs' predictions of frames `[n, H, W]`. Returns the log-likelihood, summed over the observed
+    /// cells, and their number.
     fn score_frames<'py>(
         &self,
         py: Python<'py>,
@@ -306,24 +311,27 @@ impl Estimators {
         })
     }
 
-    /// Numbers of the belief about a world.
+    /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
     }
 
-    /// The worlds, for this thread.
+    /// Locks the worlds for this thread.
+    ///
+    /// # Errors
+    /// If another thread is using them.
     fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         match self.state.try_lock() {
             Ok(state) => Ok(state),
             Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
             Err(TryLockError::WouldBlock) => {
-                let expected = "one for each thread";
-                Err(invalid(py, "belief", expected, "one in use by another"))
+                let expected = "a belief that no other thread is using";
+                Err(invalid(py, "belief", expected, "one in use"))
             }
         }
     }
 
-    /// The frames of the chosen worlds.
+    /// Decodes the frames of the chosen worlds; `None` for the other worlds.
     fn frames(
         &self,
         py: Python<'_>,
@@ -355,6 +363,7 @@ impl Estimators {
     }
 }
 
+/// Predicts all worlds, together where the kind can.
 fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     match worlds.first().and_then(|first| first.predict_together()) {
         Some(together) => together(worlds),
@@ -364,7 +373,7 @@ fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     }
 }
 
-/// The error of a belief that did not take a frame.
+/// Makes the error of a belief that could not be built, or not be corrected with a frame.
 pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     let is_impossible = matches!(
         error.downcast_ref::<EstimatorError>(),

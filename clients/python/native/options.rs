@@ -26,7 +26,7 @@ use std::sync::OnceLock;
 /// Features and paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
 
-/// Names of the options, and names of the features that describe each plan.
+/// Returns the names of the options, and the names of the features that describe each plan.
 #[pyfunction]
 pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     (
@@ -35,7 +35,7 @@ pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     )
 }
 
-/// Name of each estimator that options can be planned on, and what it is.
+/// Returns the name and a description of each estimator on which options can be planned.
 #[pyfunction]
 pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
     let serves = |kind: &&BeliefKind| beliefs::of_options(kind.label).is_ok();
@@ -56,7 +56,7 @@ pub struct Spec<'py> {
     airspace: Given<'py>,
 }
 
-/// A file's text.
+/// A model or a description.
 #[derive(FromPyObject)]
 struct Text {
     toml: String,
@@ -68,7 +68,7 @@ pub struct Options {
     /// Name of the estimator that keeps the beliefs.
     #[pyo3(get)]
     estimator: String,
-    /// How the first belief is made, once it is needed.
+    /// What `prior` is computed from.
     first: (Prior, Model),
     prior: OnceLock<Belief>,
     worlds: Owned<PlannedWorlds>,
@@ -76,8 +76,8 @@ pub struct Options {
 
 #[pymethods]
 impl Options {
-    /// Checks all arguments; beliefs begin later. `watched`: the instance on which beliefs are shown, and its first
-    /// world here.
+    /// Checks all arguments; [`Self::begin`] starts beliefs. `watched`: the instance in which beliefs are published,
+    /// and the number there of the first world here.
     #[new]
     fn new(
         py: Python<'_>,
@@ -129,8 +129,8 @@ impl Options {
         })
     }
 
-    /// New beliefs, before the first frame of some worlds with these seeds; the first time the first one may be
-    /// simulated.
+    /// Starts episodes: gives each of `worlds` the first belief and a seed. The first call may simulate that belief,
+    /// which takes seconds.
     fn begin(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
         let prior = match self.prior.get() {
             Some(prior) => prior,
@@ -154,7 +154,7 @@ impl Options {
         })
     }
 
-    /// Kind and bytes of the belief about a world, for the next client.
+    /// Returns the kind and the bytes of the belief about a world, for the next client.
     fn left(&self, py: Python<'_>, world: usize) -> PyResult<Option<(String, Vec<u8>)>> {
         self.worlds.with(py, |worlds| {
             let agent = worlds.world(world)?.agent();
@@ -162,7 +162,7 @@ impl Options {
         })
     }
 
-    /// Updates beliefs with an earlier step of some worlds: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
+    /// Updates beliefs with an earlier step of `worlds`: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
     fn see(
         &self,
         py: Python<'_>,
@@ -180,9 +180,9 @@ impl Options {
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates beliefs with the present step of some worlds, unless they include it already, and plans all options.
-    /// Features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds; `flown`: which
-    /// options brought them there.
+    /// Updates beliefs with the present step of `worlds`, then plans all options. Without `frames`, the beliefs include
+    /// the step already. `flown`: the options that the robots have just flown. Returns features
+    /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
     fn plan<'py>(
         &self,
         py: Python<'py>,
@@ -211,7 +211,7 @@ impl Options {
     }
 }
 
-/// The model that filters know, or a stand-in where the worlds' model is hidden.
+/// Returns the worlds' model. If it is hidden, and the estimator needs none, returns a stand-in without dynamics.
 fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Model> {
     if let Some(model) = &spec.model {
         return model_of(&model.toml);

@@ -158,7 +158,8 @@ impl PlannedWorlds {
         Ok(rows)
     }
 
-    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of the last plans of all worlds.
+    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of the last plans of all
+    /// worlds.
     pub fn plans(&self) -> (Array3<f32>, Array3<u8>) {
         let dim = (self.worlds.len(), OPTIONS.len());
         let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));

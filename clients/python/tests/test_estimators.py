@@ -1,4 +1,4 @@
-"""Beliefs of every kind: the Rust agent's numbers, many worlds as each alone, and refusals."""
+"""Beliefs of every kind: equal to the Rust agent's, one world or many; refusals of bad input."""
 
 import re
 import subprocess
@@ -29,7 +29,7 @@ N_WORLDS = 3
 KNOWN = [name for name in belief.kinds() if name.startswith("known")]
 LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
 
-#: Kinds, and the checkpoints of those that were learned.
+#: Kinds, and for learned kinds a checkpoint.
 CASES: list[tuple[str, str | None]] = [
     *((kind, None) for kind in KNOWN),
     *((kind, "learned_filter") for kind in LEARNED),
@@ -78,7 +78,7 @@ def made(kind: str, checkpoint: Path | None, n_worlds: int | None = None) -> Bel
 
 
 def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArray[np.float32]]:
-    """The beliefs before each step of agents whose estimator is of a kind, `(S, n, H, W)`."""
+    """Yields the beliefs of agents with this estimator before each step, `(S, n, H, W)`."""
     spec = types.SimpleNamespace(
         **GRID,
         n_moves=16,
@@ -112,7 +112,7 @@ def test_beliefs_are_the_agents_to_the_bit(
             single.correct(frames[world])
             assert (many.belief[:, world] == single.belief).all()
             single.predict()
-            # Bit for bit, as the agent's.
+            # Equal to the agent in every bit, signs of zeros included.
             assert single.belief.tobytes() == expected[:, world].tobytes()
         many.predict()
         assert many.belief.tobytes() == expected.tobytes()
@@ -210,7 +210,7 @@ def test_certainty_that_is_wrong_costs_infinitely_much() -> None:
     assert belief.score(kept, nothing, np.array([[[0, 2]]], np.uint8), target=0).brier[0] == 0.5
 
 
-#: Wrong arguments of `known`, each beside right ones, and the errors.
+#: Arguments of `known`, of which one is wrong, and the errors.
 KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"model": 7}, "model: expected text or a path, got 7"),
     ({"kind": "learned"}, f"kind: expected one of {', '.join(KNOWN)}, got 'learned'"),
@@ -239,7 +239,7 @@ WORLDS = "worlds: expected a mask or indices of 3 worlds, or a slice, got "
 
 
 def of_frame(value: int) -> NDArray[np.uint8]:
-    """Two frames; the last cell of the second has this value."""
+    """Returns two frames whose only observed value is in the last cell of the second."""
     frames = np.stack([FRAME, FRAME])
     frames[1, -1, -1] = value
     return frames
@@ -336,7 +336,7 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
         made("known", checkpoints / "learned_filter")
     with refuses("kind: expected one of learned, .*, got 3"):
         made(3, checkpoints / "learned_filter")  # pyright: ignore[reportArgumentType]
-    # No checkpoint, one of another kind, and one that fits other worlds.
+    # No checkpoint, a checkpoint of another kind, and checkpoints of other worlds.
     (tmp_path / "text").write_text("no checkpoint")
     with refuses("checkpoint .*text: expected a whole safetensors file"):
         belief.load(tmp_path / "text", **GRID)
@@ -357,7 +357,7 @@ def test_a_neural_belief_with_a_known_sensor_weighs_what_it_sees(checkpoints: Pa
 
     plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
     shows = MODEL.observation_matrix.T
-    # But where a state would be less than impossible, beliefs show what the network predicts.
+    # Except where the inverse of the sensor gives a negative probability, which is cut off.
     possible = (noisy.belief > 1e-5).all(0)
     shown = np.tensordot(shows, noisy.belief, 1)
     assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)

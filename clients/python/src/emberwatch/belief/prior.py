@@ -1,4 +1,4 @@
-"""What can be known about a world before its first frame: a filter's first belief."""
+"""Priors: a filter's belief about a world before its first frame."""
 
 import functools
 from typing import Literal
@@ -18,12 +18,12 @@ _SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 flo
 
 
 def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
+    """Returns the model's distribution at the start of the burn-in in each cell, (S, H, W)."""
     return np.tile(model.initial[:, None, None], (1, height, width))
 
 
 def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
+    """Returns equal probabilities of all states, (S, H, W), as in the authors' demonstration."""
     return np.full((model.n_states, height, width), 1.0 / model.n_states)
 
 
@@ -38,7 +38,7 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
     if not fits or given.dtype.kind not in "fiu":
         got = told(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
         raise invalid("prior", expected, got)
-    with np.errstate(all="ignore"):  # numbers that overflow are no probabilities
+    with np.errstate(all="ignore"):  # what overflows is refused below
         belief = np.array(given, np.float64, order="C")
         is_one = np.abs(belief.sum(axis=0) - 1.0) <= _SUM_TOLERANCE
     fine = is_one & (belief >= 0.0).all(axis=0)
@@ -51,11 +51,11 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
-    """How often each cell of 64 simulated worlds is in each state after the burn-in.
+    """Returns how often each cell of 64 simulated worlds is in each state after the burn-in.
 
-    Their seeds do not depend on any environment's. Shape (S, H, W); the same array again for the
-    same arguments, so it cannot be written to. The agents' beliefs begin with it, too, and it is
-    kept for later processes where they keep theirs, in ``~/.cache/emberwatch``.
+    Shape (S, H, W), read-only: calls with the same arguments share the array. The seeds of these
+    worlds are fixed and belong to no environment. The agent starts from the same prior. The first
+    call simulates for some seconds; later processes read the prior from ``~/.cache/emberwatch``.
     """
     height = as_count(height, "height", 1, _native.MAX_SIDE)
     width = as_count(width, "width", 1, _native.MAX_SIDE)
@@ -73,7 +73,10 @@ def prior_of(
     width: int,
     burn_in: int,
 ) -> NDArray[np.floating]:
-    """A prior by name, or as given; None: ``"simulated"`` after a burn-in, else ``"initial"``."""
+    """Returns a prior by name, or the given array after a check of its shape.
+
+    None: ``"simulated"`` after a burn-in, ``"initial"`` without one.
+    """
     if prior is None:
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):

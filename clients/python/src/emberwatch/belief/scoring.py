@@ -1,4 +1,4 @@
-"""How well a belief fits recorded sequences of frames and hidden states."""
+"""Scores of a belief on recorded sequences of frames and hidden states."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -14,26 +14,27 @@ from emberwatch.errors import invalid
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeliefScores:
-    """Figures of each step: shape (K,), or (K, n_worlds) of a belief about several worlds."""
+    """Scores of each step: shape (K,), or (K, n_worlds) for a belief about several worlds."""
 
     #: Mean over all cells of ``-log p`` in nats, with `p` the posterior probability of the cell's
-    #: state: 0 is perfect; infinite where a state was ruled out that is there.
+    #: true state. 0 is perfect; infinite if the belief ruled out the true state of a cell.
     log_loss: NDArray[np.float64]
     #: Mean over all cells of ``(p - 1[state is the target])**2``, with `p` the posterior
-    #: probability of the target state: 0 is perfect, 1 the worst.
+    #: probability of the target state. 0 is perfect, 1 is the worst.
     brier: NDArray[np.float64]
-    #: Share of the cells whose most probable state is the true one, 0 to 1.
+    #: Share of the cells whose most probable state is the true state, 0 to 1.
     accuracy: NDArray[np.float64]
-    #: Of the predictor, before the frame: mean over the seen cells of ``-log P(y)`` in nats; NaN in
-    #: steps without a seen cell.
+    #: Mean over the observed cells of ``-log P(y)`` in nats, with ``P(y)`` the probability of the
+    #: observation `y` under the predictor. NaN in steps without an observed cell.
     predicted_log_loss: NDArray[np.float64]
-    #: Seen cells.
+    #: Number of observed cells.
     n_seen: NDArray[np.int64]
 
     def mean(self) -> dict[str, Any]:
-        """The mean of each figure over the steps, by name; one for each world if there are several.
+        """Returns the mean of each score over the steps, by name.
 
-        Steps count alike; for `predicted_log_loss`, seen cells do.
+        Each is a number, or has shape (n_worlds,). All steps have the same weight, except in
+        `predicted_log_loss`, where all observed cells have.
         """
         figures = ("log_loss", "brier", "accuracy")
         means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}
@@ -50,28 +51,29 @@ def score(
     target: int | None = None,
     keep_correlations: bool = False,
 ) -> BeliefScores:
-    """Scores a belief on a recorded sequence, or on one for each of its worlds.
+    """Scores a belief on a recorded sequence, or on one sequence for each of its worlds.
 
-    The belief is reset first. In each step k it is corrected with frame k, its posterior is scored
-    against state k, and it predicts step k + 1. All cells count, seen or not.
+    Resets the belief first. In each step k it scores the prediction of frame k, corrects the belief
+    with this frame, scores the posterior against state k, and predicts step k + 1. The posterior is
+    scored in all cells, observed or not.
 
-    A learned belief numbers its states itself: `log_loss` and `accuracy` mean something only if its
-    state numbers are those of `states`. `brier` compares the belief's own target state with
-    `target`.
+    A learned belief numbers its states itself. Its `log_loss` and `accuracy` are meaningful only if
+    these numbers agree with `states`. `brier` compares the probability of the belief's own target
+    state with the cells where `states` equals `target`.
 
     Args:
         belief: Made by `known` or `load`, for one world, or for as many as there are sequences.
-        observations: Frames, shape (K, H, W), or (K, n_worlds, H, W); 255 where nothing was
-            observed. K is at least 1.
-        states: Hidden states of the same shape.
+        observations: Frames, type uint8, shape (K, H, W) or (K, n_worlds, H, W), 255 in unobserved
+            cells. K is at least 1.
+        states: Hidden states of the same shape and type, below S.
         target: The number in `states` of the state that pays most; None: the belief's own.
-        keep_correlations: As of `Belief.reset`: what a belief with `+spatial` learned on earlier
-            sequences stays.
+        keep_correlations: As in `Belief.reset`: whether kinds with `+spatial` keep what they have
+            learned on earlier sequences.
 
     Raises:
-        InvalidArgumentError: If a shape or type does not fit the belief, or a value is no
-            observation or no state of it; the belief has not changed.
-        EmberwatchError: Code ``"impossible_frame"``: the belief rules a frame out.
+        InvalidArgumentError: If an array does not have the belief's shape, type or values, or
+            `target` is no state. The belief does not change.
+        EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the belief.
     """
     if not isinstance(cast("object", belief), Belief):
         raise invalid("belief", "a Belief of `known` or `load`", told(belief))

@@ -53,7 +53,7 @@ def as_integer(value: object) -> int | None:
 
 
 def as_count(value: object, subject: str, least: int, most: int) -> int:
-    """Checks an integer that is not below `least` nor above `most`; True and False are none."""
+    """Checks an integer within `least` to `most`; refuses True and False."""
     number = None if isinstance(value, bool) else as_integer(value)
     if number is not None and least <= number <= most:
         return number
