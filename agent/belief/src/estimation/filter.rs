@@ -150,6 +150,14 @@ impl Estimator for BayesFilter {
         std::mem::swap(belief, &mut self.predictor);
     }
 
+    fn memory_bytes(&self) -> usize {
+        let prediction = self.prediction.as_ref();
+        size_of::<Self>()
+            + 2 * size_of_val(self.belief.as_slice())
+            + self.transition.memory_bytes()
+            + prediction.map_or(0, Prediction::memory_bytes)
+    }
+
     /// The predictor `u_k`, or after [`Estimator::correct`] the posterior `p_k`.
     fn belief(&self) -> &Belief {
         &self.belief

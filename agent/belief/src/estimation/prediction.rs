@@ -122,6 +122,13 @@ impl Prediction {
         self.kind
     }
 
+    /// Returns about how many bytes of memory it takes.
+    pub fn memory_bytes(&self) -> usize {
+        // Weights, and as much work space.
+        let n_weights = self.n_states * self.n_states * (1 + self.offsets.len());
+        2 * (size_of_val(&*self.beliefs) + n_weights * size_of::<Lanes>())
+    }
+
     /// Whether corrections of the belief must be told, see [`Self::correct`].
     pub fn has_cavities(&self) -> bool {
         self.held.is_some()

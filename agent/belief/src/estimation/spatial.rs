@@ -124,6 +124,11 @@ impl Estimator for SpatialFilter {
         self.ages.grow();
     }
 
+    fn memory_bytes(&self) -> usize {
+        // `Ages` and `Spread` keep 10 bytes per cell.
+        self.filter.memory_bytes() + size_of::<Self>() + 10 * self.ages.as_slice().len()
+    }
+
     fn belief(&self) -> &Belief {
         self.filter.belief()
     }
