@@ -109,12 +109,11 @@ impl Prediction {
         prediction
     }
 
-    /// Begins with a belief: all cavities have it.
-    pub fn begin(&mut self, belief: &Belief) {
-        let states = belief.as_slice().chunks_exact(self.shape.n_cells());
-        let planes = self.beliefs.chunks_exact_mut(self.planes.length);
-        for (to, from) in planes.zip(states.cycle()) {
-            self.planes.put(self.shape, from, to);
+    /// Starts every cavity from a belief.
+    fn begin(&mut self, belief: &Belief) {
+        let n_numbers = self.n_states * self.planes.length;
+        for planes in self.beliefs.chunks_exact_mut(n_numbers) {
+            self.planes.put(self.shape, belief.as_slice(), planes);
         }
     }
 
@@ -127,33 +126,55 @@ impl Prediction {
         self.held.is_some()
     }
 
-    /// Numbers of all cavities, with margins.
-    fn n_of_cavities(&self) -> usize {
-        self.beliefs.len() - self.n_states * self.planes.length
+    /// Returns the number of cavities: one per neighbour, or 0.
+    fn n_cavities(&self) -> usize {
+        self.held.map_or(0, |_| self.offsets.len())
     }
 
-    /// Bytes of [`Self::to_bytes`].
+    /// Returns where the belief itself starts in `beliefs`: after the cavities.
+    fn start_of_belief(&self) -> usize {
+        self.n_cavities() * self.n_states * self.planes.length
+    }
+
+    /// Returns the number of bytes of [`Self::to_bytes`].
     pub fn n_bytes(&self) -> usize {
-        4 * self.n_of_cavities()
+        4 * self.n_cavities() * self.n_states * self.shape.n_cells()
     }
 
-    /// The cavities as bytes: what it knows that the belief does not tell.
+    /// Returns the cavities, which the belief does not contain: each `[S, H, W]`, row-major, as little-endian `f32`.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let cavities = &self.beliefs[..self.n_of_cavities()];
-        cavities.iter().flat_map(|p| p.to_le_bytes()).collect()
+        let mut bytes = Vec::with_capacity(self.n_bytes());
+        let cavities = &self.beliefs[..self.start_of_belief()];
+        for plane in cavities.chunks_exact(self.planes.length) {
+            for row in 0..self.shape.height() {
+                let cells = &plane[self.planes.place([row, 0])..][..self.shape.width()];
+                bytes.extend(cells.iter().flat_map(|p| p.to_le_bytes()));
+            }
+        }
+        bytes
     }
 
-    /// Goes on from such bytes of the same prediction and grid. Returns false, and changes nothing, if they do not fit.
+    /// Loads the cavities from the bytes of a prediction with the same weights, kind and grid.
+    ///
+    /// Returns false and changes nothing if the length differs or a cavity is no belief, see [`Belief::from_bytes`].
     pub fn restore(&mut self, bytes: &[u8]) -> bool {
-        let (numbers, rest) = bytes.as_chunks::<4>();
-        let numbers: Vec<f32> = numbers.iter().map(|&p| f32::from_le_bytes(p)).collect();
-        let n = self.n_of_cavities();
-        let is_belief = |p: &f32| (0.0..=1.001).contains(p);
-        let fits = numbers.len() == n && rest.is_empty() && numbers.iter().all(is_belief);
-        if fits {
-            self.beliefs[..n].copy_from_slice(&numbers);
+        if bytes.len() != self.n_bytes() {
+            return false;
         }
-        fits
+        let (height, width) = self.shape.dim();
+        let dim = (self.n_states, height, width);
+        let cavities = bytes.chunks_exact(4 * self.n_states * self.shape.n_cells());
+        let cavities: Option<Vec<_>> = cavities.map(|it| Belief::from_bytes(it, dim)).collect();
+        let Some(cavities) = cavities else {
+            return false;
+        };
+        let planes = self
+            .beliefs
+            .chunks_exact_mut(self.n_states * self.planes.length);
+        for (to, cavity) in planes.zip(&cavities) {
+            self.planes.put(self.shape, cavity.as_slice(), to);
+        }
+        true
     }
 
     /// Writes the predictor of a posterior, both `[S, H, W]`, and predicts the cavities.
@@ -161,16 +182,14 @@ impl Prediction {
     /// # Panics
     /// If one of them has another length.
     pub fn predict(&mut self, belief: &[f32], predictor: &mut [f32]) {
-        let (n_cells, at) = (self.shape.n_cells(), self.n_of_cavities());
+        let (n_cells, start) = (self.shape.n_cells(), self.start_of_belief());
         assert_eq!(
             belief.len(),
             self.n_states * n_cells,
             "belief: expected [S, H, W]"
         );
-        let planes = self.beliefs[at..].chunks_exact_mut(self.planes.length);
-        for (to, from) in planes.zip(belief.chunks_exact(n_cells)) {
-            self.planes.put(self.shape, from, to);
-        }
+        self.planes
+            .put(self.shape, belief, &mut self.beliefs[start..]);
         vectorised(
             #[inline(always)]
             || {
@@ -191,7 +210,7 @@ impl Prediction {
     fn predict_cells(&mut self, [row, col]: [usize; 2], chunk: usize, predictor: &mut [f32]) {
         let slots = self.layout.slots(chunk);
         let at = self.planes.place([row, col]);
-        let of_belief = self.n_of_cavities();
+        let of_belief = self.start_of_belief();
         let of_state = self.planes.length;
         for (index, act) in self.layout.acts.iter().enumerate() {
             let is_held = self.held == Some(index);
@@ -220,8 +239,7 @@ impl Prediction {
             let lanes = self.mixed(state, slots, of_belief + at, None);
             predictor[state * n_cells + first..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
         }
-        let n_cavities = self.held.map_or(0, |_| self.offsets.len());
-        for cavity in 0..n_cavities {
+        for cavity in 0..self.n_cavities() {
             let plane = cavity * self.n_states * of_state + at;
             for state in 0..self.n_states {
                 let lanes = self.mixed(state, slots, plane, Some(cavity));

@@ -39,11 +39,13 @@ impl Planes {
         (row * self.stride + col) as isize - self.place([0, 0]) as isize
     }
 
-    /// Copies a grid's cells, row-major, into a plane.
-    pub fn put(&self, shape: Shape, from: &[f32], to: &mut [f32]) {
-        let width = shape.width();
-        for (row, from) in from.chunks_exact(width).enumerate() {
-            to[self.place([row, 0])..][..width].copy_from_slice(from);
+    /// Copies a belief, `[S, H, W]`, into the planes of its states.
+    pub fn put(&self, shape: Shape, belief: &[f32], planes: &mut [f32]) {
+        let states = belief.chunks_exact(shape.n_cells());
+        for (cells, plane) in states.zip(planes.chunks_exact_mut(self.length)) {
+            for (row, cells) in cells.chunks_exact(shape.width()).enumerate() {
+                plane[self.place([row, 0])..][..shape.width()].copy_from_slice(cells);
+            }
         }
     }
 }

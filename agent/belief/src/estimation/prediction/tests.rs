@@ -407,3 +407,54 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
         }
     }
 }
+
+#[test]
+fn restored_cavities_predict_the_same_and_other_bytes_are_refused() {
+    let (kernels, bias) = (fire(), [0.0; 3]);
+    let weights = Weights {
+        kernels: &kernels,
+        bias: &bias,
+        zones: (None, 1),
+        edge: Some(2),
+    };
+    let shape = Shape::new(3, 35).expect("shape");
+    let mut first_belief = belief(3, shape, 3);
+    let new = |kind| Prediction::new(weights, kind, &belief(3, shape, 4));
+    let (mut first, mut second) = (new(PredictionKind::Cavities), new(PredictionKind::Cavities));
+    predict(&mut first, &mut first_belief);
+    let (bytes, unchanged) = (first.to_bytes(), second.beliefs.clone());
+    // Eight neighbours.
+    assert_eq!(bytes.len(), 4 * 8 * 3 * 3 * 35);
+    let with = |number: usize, p: f32| {
+        let mut bytes = bytes.clone();
+        bytes[4 * number..][..4].copy_from_slice(&p.to_le_bytes());
+        bytes
+    };
+    let last = bytes.len() / 4 - 1;
+    for (name, refused) in [
+        ("nothing", Vec::new()),
+        ("a number too few", bytes[4..].to_vec()),
+        ("a byte too many", [&bytes[..], &[0]].concat()),
+        ("zeros", vec![0; bytes.len()]),
+        ("a sum over one", with(0, 1.0005)),
+        ("a negative number", with(last, -0.5)),
+        ("no number", with(last, f32::NAN)),
+    ] {
+        assert!(!second.restore(&refused), "{name}");
+        assert_eq!(second.beliefs, unchanged, "{name}");
+    }
+    assert!(second.restore(&bytes));
+    let mut second_belief = first_belief.clone();
+    predict(&mut first, &mut first_belief);
+    predict(&mut second, &mut second_belief);
+    assert_eq!(
+        (first_belief, first.to_bytes()),
+        (second_belief, second.to_bytes())
+    );
+    let mut second_order = new(PredictionKind::SecondOrder);
+    assert_eq!(
+        (second_order.n_bytes(), second_order.to_bytes().len()),
+        (0, 0)
+    );
+    assert!(second_order.restore(&[]) && !second_order.restore(&bytes));
+}
