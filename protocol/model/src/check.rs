@@ -343,10 +343,18 @@ impl Checker<'_> {
         Ok(weights)
     }
 
-    /// The state of cells outside the grid.
+    /// Finds the state of cells outside the grid, if the file names one.
     pub fn edge(&self, file: &ModelFile) -> Result<Option<usize>, ModelError> {
-        let edge = file.edge.as_deref();
-        edge.map(|name| self.state(file, name)).transpose()
+        let Some(name) = &file.edge else {
+            return Ok(None);
+        };
+        let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
+        let state = names.iter().position(|known| known == name);
+        if state.is_none() {
+            let expected = format!("the name of a state, one of {names:?}");
+            return self.wrong("edge".into(), &expected, format!("{name:?}"));
+        }
+        Ok(state)
     }
 
     fn state(&self, file: &ModelFile, name: &str) -> Result<usize, ModelError> {
