@@ -24,11 +24,11 @@ mod rows;
 use super::file::ModelError;
 use super::grid::{Grid, Shape};
 use super::parameters::Model;
-use super::vectors::vectorised;
-use layout::{LANES, Layout};
+use super::vectors::{LANES, vectorised};
+use super::zoned::ZonedNumbers;
+use layout::Layout;
 use ndarray::{Array3, Array4, NdFloat};
-use rows::{Kernels, Own, Slots, kernel_rows, taps_that_weigh_alike};
-use std::collections::HashMap;
+use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
 use std::sync::Arc;
 
 /// `Phi` for one model on one grid, with its work space: give each thread its own clone.
@@ -42,7 +42,8 @@ pub struct Transition<T = f32> {
     /// Groups of taps that weigh alike: where each reads, relative to a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
-    land: Arc<Land<T>>,
+    /// The weights that differ between zones.
+    slots: Arc<ZonedNumbers<T>>,
     /// The belief with a margin of zeros, in the plane of the edge's state of ones.
     planes: Vec<T>,
     /// The inputs of each group, added up.
@@ -51,55 +52,6 @@ pub struct Transition<T = f32> {
     weights: Vec<[T; LANES]>,
     /// The same in one own state.
     own_weights: Vec<[T; LANES]>,
-}
-
-/// What differs between the zones of a land.
-#[derive(Debug)]
-struct Land<T> {
-    /// Weights that differ.
-    n_slots: usize,
-    /// The pattern of zones that each [`LANES`] cells have, row by row; none where zones do not differ.
-    of_chunk: Vec<u32>,
-    /// For each pattern the slots of its lanes.
-    slots: Vec<[T; LANES]>,
-}
-
-impl<T: NdFloat> Land<T> {
-    fn new(zones: Option<&Grid<u8>>, slots: &Slots<T>) -> Self {
-        let mut land = Self {
-            n_slots: slots.len(),
-            of_chunk: Vec::new(),
-            slots: Vec::new(),
-        };
-        let mut patterns = HashMap::new();
-        for row in zones
-            .filter(|_| land.n_slots > 0)
-            .iter()
-            .flat_map(|map| map.rows())
-        {
-            for cells in row.to_vec().chunks(LANES) {
-                let mut pattern = [0; LANES];
-                pattern[..cells.len()].copy_from_slice(cells);
-                let n_known = patterns.len() as u32;
-                let number = *patterns.entry(pattern).or_insert(n_known);
-                if number == n_known {
-                    let of_lanes = |slot: &Vec<T>| pattern.map(|zone| slot[usize::from(zone)]);
-                    land.slots.extend(slots.iter().map(of_lanes));
-                }
-                land.of_chunk.push(number);
-            }
-        }
-        land
-    }
-
-    /// The slots of a chunk's lanes.
-    #[inline(always)]
-    fn slots(&self, chunk: usize) -> &[[T; LANES]] {
-        let Some(&pattern) = self.of_chunk.get(chunk) else {
-            return &[];
-        };
-        &self.slots[pattern as usize * self.n_slots..][..self.n_slots]
-    }
 }
 
 impl<T: NdFloat> Transition<T> {
@@ -160,7 +112,7 @@ impl<T: NdFloat> Transition<T> {
             own_weights: vec![[T::zero(); LANES]; n_states],
             groups,
             kernels,
-            land: Arc::new(Land::new(zones, &slots)),
+            slots: Arc::new(ZonedNumbers::new(&slots, zones)),
         }
     }
 
@@ -204,7 +156,7 @@ impl<T: NdFloat> Transition<T> {
     /// Eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
     #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     fn weigh(&mut self, at: usize, chunk: usize) {
-        let slots = self.land.slots(chunk);
+        let slots = self.slots.of_chunk(chunk);
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
         }

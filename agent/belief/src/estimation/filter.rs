@@ -111,12 +111,6 @@ impl BayesFilter {
         4 * self.belief.as_slice().len() + cavities
     }
 
-    /// Takes newer learned parameters of the same dimensions; the belief stays. It predicts by the mean field.
-    pub fn set_tables(&mut self, tables: &Tables) {
-        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
-        self.prediction = None;
-    }
-
     /// The belief and `P(y | x)`, shape `[S, O]`.
     pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
         (&self.belief, &self.likelihood)

@@ -4,6 +4,8 @@
 //! The belief is about observations, S = O: after a frame, visited cells are what they showed. With a known sensor it is
 //! about states: what a cell will show is traced back to what it is, and a frame corrects that by Bayes' rule (eq. 5).
 
+mod sensor;
+
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::{LearnedModel, SavedModel, check_target};
 use super::world_form::WorldForm;
@@ -17,7 +19,8 @@ use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, MAX_VALUES, Shape};
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
-use ndarray::{Array2, Axis, s};
+use ndarray::Array2;
+use sensor::{inverse, trace_back};
 use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::borrow::Cow;
@@ -60,9 +63,6 @@ pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     },
     ..NEURAL
 };
-
-/// What is traced back to a state is at least this.
-const LEAST: f64 = 1e-6;
 
 /// A neural belief that was learned: all that acting on it needs.
 #[derive(Debug, Clone)]
@@ -399,45 +399,6 @@ impl NeuralEstimator {
     }
 }
 
-/// Turns the distribution of what each cell shows into that of what it is, by the inverse of `P(y | x)`. No state is ruled
-/// out, as what a network predicts is no exact mixture of what states show.
-fn trace_back(shown: &mut Probabilities, inverse: &Array2<f64>) {
-    let (n, height, width) = shown.dim();
-    let mut states = vec![0.0; n];
-    for (row, col) in (0..height * width).map(|cell| (cell / width, cell % width)) {
-        for (state, p) in states.iter_mut().enumerate() {
-            let parts =
-                (0..n).map(|seen| f64::from(shown[[seen, row, col]]) * inverse[[seen, state]]);
-            *p = parts.sum::<f64>().max(LEAST);
-        }
-        let total: f64 = states.iter().sum();
-        for (state, p) in states.iter().enumerate() {
-            shown[[state, row, col]] = (p / total) as f32;
-        }
-    }
-}
-
-/// The inverse of a square matrix, by Gauss and Jordan's elimination with pivots; `None` if it has none.
-fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
-    let n = matrix.nrows();
-    let mut both = ndarray::concatenate![Axis(1), *matrix, Array2::<f64>::eye(n)];
-    for col in 0..n {
-        let size = |row: &usize| both[[*row, col]].abs();
-        let pivot = (col..n).max_by(|a, b| size(a).total_cmp(&size(b)))?;
-        if size(&pivot) < 1e-9 {
-            return None;
-        }
-        (0..2 * n).for_each(|at| both.swap([col, at], [pivot, at]));
-        let own = &both.row(col) / both[[col, col]];
-        for row in 0..n {
-            let factor = if row == col { 0.0 } else { both[[row, col]] };
-            both.row_mut(row).scaled_add(-factor, &own);
-        }
-        both.row_mut(col).assign(&own);
-    }
-    Some(both.slice(s![.., n..]).to_owned())
-}
-
 fn belief(probabilities: Probabilities) -> Belief {
     let belief = Belief::from_probabilities(probabilities);
     belief.expect("invariant: a softmax is on the simplex")
@@ -450,117 +411,4 @@ fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use emberwatch_belief::estimation::BayesFilter;
-    use emberwatch_network::{Device, Lesson};
-
-    fn estimator() -> NeuralEstimator {
-        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-        NeuralEstimator::new(&network, None, shape()).expect("a belief")
-    }
-
-    fn shape() -> Shape {
-        Shape::new(2, 3).expect("test shape")
-    }
-
-    fn frame(values: &[u8]) -> Frame {
-        Frame::from_bytes(shape(), 3, values).expect("test frame")
-    }
-
-    #[test]
-    fn visited_cells_are_what_they_showed_until_the_next_step() {
-        let mut estimator = estimator();
-        let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
-        assert!(
-            value(&estimator, 1)
-                .iter()
-                .all(|p| (p - 1.0 / 3.0).abs() < 1e-6)
-        );
-        let seen = frame(&[255, 2, 255, 255, 255, 255]);
-        estimator.correct(&seen).expect("possible");
-        assert_eq!(value(&estimator, 1), [0.0, 0.0, 1.0]);
-        assert!((value(&estimator, 0)[2] - 1.0 / 3.0).abs() < 1e-6);
-        estimator.predict();
-        assert!(
-            (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
-            "nothing is learned"
-        );
-    }
-
-    #[test]
-    fn a_known_sensor_makes_it_the_filter_that_an_unlearned_network_leaves_alone() {
-        let model = emberwatch_model::Model::wildfire();
-        let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
-        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-        let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
-            .expect("a belief")
-            .seen_through(model.likelihood().clone())
-            .expect("an inverse");
-        let mut expected = filter();
-        for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
-            own.correct(&frame(&values)).expect("possible");
-            expected.correct(&frame(&values)).expect("possible");
-            let off = (&own.belief().view() - &expected.belief().view()).mapv(f32::abs);
-            assert!(off.iter().all(|off| *off < 1e-4), "{off}");
-            own.predict();
-            expected.predict();
-        }
-    }
-
-    #[test]
-    fn many_of_several_networks_predict_together_as_each_alone() {
-        let networks = [1, 2].map(|seed| {
-            let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
-            let lesson = Lesson {
-                before: Sightings::new(shape()),
-                frame: vec![(0, 1), (4, 2)],
-                base: Vec::new(),
-            };
-            let updates = (0..3).map(|_| network.update(0.05, std::slice::from_ref(&lesson)));
-            assert!(updates.into_iter().all(|loss| loss.is_ok()));
-            network
-        });
-        let estimators = || -> Vec<Box<dyn Estimator>> {
-            let filter = || {
-                let model = emberwatch_model::Model::wildfire();
-                BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter")
-            };
-            let mut all: Vec<Box<dyn Estimator>> = vec![Box::new(filter())];
-            // Networks in turn, with a filter below and without.
-            for index in 0..8 {
-                let below = (index % 4 > 1).then(|| Box::new(filter()) as Box<dyn Estimator>);
-                let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
-                let mut estimator = estimator.expect("a belief");
-                let seen = [255, 255, index as u8 % 3, 255, 1, 255];
-                estimator.correct(&frame(&seen)).expect("possible");
-                all.push(Box::new(estimator));
-            }
-            all
-        };
-        let (mut together, mut alone) = (estimators(), estimators());
-        predict_together(together.iter_mut().map(|it| &mut **it).collect());
-        for (index, (together, alone)) in together.iter().zip(&mut alone).enumerate() {
-            let before = alone.belief().clone();
-            alone.predict();
-            assert!(together.belief() == alone.belief(), "{index}");
-            assert!(*alone.belief() != before, "{index}");
-        }
-    }
-
-    #[test]
-    fn another_goes_on_from_its_bytes() {
-        let (mut first, mut second) = (estimator(), estimator());
-        for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
-            first.correct(&frame(&values)).expect("possible");
-            first.predict();
-        }
-        let bytes = first.to_bytes();
-        assert!(!second.restore(&bytes[1..]) && second.sightings == Sightings::new(shape()));
-        assert!(second.restore(&bytes));
-        assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
-        let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
-        let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
-        assert_ne!(other.kind(), first.kind());
-    }
-}
+mod tests;

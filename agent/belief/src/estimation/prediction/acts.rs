@@ -1,10 +1,9 @@
 //! A model's weights, laid out to be read by a prediction: which neighbours weigh alike, and in which states they weigh
 //! anything.
 
-use super::lanes::{LANES, Lanes};
-use emberwatch_model::{Grid, Model, Shape};
+use emberwatch_model::zoned::ZonedNumbers;
+use emberwatch_model::{Grid, Model};
 use ndarray::Array4;
-use std::collections::HashMap;
 
 /// The weights of a model, or learned ones.
 #[derive(Debug, Clone, Copy)]
@@ -80,15 +79,12 @@ pub struct Layout {
     pub rests: Vec<Rest>,
     /// Neighbours as taps of the kernel, row and column: with own kernels all but the centre.
     pub taps: Vec<[usize; 2]>,
-    n_slots: usize,
-    /// The pattern of zones of each [`LANES`] cells of a row, row by row.
-    of_chunk: Vec<u32>,
-    /// Of each pattern the slots.
-    slots: Vec<Lanes>,
+    /// The numbers in the slots.
+    pub slots: ZonedNumbers<f32>,
 }
 
 impl Layout {
-    pub fn new(weights: Weights<'_>, shape: Shape) -> Self {
+    pub fn new(weights: Weights<'_>) -> Self {
         let mut slots = Slots::new(weights);
         let (mut acts, mut rests) = (Vec::new(), Vec::new());
         for own in 0..slots.n_own {
@@ -99,16 +95,12 @@ impl Layout {
                 acts.push(act);
             }
         }
-        let mut layout = Self {
+        Self {
             acts,
             rests,
-            n_slots: slots.of_zones.len(),
-            of_chunk: Vec::new(),
-            slots: Vec::new(),
+            slots: ZonedNumbers::new(&slots.of_zones, weights.zones.0),
             taps: slots.taps,
-        };
-        layout.lay_out(&slots.of_zones, weights.zones.0, shape);
-        layout
+        }
     }
 
     /// The act whose next states depend most on neighbours.
@@ -118,33 +110,6 @@ impl Layout {
             let influence = |act: usize| self.acts[act].influence;
             influence(*a).total_cmp(&influence(*b))
         })
-    }
-
-    /// The slots of a chunk of cells.
-    #[inline(always)]
-    pub fn slots(&self, chunk: usize) -> &[Lanes] {
-        &self.slots[self.of_chunk[chunk] as usize * self.n_slots..][..self.n_slots]
-    }
-
-    fn lay_out(&mut self, of_zones: &[Vec<f32>], zones: Option<&Grid<u8>>, shape: Shape) {
-        let mut known = HashMap::new();
-        for row in 0..shape.height() {
-            for col in (0..shape.width()).step_by(LANES) {
-                let mut pattern = [0; LANES];
-                if let Some(zones) = zones {
-                    for (lane, zone) in pattern.iter_mut().enumerate() {
-                        *zone = zones[[row, (col + lane).min(shape.width() - 1)]];
-                    }
-                }
-                let n_known = known.len() as u32;
-                let number = *known.entry(pattern).or_insert(n_known);
-                if number == n_known {
-                    let of_lanes = |slot: &Vec<f32>| pattern.map(|zone| slot[usize::from(zone)]);
-                    self.slots.extend(of_zones.iter().map(of_lanes));
-                }
-                self.of_chunk.push(number);
-            }
-        }
     }
 }
 

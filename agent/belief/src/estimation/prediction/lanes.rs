@@ -3,9 +3,7 @@
 //! Loops are written out, as closures of iterators are not always compiled for the vectors of the processor. Every lane does the same operations in the same order and none is fused, so results are bit-identical on every platform.
 
 use emberwatch_model::Shape;
-
-/// Cells that are computed at once.
-pub const LANES: usize = 32;
+pub use emberwatch_model::vectors::LANES;
 
 pub type Lanes = [f32; LANES];
 

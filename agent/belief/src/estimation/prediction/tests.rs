@@ -82,6 +82,16 @@ fn an_edge_is_a_frame_of_cells_in_its_state() {
     }
 }
 
+/// The weights of a grid without zones or an edge state.
+fn weights<'a>(kernels: &'a [Array4<f64>], bias: &'a [f64]) -> Weights<'a> {
+    Weights {
+        kernels,
+        bias,
+        zones: (None, 1),
+        edge: None,
+    }
+}
+
 /// A fire that ignites with `f / (a f + b)` from `f` of four burning neighbours, and burns out with a tenth.
 fn fire() -> Vec<Array4<f64>> {
     let (a, b) = (0.7, 1.8);
@@ -280,12 +290,7 @@ const KINDS: [PredictionKind; 3] = [
 #[test]
 fn each_cure_comes_closer_to_all_states_enumerated() {
     let (kernels, bias) = (fire(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     // Bounds: a tenth above what was measured.
     for ([height, width], one_in, n_worlds, bounds) in [
         ([2, 3], 0, 1, [0.134, 0.098, 0.076]),
@@ -318,12 +323,7 @@ fn the_second_order_is_closer_for_the_papers_kernels() {
         }
     }
     let (kernels, bias) = ([kernel], [0.01, 0.001, 0.001]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     // Bounds: a tenth above what was measured.
     for ([height, width], one_in, n_worlds, bounds) in [
         ([2, 3], 0, 1, [0.634, 0.116]),
@@ -359,12 +359,7 @@ fn learned_like() -> Vec<Array4<f64>> {
 #[test]
 fn cavities_stay_distributions_where_several_own_states_act() {
     let (kernels, bias) = (learned_like(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     let shape = Shape::new(4, 35).expect("shape");
     let mut belief = belief(3, shape, 3);
     let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
@@ -385,12 +380,7 @@ fn cavities_stay_distributions_where_several_own_states_act() {
 #[test]
 fn a_correction_changes_the_cavities_of_its_cells_alone() {
     let (kernels, bias) = (fire(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
     let mut belief = Belief::from_states(&states, 3).expect("states");
     let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
@@ -412,10 +402,8 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
 fn restored_cavities_predict_the_same_and_other_bytes_are_refused() {
     let (kernels, bias) = (fire(), [0.0; 3]);
     let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
         edge: Some(2),
+        ..weights(&kernels, &bias)
     };
     let shape = Shape::new(3, 35).expect("shape");
     let mut first_belief = belief(3, shape, 3);
