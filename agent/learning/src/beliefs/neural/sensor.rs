@@ -1,30 +1,32 @@
-//! From what cells show to what they are, through a sensor with a known observation matrix.
+//! Converts predicted observations to states by the inverse of a known observation matrix.
 
 use emberwatch_model::grid::Probabilities;
 use ndarray::{Array2, Axis, s};
 
-/// What is traced back to a state is at least this.
-const LEAST: f64 = 1e-6;
+/// Minimum probability of a state before normalisation.
+const MIN_PROBABILITY: f64 = 1e-6;
 
-/// Turns the distribution of what each cell shows into that of what it is, by the inverse of `P(y | x)`. No state is ruled
-/// out, as what a network predicts is no exact mixture of what states show.
-pub fn trace_back(shown: &mut Probabilities, inverse: &Array2<f64>) {
-    let (n, height, width) = shown.dim();
+/// Replaces each cell's distribution over observations, `[O, H, W]`, by its distribution over states.
+///
+/// `inverse` is the inverse of `P(y | x)`. A network's prediction may correspond to no distribution over states. So
+/// negative values are raised to a small minimum, and all are normalised.
+pub fn states_from_observations(probabilities: &mut Probabilities, inverse: &Array2<f64>) {
+    let (n, height, width) = probabilities.dim();
     let mut states = vec![0.0; n];
     for (row, col) in (0..height * width).map(|cell| (cell / width, cell % width)) {
         for (state, p) in states.iter_mut().enumerate() {
-            let parts =
-                (0..n).map(|seen| f64::from(shown[[seen, row, col]]) * inverse[[seen, state]]);
-            *p = parts.sum::<f64>().max(LEAST);
+            let parts = (0..n)
+                .map(|seen| f64::from(probabilities[[seen, row, col]]) * inverse[[seen, state]]);
+            *p = parts.sum::<f64>().max(MIN_PROBABILITY);
         }
         let total: f64 = states.iter().sum();
         for (state, p) in states.iter().enumerate() {
-            shown[[state, row, col]] = (p / total) as f32;
+            probabilities[[state, row, col]] = (p / total) as f32;
         }
     }
 }
 
-/// The inverse of a square matrix, by Gauss and Jordan's elimination with pivots; `None` if it has none.
+/// Inverts a square matrix by Gauss-Jordan elimination with pivots. Returns `None` if it is singular.
 pub fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
     let n = matrix.nrows();
     let mut both = ndarray::concatenate![Axis(1), *matrix, Array2::<f64>::eye(n)];

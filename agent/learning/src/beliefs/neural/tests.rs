@@ -16,7 +16,7 @@ fn frame(values: &[u8]) -> Frame {
 }
 
 #[test]
-fn visited_cells_are_what_they_showed_until_the_next_step() {
+fn visited_cells_are_certain_until_the_next_step() {
     let mut estimator = estimator();
     let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
     assert!(
@@ -36,13 +36,13 @@ fn visited_cells_are_what_they_showed_until_the_next_step() {
 }
 
 #[test]
-fn a_known_sensor_makes_it_the_filter_that_an_unlearned_network_leaves_alone() {
+fn with_a_sensor_an_unlearned_network_is_the_filter() {
     let model = emberwatch_model::Model::wildfire();
     let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
         .expect("a belief")
-        .seen_through(model.likelihood().clone())
+        .with_sensor(model.likelihood().clone())
         .expect("an inverse");
     let mut expected = filter();
     for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
@@ -96,7 +96,7 @@ fn many_of_several_networks_predict_together_as_each_alone() {
 }
 
 #[test]
-fn another_goes_on_from_its_bytes() {
+fn restored_bytes_are_the_same_belief() {
     let (mut first, mut second) = (estimator(), estimator());
     for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
         first.correct(&frame(&values)).expect("possible");
