@@ -57,6 +57,29 @@ pub enum PredictionKind {
     Cavities,
 }
 
+/// Largest error of a distribution's sum that is left to rounding.
+const MAX_DRIFT: f32 = 1e-5;
+
+/// Divides distributions by their sums where rounding errors have added up, as in a cell that is never seen.
+///
+/// There is one plane per state, `plane_length` apart, with one distribution per lane.
+#[inline(always)]
+fn correct_drift(planes: &mut [f32], plane_length: usize, n_lanes: usize) {
+    let mut sums = [0.0; LANES];
+    for plane in planes.chunks(plane_length) {
+        let lanes = sums.iter_mut().zip(&plane[..n_lanes]);
+        lanes.for_each(|(sum, probability)| *sum += probability);
+    }
+    let sums = &sums[..n_lanes];
+    if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
+        return;
+    }
+    for plane in planes.chunks_mut(plane_length) {
+        let lanes = plane[..n_lanes].iter_mut().zip(sums);
+        lanes.for_each(|(probability, sum)| *probability /= sum);
+    }
+}
+
 /// Predicts the belief of one world, and keeps its cavities.
 #[derive(Debug, Clone)]
 pub struct Prediction {
@@ -186,13 +209,17 @@ impl Prediction {
             let lanes = self.next_probability(state, slots, at, None);
             predictor[state * n_cells + first..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
         }
+        correct_drift(&mut predictor[first..], n_cells, n_lanes);
+        let length = self.beliefs.planes.length;
         for cavity in 0..n_cavities {
             let at = self.beliefs.start(cavity) + place;
             for state in 0..self.n_states {
                 let lanes = self.next_probability(state, slots, at, Some(cavity));
-                let to = at + state * self.beliefs.planes.length;
+                let to = at + state * length;
                 self.next.probabilities[to..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
             }
+            let end = self.beliefs.start(cavity + 1);
+            correct_drift(&mut self.next.probabilities[at..end], length, n_lanes);
         }
     }
 

@@ -239,6 +239,20 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
 }
 
 #[test]
+fn unseen_cells_stay_distributions_for_ever() {
+    let model = Model::built_in("wildfire-burnout").expect("built in");
+    let shape = Shape::new(3, 5).expect("shape");
+    let mut belief = belief(model.n_states(), shape, 3);
+    let mut prediction = Prediction::new((&model).into(), PredictionKind::Cavities, &belief);
+    for _ in 0..20_000 {
+        predict(&mut prediction, &mut belief);
+    }
+    assert!(prediction.clone().restore(&prediction.to_bytes()));
+    let sums = belief.view().sum_axis(ndarray::Axis(0));
+    assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 3e-5));
+}
+
+#[test]
 fn only_bytes_of_cavities_are_restored() {
     let (kernels, bias) = (fire(), [0.0; 3]);
     let weights = Weights {
