@@ -41,7 +41,7 @@ use crate::estimation::belief::Belief;
 use chunk::{ChunkInputs, ChunkPredictor};
 use emberwatch_model::Shape;
 use emberwatch_model::vectors::vectorised;
-use lanes::{LANES, Lanes, add_product, lanes_from};
+use lanes::{LANES, Lanes, add, add_product, lanes_from};
 use layout::Layout;
 use padded::PaddedBeliefs;
 
@@ -62,20 +62,14 @@ const MAX_DRIFT: f32 = 1e-5;
 
 /// Divides distributions by their sums where rounding errors have added up, as in a cell that is never seen.
 ///
-/// There is one plane per state, `plane_length` apart, with one distribution per lane.
+/// There is one plane per state, `plane_length` apart, and one distribution per lane.
 #[inline(always)]
-fn correct_drift(planes: &mut [f32], plane_length: usize, n_lanes: usize) {
-    let mut sums = [0.0; LANES];
-    for plane in planes.chunks(plane_length) {
-        let lanes = sums.iter_mut().zip(&plane[..n_lanes]);
-        lanes.for_each(|(sum, probability)| *sum += probability);
-    }
-    let sums = &sums[..n_lanes];
+fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
         return;
     }
     for plane in planes.chunks_mut(plane_length) {
-        let lanes = plane[..n_lanes].iter_mut().zip(sums);
+        let lanes = plane.iter_mut().zip(sums);
         lanes.for_each(|(probability, sum)| *probability /= sum);
     }
 }
@@ -205,21 +199,25 @@ impl Prediction {
         let (n_cells, first) = (self.shape.n_cells(), row * self.shape.width() + col);
         let n_cavities = self.beliefs.n_cavities;
         let at = self.beliefs.start(n_cavities) + place;
+        let mut sums = [0.0; LANES];
         for state in 0..self.n_states {
             let lanes = self.next_probability(state, slots, at, None);
+            add(&mut sums, &lanes);
             predictor[state * n_cells + first..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
         }
-        correct_drift(&mut predictor[first..], n_cells, n_lanes);
+        correct_drift(&mut predictor[first..], n_cells, &sums[..n_lanes]);
         let length = self.beliefs.planes.length;
         for cavity in 0..n_cavities {
             let at = self.beliefs.start(cavity) + place;
+            let mut sums = [0.0; LANES];
             for state in 0..self.n_states {
                 let lanes = self.next_probability(state, slots, at, Some(cavity));
+                add(&mut sums, &lanes);
                 let to = at + state * length;
                 self.next.probabilities[to..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
             }
             let end = self.beliefs.start(cavity + 1);
-            correct_drift(&mut self.next.probabilities[at..end], length, n_lanes);
+            correct_drift(&mut self.next.probabilities[at..end], length, &sums[..n_lanes]);
         }
     }
 
