@@ -162,7 +162,7 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
     for (flags, words) in [
         (
             format!("--instance {name} --worlds 1"),
-            "learning.full_frames: expected a server with --coverage client or full, got path",
+            "full_frames: expected a server with --coverage client or full, got path",
         ),
         (
             format!("{WORLDS} --learner neural"),

@@ -1,11 +1,12 @@
-//! How well a belief fits the hidden states.
+//! Scores of a belief against the hidden states.
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::Grid;
 
-/// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
-/// probability of the state that pays most, which the belief numbers `own`. 0 is perfect; the share
-/// `q` of such cells, told of each cell alike, scores `q (1 - q)`.
+/// Computes the Brier score of one state: the mean over all cells of `(p - 1[x = target])^2`.
+///
+/// `p` is the belief in the state. It has the number `target` in the model and `own` in the belief. A perfect belief
+/// scores 0. If a share `q` of the cells is in the state, the belief `p = q` in every cell scores `q (1 - q)`.
 pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
     let squared = |(&p, &state): (&f32, &u8)| {
         let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
@@ -15,21 +16,24 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
     sum / truth.len() as f64
 }
 
-/// Mean over all cells of `-ln p` in nats, where `p` is the probability of the cell's state; infinite where that is 0.
+/// Computes the log loss: the mean over all cells of `-ln p` in nats, where `p` is the belief in the cell's true state.
+///
+/// Infinite if some `p` is 0.
 ///
 /// # Panics
-/// If a state is not one of the belief's.
+/// If a true state is not below the belief's number of states.
 pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
-    let of_state = |((row, col), &state): ((usize, usize), &u8)| {
+    let log = |((row, col), &state): ((usize, usize), &u8)| {
         let probability = belief.probabilities()[[usize::from(state), row, col]];
         f64::from(probability).ln()
     };
-    let sum: f64 = truth.indexed_iter().map(of_state).sum();
-    // Not -0 where all are certain.
+    let sum: f64 = truth.indexed_iter().map(log).sum();
+    // 0 instead of -0 for a perfect belief.
     0.0 - sum / truth.len() as f64
 }
 
-/// Share of the cells whose most probable state is the true one; the first of several such states counts.
+/// Computes the share of cells whose most probable state is the true state. Among equally probable states, the first
+/// counts.
 pub fn accuracy(belief: &Belief, truth: &Grid<u8>) -> f64 {
     let numbers = belief.as_slice();
     let is_right = |&(index, &state): &(usize, &u8)| {

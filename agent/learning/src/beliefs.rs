@@ -1,6 +1,6 @@
-//! Kinds of belief: what a policy believes about its world, and the facts that commands, tables and charts ask for.
+//! Kinds of belief: how to build each estimator, and its names and properties for commands, tables and charts.
 //!
-//! A kind is one file, with its constructor and its facts, and a line in [`BELIEFS`].
+//! Each kind is a constant in a file of this folder, and has an entry in [`BELIEFS`].
 
 pub mod autoencoder;
 pub mod first_belief;
@@ -22,7 +22,7 @@ pub use self::neural::{NEURAL, NEURAL_SENSOR};
 pub use self::truth::{NEXT_TRUTH, NONE, TRUTH};
 pub use self::world_form::WorldForm;
 
-/// All kinds, from the least to the most informed.
+/// All kinds, ordered by how much they know about the world.
 pub const BELIEFS: &[&BeliefKind] = &[
     &NONE,
     &KNOWN,
@@ -41,21 +41,23 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &NEXT_TRUTH,
 ];
 
-/// The kind of a name, or of a label.
+/// Finds a kind by its name or its label.
 pub fn named(name: &str) -> Option<&'static BeliefKind> {
     let mut kinds = BELIEFS.iter().copied();
     kinds.find(|kind| kind.name == name || kind.label == name)
 }
 
-/// As [`named`], of those on which options can be learned: frames change them, they know a model or were learned, not both,
-/// and no network decides on their hidden vector.
+/// Like [`named`], for the kinds that options can be learned on.
+///
+/// Frames update such a belief. It either knows the model or was learned, not both. No network decides on its hidden
+/// vector.
 ///
 /// # Errors
-/// Names them all.
+/// If there is no such kind. The error lists the labels of all that there are.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     let serves = |kind: &&BeliefKind| {
-        let is_of_one_source = !kind.knows_model || kind.learned_by.is_none();
-        kind.input == Input::Frames && is_of_one_source && !kind.decides()
+        let has_one_source = !kind.knows_model || kind.learned_by.is_none();
+        kind.input == Input::Frames && has_one_source && !kind.decides()
     };
     named(name).filter(serves).ok_or_else(|| {
         let kinds = BELIEFS.iter().copied().filter(serves);

@@ -39,6 +39,7 @@ pub struct AgentConfig {
     /// The name of what `train` learns with.
     pub learner: String,
     pub kernels: KernelKind,
+    pub full_frames: bool,
     pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
     pub neural: NeuralConfig,

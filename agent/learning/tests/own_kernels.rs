@@ -101,7 +101,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
         learner.learn().expect("finite");
         let tables = learner.learned().tables;
         for world in &mut worlds {
-            world.filter.set_tables(&tables);
+            world.filter = BayesFilter::learned(&tables, world.filter.belief().clone());
         }
     }
     learner.learned()

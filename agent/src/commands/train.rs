@@ -145,7 +145,7 @@ impl TrainCommand {
                 "--coverage applies only with --learner filter, got {}",
                 kind.name
             );
-            config.learning.full_frames = full_frames;
+            config.full_frames = full_frames;
         }
         let n_worlds = self
             .worlds
@@ -239,7 +239,7 @@ impl TrainCommand {
                 "--kernels: expected {expected} as in the checkpoint, got {}",
                 got.unwrap_or(expected)
             );
-            let (expected, got) = (training.config.learning.full_frames, self.full_frames);
+            let (expected, got) = (training.config.full_frames, self.full_frames);
             ensure!(
                 got.is_none_or(|got| got == expected),
                 "--coverage: expected the checkpoint's, {}",

@@ -67,7 +67,7 @@ impl TrainingSpec {
 
     /// Whether a checkpoint was trained with settings other than these.
     pub fn has_other_settings(&self, contents: &Contents) -> Result<bool> {
-        Ok(toml::to_string(&self.config)? != contents.settings)
+        Ok(self.config != contents.settings()?)
     }
 
     /// What the settings say that learns.

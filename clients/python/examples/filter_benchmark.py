@@ -1,18 +1,19 @@
-"""Filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
+"""Scores filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
 
     python filter_benchmark.py                          # on fires that are simulated here
     python filter_benchmark.py --fires fires-all.npz    # on recorded ones
 
-25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with 1 - (1 - a)**f, where f of
-its four neighbours burn and a rises from .1 in the first column to .4 in the last; a burning one
-burns out with 1 - exp(-1/10). At first 4 x 4 trees in the middle burn, which every filter knows. A
-tree that is seen shows its state with .9, and each other with .05. The table has, over all steps
-but the first:
+25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with probability
+1 - (1 - a)**f, where f of its four neighbours burn and a rises from .1 in the first column to .4 in
+the last. A burning tree burns out with probability 1 - exp(-1/10). At the start, 4 x 4 trees in the
+middle burn, which every filter knows. An observed tree shows its state with probability .9, and
+each of the two other states with .05. The table leaves out the first step of each fire:
 
-- accuracy: the share of the trees whose most probable state is the true one, its median over steps,
-  as in the paper; the mean over fires;
-- NLL: the mean of -log p of the true state, which also tells how sure a filter is;
-- difference: NLL without that of the first filter, paired by fire, with its standard error.
+- accuracy: share of the trees whose most probable state is the true state; the median over steps,
+  as in the paper, then the mean over fires;
+- NLL: mean of -log p of the true state, which also measures a filter's confidence;
+- difference: NLL minus the NLL of the first filter, paired by fire, with its standard error;
+- us a step: microseconds to correct and predict once.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ Fire = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # states and frames, both [K
 
 
 def model() -> Model:
-    """The fire as a model file.
+    """Returns the fire's model.
 
-    Weights give P(ignite) = f / (A f + B), which is exact for f = 1 and f = 4 and off by .015 at
-    most between. Trees beyond the edge are healthy. Each column is a zone, as its rate differs.
+    The weights give P(ignite) = f / (A f + B), which is exact for f = 1 and f = 4, and off by at
+    most .015 for f = 2 and f = 3. Trees outside the grid are healthy. Each column is a zone, as
+    columns differ in a.
     """
     zones, kernels = [], []
     for column, rate in enumerate(RATES.tolist()):
@@ -77,7 +79,7 @@ def model() -> Model:
 
 
 def burn(random: np.random.Generator) -> NDArray[np.uint8]:
-    """The states of one fire until nothing burns."""
+    """Simulates one fire until nothing burns; states of shape (K, 25, 25)."""
     state = np.zeros((SIDE, SIDE), np.uint8)
     state[11:15, 11:15] = BURNING
     states = [state]
@@ -96,13 +98,13 @@ def burn(random: np.random.Generator) -> NDArray[np.uint8]:
 def observe(
     states: NDArray[np.uint8], seen: NDArray[np.bool_], random: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Frames of the trees that are seen."""
+    """Returns frames that show the trees `seen`."""
     shown = (states + random.choice(3, states.shape, p=[0.9, 0.05, 0.05])) % 3
     return np.where(seen, shown, 255).astype(np.uint8)
 
 
 def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """What a camera sees of 9 x 9 trees that flies to one point of the forest after another."""
+    """Returns the trees that a camera sees, 9 x 9 at a time, as it flies between random points."""
     seen = np.zeros((steps, SIDE, SIDE), bool)
     at, goal = np.array([12, 12]), np.array([12, 12])
     for step in range(steps):
@@ -114,7 +116,7 @@ def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
 
 
 def simulated(which: str, n_fires: int, seed: int) -> Iterator[Fire]:
-    """Fires with their frames: `which` is "all", "tenth" or "window"."""
+    """Simulates fires; `which` says which trees are seen: "all", "tenth" or "window"."""
     for fire in range(n_fires):
         random = np.random.default_rng([seed, fire])
         states = burn(random)
@@ -127,14 +129,14 @@ def simulated(which: str, n_fires: int, seed: int) -> Iterator[Fire]:
 
 
 def recorded(path: Path) -> Iterator[Fire]:
-    """Fires of an .npz file with `states_N` and `frames_N` for each fire N."""
+    """Reads fires from an .npz file with `states_N` and `frames_N` for each fire N."""
     with np.load(path) as arrays:
         for name in sorted(name for name in arrays.files if name.startswith("states_")):
             yield arrays[name], arrays[name.replace("states_", "frames_")]
 
 
 def score(fires: list[Fire], kinds: list[str]) -> None:
-    """Prints the table of some kinds of belief."""
+    """Prints the table, a row for each kind of belief."""
     forest = model()
     losses: dict[str, NDArray[np.float64]] = {}
     print("| filter | accuracy | NLL | difference | us a step |\n|---|--:|--:|--:|--:|")
@@ -150,10 +152,10 @@ def score(fires: list[Fire], kinds: list[str]) -> None:
 
 
 def figures(forest: Model, fires: list[Fire], kind: str) -> list[tuple[float, float, float]]:
-    """Accuracy, NLL and microseconds of a step, of each fire.
+    """Returns the accuracy, the NLL and the microseconds per step of each fire.
 
-    All fires begin alike. A spatial filter has learned how cells vary together from all of them
-    before: they are filtered twice, and the second time counts.
+    All fires start from the same state. Spatial filters learn how cells vary together as they run,
+    so they filter all fires twice, and only the second run is scored.
     """
     exact = np.eye(3)[fires[0][0][0]].transpose(2, 0, 1)
     it = belief.known(forest, prior=exact, kind=kind)
@@ -172,7 +174,7 @@ def figures(forest: Model, fires: list[Fire], kind: str) -> list[tuple[float, fl
 
 
 def run(it: belief.Belief, frames: NDArray[np.uint8]) -> None:
-    """Filters one fire."""
+    """Runs a filter through one fire."""
     for frame in frames:
         it.correct(frame)
         it.predict()
@@ -183,11 +185,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--fires", type=Path, action="append", help="file of fires (.npz)")
-    parser.add_argument("--simulate", type=int, default=12, metavar="N", help="number of fires")
-    parser.add_argument("--seed", type=int, default=0, help="of the simulated fires")
+    parser.add_argument(
+        "--fires", type=Path, action="append", help="file of recorded fires (.npz); repeatable"
+    )
+    parser.add_argument(
+        "--simulate", type=int, default=12, metavar="N", help="number of simulated fires"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated fires")
     kinds = [kind for kind in belief.kinds() if kind.startswith("known")]
-    parser.add_argument("--kinds", default=",".join(kinds), help="kinds of belief")
+    parser.add_argument("--kinds", default=",".join(kinds), help="kinds of belief, comma-separated")
     args = parser.parse_args()
     for path in args.fires or []:
         print(f"\n{path.name}\n")

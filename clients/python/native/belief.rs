@@ -1,5 +1,4 @@
-//! Beliefs in double precision: Bayes' rule, `Phi`, and the first belief. Their shape is `[S, n, H, W]`: the
-//! states of n worlds.
+//! Beliefs about `n` worlds in double precision, `[S, n, H, W]`: Bayes' rule, the operator `Phi`, and simulated priors.
 
 use crate::detached::detached;
 use crate::errors::{check_memory, no_memory, no_threads};
@@ -21,7 +20,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, TryLockError};
 use std::time::Duration;
 
-/// How often a long computation looks for Ctrl-C.
+/// Time between two checks for Ctrl-C in a long computation.
 const LOOK: Duration = Duration::from_millis(2);
 
 /// The operator `Phi` of one model on one grid. Threads cannot share it.
@@ -33,9 +32,9 @@ pub struct Transition {
     work: Mutex<Work>,
 }
 
-/// What one application at a time needs.
+/// The operator and its work space, for one application at a time.
 struct Work {
-    /// Or the error that `apply` raises: that eq. 3 could divide by zero.
+    /// The operator, or the error that `apply` raises because eq. 3 could divide by zero.
     operator: Result<transition::Transition<f64>, ModelError>,
     belief: Array3<f64>,
     predictor: Array3<f64>,
@@ -62,7 +61,7 @@ impl Transition {
         })
     }
 
-    /// `Phi` of beliefs, a new array of their shape.
+    /// Applies `Phi` to beliefs `[S, n, H, W]`. Returns a new array of the same shape.
     fn apply<'py>(
         &self,
         py: Python<'py>,
@@ -72,8 +71,8 @@ impl Transition {
             Ok(work) => work,
             Err(TryLockError::Poisoned(left)) => left.into_inner(),
             Err(TryLockError::WouldBlock) => {
-                let expected = "a transition or filter for each thread";
-                return Err(invalid(py, "transition", expected, "one in use by another"));
+                let expected = "a transition or filter that no other thread is using";
+                return Err(invalid(py, "transition", expected, "one in use"));
             }
         };
         let Work {
@@ -111,13 +110,13 @@ impl Transition {
         Ok(out.into_pyarray(py))
     }
 
-    /// What copies and pickles are made from.
+    /// Returns the constructor's arguments, for copies and pickles.
     fn __getnewargs__(&self) -> (&str, usize, usize) {
         (&self.model, self.shape.height(), self.shape.width())
     }
 }
 
-/// The error of a model whose weights can all be 0, or lose their precision.
+/// Makes the error of a model whose weights can all be 0, or lose their precision.
 pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     match error {
         ModelError::ZeroWeight { cell, .. } => {
@@ -140,7 +139,8 @@ pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     }
 }
 
-/// Bayes' rule (eq. 5) in place on the cells that frames `[n, H, W]` show; `likelihood` is `P(y | x)`, `[S, O]`.
+/// Corrects beliefs in place by Bayes' rule (eq. 5) in the cells that frames `[n, H, W]` show; `likelihood` is `P(y |
+/// x)`, `[S, O]`.
 #[pyfunction]
 pub fn correct<'py>(
     py: Python<'py>,
@@ -183,13 +183,13 @@ pub fn correct<'py>(
     })
 }
 
-/// Index and value of the observed cells.
+/// Returns the index and the value of each observed cell.
 fn shown(frames: ArrayView3<'_, u8>) -> Vec<(usize, u8)> {
     let values = frames.iter().copied().enumerate();
     values.filter(|&(_, value)| value != UNOBSERVED).collect()
 }
 
-/// How often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.
+/// Returns how often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.
 #[pyfunction]
 pub fn simulated_prior<'py>(
     py: Python<'py>,
@@ -205,7 +205,7 @@ pub fn simulated_prior<'py>(
     Ok(belief.probabilities().to_pyarray(py))
 }
 
-/// The belief before the first frame; one that was simulated is kept for later.
+/// Returns the belief before the first frame. Keeps a simulated one in a file, for later processes.
 pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let is_simulated = matches!(prior, Prior::Simulated { .. });
     let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
@@ -214,16 +214,16 @@ pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -
         return Ok(belief);
     }
     let belief = simulated(py, prior, model, shape)?;
-    // Else it is simulated again.
+    // If it cannot be written, a later process simulates it again.
     let _ = kept.map(|kept| kept.write(&belief));
     Ok(belief)
 }
 
-/// Simulates on threads of its own, as those of a global pool do not survive a fork; Ctrl-C ends it.
+/// Simulates a prior on new threads, as a global pool is unusable after a fork. Ctrl-C ends it.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
-    // Each thread counts states in a world of its own.
+    // Each thread simulates one world at a time and counts its states.
     let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
     let n_bytes = 2 * n_threads * of_thread;
     check_memory(py, "the worlds of a first belief", n_bytes)?;

@@ -1,7 +1,6 @@
-//! Beliefs of every kind about some worlds: the agent's own estimators, fed with frames from Python.
+//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which frames correct.
 
 use crate::detached::detached;
-use crate::errors::check_memory;
 use crate::model::{model_of, shape_of};
 use crate::origin::{Origin, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
@@ -18,26 +17,28 @@ use emberwatch_learning::options::usual;
 use emberwatch_model::frame::FrameError;
 use emberwatch_model::{Frame, Grid, Model, Shape};
 use emberwatch_network::Device;
-use numpy::ndarray::{Array1, Array3, Array4, ArrayView3, Axis};
+use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::any::Any;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
-/// One number for each world.
+/// One number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
 
-/// Beliefs about some worlds. Threads cannot share them.
+/// Beliefs about `n` worlds. Threads cannot share them. `chosen` is a mask of worlds, `[n]`; the Python class has
+/// checked the shapes of all arrays.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Estimators {
     #[pyo3(get)]
     kind: &'static str,
     #[pyo3(get)]
     state_names: Vec<String>,
-    /// The state that pays most.
+    /// The state that pays most; states are numbered from 0.
     #[pyo3(get)]
     target_state: usize,
+    #[pyo3(get)]
     n_observations: usize,
     n_worlds: usize,
     shape: Shape,
@@ -45,11 +46,13 @@ pub struct Estimators {
     state: Mutex<State>,
 }
 
+/// The estimators and their threads, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
     threads: Pool,
 }
 
+/// Copies what a spatial filter has learned about how cells vary together; does nothing for other kinds.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
     let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
@@ -60,16 +63,16 @@ fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
 
 #[pymethods]
 impl Estimators {
-    /// Of a known model; `prior` is the first belief in each world, `[S, H, W]`.
+    /// Builds beliefs of a known model. `prior`: the first belief about each world, `[S, H, W]`.
     #[staticmethod]
     fn known(
         py: Python<'_>,
         model: &str,
         prior: PyReadonlyArray3<'_, f32>,
-        kind: &str,
+        kind: &Bound<'_, PyAny>,
         n_worlds: usize,
     ) -> PyResult<Self> {
-        let kind = kind_of(py, kind, false)?;
+        let kind = kind_of(kind, false)?;
         let (model, prior) = (model_of(model)?, prior.as_array());
         let (n_states, height, width) = prior.dim();
         if n_states != model.n_states() {
@@ -89,24 +92,25 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Of a checkpoint; without `kind`, of the belief that it holds. With a model, the checkpoint must fit its worlds.
+    /// Loads beliefs from a checkpoint: of `kind`, or of the kind that the checkpoint is for. With a model, checks that
+    /// the checkpoint fits its worlds.
     #[staticmethod]
     fn load(
         py: Python<'_>,
         checkpoint: PathBuf,
         grid: (usize, usize),
-        kind: Option<&str>,
+        kind: Option<&Bound<'_, PyAny>>,
         model: Option<&str>,
         n_worlds: usize,
     ) -> PyResult<Self> {
         let shape = shape_of(py, grid.0, grid.1)?;
-        let kind = kind.map(|name| kind_of(py, name, true)).transpose()?;
+        let kind = kind.map(|name| kind_of(name, true)).transpose()?;
         let model = model.map(model_of).transpose()?;
         let learned = py.detach(|| learners::read([&*checkpoint], &Device::Cpu));
         let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
         let kind = kind.unwrap_or_else(|| usual(&learned));
         if kind.learned_by.is_none() {
-            let got = format!("one on the belief '{}': use known(model)", kind.name);
+            let got = format!("decisions on the belief '{}': use known(model)", kind.name);
             return Err(invalid(py, "checkpoint", "a learned belief", got));
         }
         let form = model.as_ref().map(|model| WorldForm::of(model, shape));
@@ -122,13 +126,13 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Number of worlds, height and width.
+    /// Returns the number of worlds, the height and the width.
     #[getter]
     fn shape(&self) -> (usize, usize, usize) {
         (self.n_worlds, self.shape.height(), self.shape.width())
     }
 
-    /// The beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
+    /// Returns the beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
     fn belief<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray4<f32>>> {
         let state = self.state(py)?;
         let (height, width) = self.shape.dim();
@@ -140,7 +144,7 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// The entropy of each cell in nats, `[n, H, W]`.
+    /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let state = self.state(py)?;
         let (height, width) = self.shape.dim();
@@ -151,8 +155,8 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Begins again in the chosen worlds, with the first belief. `keeps_correlations`: with what spatial filters have
-    /// learned of how cells vary together.
+    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep what they have
+    /// learned about how cells vary together.
     fn reset(
         &self,
         py: Python<'_>,
@@ -161,24 +165,27 @@ impl Estimators {
     ) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
         let State { worlds, threads } = &mut *state;
-        let n_numbers = n_chosen * self.n_numbers();
-        let made = detached(py, n_numbers, || self.origin.estimators(threads, n_chosen));
-        let made = made.map_err(|error| raise(py, &error))?;
-        let places = worlds.iter_mut().zip(chosen);
-        let places = places.filter(|(_, chosen)| **chosen);
-        for ((place, _), mut made) in places.zip(made) {
-            if keeps_correlations {
-                keep_correlations(&**place, &mut *made);
-            }
-            *place = made;
-        }
-        Ok(())
+        let chosen = worlds.iter_mut().zip(chosen);
+        let chosen = chosen.filter_map(|(world, &chosen)| chosen.then_some(world));
+        let reset = detached(py, n_chosen * self.n_numbers(), || {
+            threads.work(self.origin.is_short(n_chosen), |threads| {
+                threads.each(chosen, |world| {
+                    let mut new = self.origin.estimator()?;
+                    if keeps_correlations {
+                        keep_correlations(&**world, &mut *new);
+                    }
+                    *world = new;
+                    Ok(())
+                })
+            })
+        });
+        let reset: anyhow::Result<()> = reset.into_iter().collect();
+        reset.map_err(|error| raise(py, &error))
     }
 
-    /// Corrects the chosen worlds with their frames; `frames` are those of all, `[n, H, W]`.
+    /// Corrects the beliefs about the chosen worlds with their frames; `frames` holds one per world, `[n, H, W]`.
     fn correct(
         &self,
         py: Python<'_>,
@@ -212,11 +219,10 @@ impl Estimators {
         })
     }
 
-    /// Moves the beliefs about the chosen worlds one step ahead.
+    /// Predicts: moves the beliefs about the chosen worlds from X_k to X_{k+1}.
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let State { worlds, threads } = &mut *state;
         let is_short = self.origin.is_short(worlds.len());
         let worlds = worlds.iter_mut().zip(chosen);
@@ -229,8 +235,8 @@ impl Estimators {
         Ok(())
     }
 
-    /// How well the beliefs fit hidden states `[n, H, W]`: negative log-likelihood, Brier score of the state `target`,
-    /// share of cells whose most probable state is right.
+    /// Scores the beliefs against hidden states `[n, H, W]`. Returns the log loss, the Brier score for the state
+    /// `target`, and the share of cells whose most probable state is right.
     fn scores<'py>(
         &self,
         py: Python<'py>,
@@ -239,7 +245,6 @@ impl Estimators {
     ) -> PyResult<(Numbers<'py>, Numbers<'py>, Numbers<'py>)> {
         let state = self.state(py)?;
         let states = states.as_array();
-        self.check_dim(py, "states", states.dim())?;
         let n_states = self.state_names.len();
         if let Some(got) = states.iter().find(|state| usize::from(**state) >= n_states) {
             return Err(invalid(
@@ -250,25 +255,19 @@ impl Estimators {
             ));
         }
         let truths: Vec<Grid<u8>> = states.outer_iter().map(|it| it.to_owned()).collect();
-        let pairs = || state.worlds.iter().map(|it| it.belief()).zip(&truths);
-        let own = self.target_state;
-        let losses: Array1<f64> = pairs()
-            .map(|(belief, truth)| log_loss(belief, truth))
-            .collect();
-        let brier: Array1<f64> = pairs()
-            .map(|(belief, truth)| brier_score(belief, truth, target, own))
-            .collect();
-        let right: Array1<f64> = pairs()
-            .map(|(belief, truth)| accuracy(belief, truth))
-            .collect();
-        Ok((
-            losses.into_pyarray(py),
-            brier.into_pyarray(py),
-            right.into_pyarray(py),
-        ))
+        let figures = |figure: &dyn Fn(&Belief, &Grid<u8>) -> f64| {
+            let pairs = state.worlds.iter().zip(&truths);
+            let figures = pairs.map(|(world, truth)| figure(world.belief(), truth));
+            PyArray1::from_iter(py, figures)
+        };
+        let brier = |belief: &Belief, truth: &Grid<u8>| {
+            brier_score(belief, truth, target, self.target_state)
+        };
+        Ok((figures(&log_loss), figures(&brier), figures(&accuracy)))
     }
 
-    /// How well the beliefs predict frames `[n, H, W]`: log-likelihood, summed over the seen cells, and their number.
+    /// Scores the beliefs' predictions of frames `[n, H, W]`. Returns the log-likelihood, summed over the observed
+    /// cells, and their number.
     fn score_frames<'py>(
         &self,
         py: Python<'py>,
@@ -289,27 +288,14 @@ impl Estimators {
 
 impl Estimators {
     fn new(py: Python<'_>, origin: Origin, n_worlds: usize) -> PyResult<Self> {
-        let (kind, shape, mut threads) = (origin.kind, origin.shape, Pool::default());
+        let kind = origin.kind;
         let conditions = origin.conditions();
         let names = kind
             .state_names(&conditions)
             .and_then(|names| Ok((names, kind.target(&conditions)?)));
         let (state_names, target_state) = names.map_err(|error| unfit(py, &error))?;
-        // A belief, its predictor and work space.
-        let of_world = 4 * state_names.len() * shape.n_cells() * size_of::<f32>();
-        let n_bytes = n_worlds.saturating_mul(of_world);
-        check_memory(
-            py,
-            format_args!("the beliefs about {n_worlds} worlds"),
-            n_bytes,
-        )?;
-        let worlds = py.detach(|| origin.estimators(&mut threads, n_worlds));
-        let worlds = worlds.map_err(|error| unfit(py, &error))?;
-        let mut shapes = worlds.iter().map(|world| world.belief().shape());
-        if let Some(own) = shapes.find(|own| *own != shape) {
-            let expected = format!("a belief on {shape}");
-            return Err(invalid(py, "checkpoint", expected, own));
-        }
+        let mut threads = Pool::default();
+        let worlds = origin.estimators(py, &mut threads, n_worlds, state_names.len())?;
         let of_model = origin.model.as_ref().map(Model::n_observations);
         let likelihood = worlds.first().and_then(|world| world.likelihood());
         let of_belief = likelihood.map(|likelihood| likelihood.ncols());
@@ -319,63 +305,39 @@ impl Estimators {
             state_names,
             target_state,
             n_worlds,
-            shape,
+            shape: origin.shape,
             state: Mutex::new(State { worlds, threads }),
             origin,
         })
     }
 
-    /// Numbers of the belief about a world.
+    /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
     }
 
-    /// The worlds, for this thread.
+    /// Locks the worlds for this thread.
+    ///
+    /// # Errors
+    /// If another thread is using them.
     fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         match self.state.try_lock() {
             Ok(state) => Ok(state),
             Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
             Err(TryLockError::WouldBlock) => {
-                let expected = "one for each thread";
-                Err(invalid(py, "belief", expected, "one in use by another"))
+                let expected = "a belief that no other thread is using";
+                Err(invalid(py, "belief", expected, "one in use"))
             }
         }
     }
 
-    fn check_worlds(&self, py: Python<'_>, what: &str, got: usize) -> PyResult<()> {
-        if got == self.n_worlds {
-            return Ok(());
-        }
-        Err(invalid(
-            py,
-            what,
-            format!("one for each of {} worlds", self.n_worlds),
-            got,
-        ))
-    }
-
-    fn check_dim(&self, py: Python<'_>, what: &str, got: (usize, usize, usize)) -> PyResult<()> {
-        let expected = (self.n_worlds, self.shape.height(), self.shape.width());
-        if got == expected {
-            return Ok(());
-        }
-        Err(invalid(
-            py,
-            what,
-            format!("shape {expected:?}"),
-            format!("{got:?}"),
-        ))
-    }
-
-    /// The frames of the chosen worlds.
+    /// Decodes the frames of the chosen worlds; `None` for the other worlds.
     fn frames(
         &self,
         py: Python<'_>,
         frames: ArrayView3<'_, u8>,
         chosen: &[bool],
     ) -> PyResult<Vec<Option<Frame>>> {
-        self.check_dim(py, "frame", frames.dim())?;
-        self.check_worlds(py, "worlds", chosen.len())?;
         let frames = frames.as_standard_layout();
         let worlds = frames.outer_iter().zip(chosen);
         let frame = |(frame, &chosen): (numpy::ndarray::ArrayView2<'_, u8>, &bool)| {
@@ -401,6 +363,7 @@ impl Estimators {
     }
 }
 
+/// Predicts all worlds, together where the kind can.
 fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     match worlds.first().and_then(|first| first.predict_together()) {
         Some(together) => together(worlds),
@@ -410,7 +373,7 @@ fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     }
 }
 
-/// The error of a belief that did not take a frame.
+/// Makes the error of a belief that could not be built, or not be corrected with a frame.
 pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     let is_impossible = matches!(
         error.downcast_ref::<EstimatorError>(),

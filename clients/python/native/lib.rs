@@ -18,6 +18,7 @@ mod moves;
 mod options;
 mod origin;
 mod owned;
+mod planned_worlds;
 mod planning;
 mod reader;
 mod recording;

@@ -34,6 +34,7 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     fields.set_item("kernels", kernels.to_pyarray(py))?;
     fields.set_item("bias", model.bias().to_pyarray(py))?;
     fields.set_item("initial", model.initial().to_pyarray(py))?;
+    fields.set_item("edge", model.edge())?;
     let zones = model.file().zones.iter();
     fields.set_item("zone_names", names(py, zones.clone().map(|it| &it.name))?)?;
     fields.set_item("zone_colors", colors(py, zones.map(|it| &it.color))?)?;

@@ -1,33 +1,23 @@
-//! Options: beliefs about worlds of one robot each, and the plans among which a learner chooses.
+//! Options for Python: beliefs about worlds of one robot each, and the plans among which a learner chooses.
 
 use crate::airspace::Given;
-use crate::answer::RESULT_BYTES;
 use crate::belief::first_belief;
 use crate::connection::checked;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::owned::Owned;
+use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
 use crate::refusal::{invalid, refused};
-use crate::threads::{Pool, Threads};
-use crate::wire::{Feed, View};
-use anyhow::{Context, Result, ensure};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::OPTIONS;
-use emberwatch_belief::planning::options::{N_FEATURES, feature_names};
-use emberwatch_learning::beliefs::{self, BeliefKind, NEURAL};
+use emberwatch_belief::planning::options::feature_names;
+use emberwatch_learning::beliefs::{self, BeliefKind};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learners;
-use emberwatch_learning::options::{Crew, Planned, Shown, usual};
-use emberwatch_messages::agent_belief::Intent;
-use emberwatch_messages::instance::Instance;
-use emberwatch_messages::message::{RobotResult, WorldResult};
-use emberwatch_messages::payload::WORLD_BYTES;
-use emberwatch_model::Description;
-use emberwatch_model::path::path_to_bytes;
-use emberwatch_model::{Frame, Model};
+use emberwatch_learning::options::{Crew, usual};
+use emberwatch_model::{Description, Model};
 use emberwatch_network::Device;
-use numpy::ndarray::{Array3, ArrayView1, s};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::path::PathBuf;
@@ -36,7 +26,7 @@ use std::sync::OnceLock;
 /// Features and paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
 
-/// Names of the options, and names of the features that describe each plan.
+/// Returns the names of the options, and the names of the features that describe each plan.
 #[pyfunction]
 pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     (
@@ -45,7 +35,7 @@ pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     )
 }
 
-/// Name of each estimator that options can be planned on, and what it is.
+/// Returns the name and a description of each estimator on which options can be planned.
 #[pyfunction]
 pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
     let serves = |kind: &&BeliefKind| beliefs::of_options(kind.label).is_ok();
@@ -66,7 +56,7 @@ pub struct Spec<'py> {
     airspace: Given<'py>,
 }
 
-/// A file's text.
+/// A model or a description.
 #[derive(FromPyObject)]
 struct Text {
     toml: String,
@@ -78,52 +68,16 @@ pub struct Options {
     /// Name of the estimator that keeps the beliefs.
     #[pyo3(get)]
     estimator: String,
-    /// How the first belief is made, once it is needed.
+    /// What `prior` is computed from.
     first: (Prior, Model),
     prior: OnceLock<Belief>,
-    state: Owned<State>,
-}
-
-struct State {
-    crew: Crew,
-    /// `None` before a world's first episode.
-    worlds: Vec<Option<Planned>>,
-    threads: Pool,
-    watched: Option<Watched>,
-}
-
-/// The channel on which beliefs are published to observers.
-struct Watched {
-    instance: Instance,
-    first_world: u32,
-    feed: Option<Feed>,
-}
-
-/// The observation of one world, and what to do with it.
-struct WorldWork<'a> {
-    index: usize,
-    planned: &'a mut Planned,
-    world: WorldResult,
-    robot: RobotResult,
-    /// Seen before, if there is none.
-    frame: Option<&'a [u8]>,
-    flown: Option<usize>,
-    plans: bool,
-    is_shown: bool,
-}
-
-/// The published state of a world: the belief after its frame.
-struct Outlook {
-    index: usize,
-    world: WorldResult,
-    belief: Belief,
-    intent: Intent,
+    worlds: Owned<PlannedWorlds>,
 }
 
 #[pymethods]
 impl Options {
-    /// Checks all arguments; beliefs begin later. `watched`: the instance on which beliefs are shown, and its first
-    /// world here.
+    /// Checks all arguments; [`Self::begin`] starts beliefs. `watched`: the instance in which beliefs are published,
+    /// and the number there of the first world here.
     #[new]
     fn new(
         py: Python<'_>,
@@ -168,53 +122,47 @@ impl Options {
             estimator: crew.estimator().label.into(),
             first: (first, crew.model().clone()),
             prior: OnceLock::new(),
-            state: Owned::new(
+            worlds: Owned::new(
                 "options",
-                State {
-                    crew,
-                    worlds: (0..n_worlds).map(|_| None).collect(),
-                    threads: Pool::default(),
-                    watched: watched.transpose()?,
-                },
+                PlannedWorlds::new(crew, n_worlds, watched.transpose()?),
             ),
         })
     }
 
-    /// New beliefs, before the first frame of some worlds with these seeds; the first time the first one may be
-    /// simulated.
+    /// Starts episodes: gives each of `worlds` the first belief and a seed. The first call may simulate that belief,
+    /// which takes seconds.
     fn begin(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
         let prior = match self.prior.get() {
             Some(prior) => prior,
             None => {
-                let shape = self.state.with(py, |state| state.crew.shape())?;
+                let shape = self.worlds.with(py, |worlds| worlds.crew.shape())?;
                 let (prior, model) = &self.first;
                 let prior = first_belief(py, *prior, model, shape)?;
                 self.prior.get_or_init(|| prior)
             }
         };
-        let begun = self.state.with(py, |state| {
-            state.begin(worlds.into_iter().zip(seeds), prior)
-        });
+        let seeds = worlds.into_iter().zip(seeds);
+        let begun = self.worlds.with(py, |worlds| worlds.begin(seeds, prior));
         begun?.map_err(|error| raise(py, &error))
     }
 
     /// Continues in a world with the belief that another agent left for the present step. Returns whether it fits.
     fn take_over(&self, py: Python<'_>, world: usize, kind: &str, data: &[u8]) -> PyResult<bool> {
-        self.state.with(py, |state| {
-            let planned = state.worlds.get_mut(world).and_then(Option::as_mut);
+        self.worlds.with(py, |worlds| {
+            let planned = worlds.world(world);
             planned.is_some_and(|planned| planned.take_over(kind, data))
         })
     }
 
-    /// Kind and bytes of the belief about a world, for the next client.
+    /// Returns the kind and the bytes of the belief about a world, for the next client.
     fn left(&self, py: Python<'_>, world: usize) -> PyResult<Option<(String, Vec<u8>)>> {
-        self.state.with(py, |state| {
-            let agent = state.worlds.get(world)?.as_ref()?.agent();
+        self.worlds.with(py, |worlds| {
+            let agent = worlds.world(world)?.agent();
             agent.handover_kind().zip(agent.handover())
         })
     }
 
-    /// Updates beliefs with an earlier step of some worlds: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
+    /// Updates beliefs with an earlier step of `worlds`: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
     fn see(
         &self,
         py: Python<'_>,
@@ -222,16 +170,19 @@ impl Options {
         results: PyReadonlyArray1<'_, u8>,
         frames: PyReadonlyArray3<'_, u8>,
     ) -> PyResult<()> {
-        let (results, frames) = (results.as_slice()?, frames.as_slice()?);
-        let seen = self.state.with(py, |state| {
-            state.update(&worlds, results, Some(frames), None, false)
-        });
+        let observed = Observed {
+            worlds: &worlds,
+            results: results.as_slice()?,
+            frames: Some(frames.as_slice()?),
+            flown: None,
+        };
+        let seen = self.worlds.with(py, |it| it.update(observed, false));
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates beliefs with the present step of some worlds, unless they include it already, and plans all options.
-    /// Features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds; `flown`: which
-    /// options brought them there.
+    /// Updates beliefs with the present step of `worlds`, then plans all options. Without `frames`, the beliefs include
+    /// the step already. `flown`: the options that the robots have just flown. Returns features
+    /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
     fn plan<'py>(
         &self,
         py: Python<'py>,
@@ -240,201 +191,27 @@ impl Options {
         frames: Option<PyReadonlyArray3<'py, u8>>,
         flown: Option<Vec<usize>>,
     ) -> PyResult<Plans<'py>> {
-        let results = results.as_slice()?;
         let frames = frames.as_ref().map(|frames| frames.as_slice());
-        let frames = frames.transpose()?;
-        let plans = self.state.with(py, |state| {
-            state.update(&worlds, results, frames, flown.as_deref(), true)?;
-            Ok(state.plans())
+        let observed = Observed {
+            worlds: &worlds,
+            results: results.as_slice()?,
+            frames: frames.transpose()?,
+            flown: flown.as_deref(),
+        };
+        let plans = self.worlds.with(py, |it| {
+            it.update(observed, true)?;
+            Ok(it.plans())
         });
         let (features, paths) = plans?.map_err(|error| raise(py, &error))?;
         Ok((features.into_pyarray(py), paths.into_pyarray(py)))
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.state.close(py)
+        self.worlds.close(py)
     }
 }
 
-impl State {
-    fn begin(&mut self, seeds: impl Iterator<Item = (usize, u64)>, prior: &Belief) -> Result<()> {
-        let seeds: Vec<(usize, u64)> = seeds.collect();
-        let Self { crew, threads, .. } = self;
-        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
-        let n_worlds = seeds.len();
-        let begun = threads.work(is_short(crew, n_worlds), |threads| {
-            threads.each(seeds, begin)
-        });
-        for begun in begun {
-            let (world, planned) = begun?;
-            let n_worlds = self.worlds.len();
-            let place = self.worlds.get_mut(world);
-            *place.with_context(|| no_such_world(n_worlds, world))? = Some(planned);
-        }
-        Ok(())
-    }
-
-    /// Updates beliefs with frames, and plans.
-    fn update(
-        &mut self,
-        worlds: &[usize],
-        results: &[u8],
-        frames: Option<&[u8]>,
-        flown: Option<&[usize]>,
-        plans: bool,
-    ) -> Result<()> {
-        let n_cells = self.crew.shape().n_cells();
-        ensure!(
-            results.len() == worlds.len() * RESULT_BYTES
-                && frames.is_none_or(|frames| frames.len() == worlds.len() * n_cells)
-                && flown.is_none_or(|flown| flown.len() == worlds.len()),
-            "options: expected a result, a frame and an option for each of {} worlds, got others",
-            worlds.len()
-        );
-        let shown = self.shown(worlds.len() * usize::from(plans && frames.is_some()));
-        let mut row_of = vec![None; self.worlds.len()];
-        for (row, &world) in worlds.iter().enumerate() {
-            let place = row_of.get_mut(world);
-            *place.with_context(|| no_such_world(self.worlds.len(), world))? = Some(row);
-        }
-        let Self {
-            crew,
-            threads,
-            worlds: all,
-            ..
-        } = self;
-        let tasks = all.iter_mut().zip(row_of).enumerate();
-        let tasks = tasks.filter_map(|(index, (planned, row))| {
-            let (planned, row) = (planned.as_mut()?, row?);
-            let result = &results[row * RESULT_BYTES..][..RESULT_BYTES];
-            let (world, robot) = result.split_at(WORLD_BYTES);
-            Some(WorldWork {
-                index,
-                planned,
-                world: bytemuck::pod_read_unaligned(world),
-                robot: bytemuck::pod_read_unaligned(robot),
-                frame: frames.map(|frames| &frames[row * n_cells..][..n_cells]),
-                flown: flown.map(|flown| flown[row]),
-                plans,
-                is_shown: shown.contains(&row),
-            })
-        });
-        let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = threads.work(is_short(crew, tasks.len()), |threads| {
-            work_on(crew, tasks, threads)
-        });
-        let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
-        self.show(outlooks.into_iter().flatten());
-        Ok(())
-    }
-
-    /// Features and paths of the last plans of all worlds.
-    fn plans(&self) -> (Array3<f32>, Array3<u8>) {
-        let dim = (self.worlds.len(), OPTIONS.len());
-        let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
-        let mut paths = Array3::zeros((dim.0, dim.1, self.crew.n_moves()));
-        for (world, planned) in self.worlds.iter().enumerate() {
-            let proposals = planned.iter().flat_map(Planned::proposals);
-            for (option, proposal) in proposals.enumerate() {
-                let of_option = s![world, option, ..];
-                features
-                    .slice_mut(of_option)
-                    .assign(&ArrayView1::from(&proposal.features));
-                let moves = path_to_bytes(&proposal.plan.moves);
-                paths.slice_mut(of_option).assign(&ArrayView1::from(&moves));
-            }
-        }
-        (features, paths)
-    }
-
-    /// Selects the worlds to publish now.
-    fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
-        let begun = self.worlds.iter().flatten().next();
-        let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
-            return Vec::new();
-        };
-        let belief = || begun.agent().belief().probabilities();
-        let feed = watched
-            .feed
-            .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
-        if n_worlds == 0 {
-            Vec::new()
-        } else {
-            feed.due(n_worlds)
-        }
-    }
-
-    fn show(&mut self, outlooks: impl Iterator<Item = Outlook>) {
-        let Some(watched) = &mut self.watched else {
-            return;
-        };
-        for outlook in outlooks {
-            let world = watched.first_world + outlook.index as u32;
-            let view = View {
-                world,
-                robots: world..world + 1,
-                result: &outlook.world,
-                belief: outlook.belief.probabilities(),
-                intent: outlook.intent,
-            };
-            if let Some(feed) = &mut watched.feed {
-                feed.show(&view);
-            }
-        }
-    }
-}
-
-/// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
-fn work_on(
-    crew: &Crew,
-    mut tasks: Vec<WorldWork<'_>>,
-    threads: Threads,
-) -> Vec<Result<Option<Outlook>>> {
-    let seen = threads.each(&mut tasks, |task| task.see(crew));
-    let fits = tasks
-        .into_iter()
-        .zip(&seen)
-        .filter(|(_, seen)| seen.is_ok());
-    let mut tasks: Vec<_> = fits.map(|(task, _)| task).collect();
-    let new = tasks.iter_mut().filter(|task| task.frame.is_some());
-    let new = new.map(|task| &mut *task.planned);
-    match threads {
-        Threads::Several => Planned::predict_all(new),
-        Threads::One => new.for_each(|planned| Planned::predict_all([planned])),
-    }
-    let planning = tasks.into_iter().filter(|task| task.plans);
-    threads.each(planning, |task| task.planned.plan(task.robot.cell()));
-    seen
-}
-
-impl WorldWork<'_> {
-    /// Corrects the belief with the frame, if there is one.
-    fn see(&mut self, crew: &Crew) -> Result<Option<Outlook>> {
-        let Some(frame) = self.frame else {
-            return Ok(None);
-        };
-        let intent = self.is_shown.then(|| self.planned.intent(self.flown));
-        let n_observations = crew.model().n_observations();
-        self.planned.see(&Shown {
-            frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
-            reward: (self.world.step > 0).then_some(self.robot.reward),
-        })?;
-        Ok(intent.map(|intent| Outlook {
-            index: self.index,
-            world: self.world,
-            belief: self.planned.agent().belief().clone(),
-            intent,
-        }))
-    }
-}
-
-/// Whether the work on some worlds is too short for other threads: one world alone, but for networks, whose own threads
-/// must be among the pool's.
-fn is_short(crew: &Crew, n_worlds: usize) -> bool {
-    n_worlds == 1 && *crew.estimator() != NEURAL
-}
-
-/// The model that filters know, or a stand-in where the worlds' model is hidden.
+/// Returns the worlds' model. If it is hidden, and the estimator needs none, returns a stand-in without dynamics.
 fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Model> {
     if let Some(model) = &spec.model {
         return model_of(&model.toml);
@@ -455,8 +232,4 @@ fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Mo
         None => spec.airspace.seen(spec.n_observations).unchanging(),
     };
     model.map_err(|error| refused(py, error.to_string()))
-}
-
-fn no_such_world(n_worlds: usize, got: usize) -> String {
-    format!("options: expected a world below {n_worlds}, got {got}")
 }

@@ -1,6 +1,7 @@
-//! What beliefs of every kind are made from: a model and a first belief, or a checkpoint.
+//! The sources that beliefs are built from: a model and a first belief, or a checkpoint.
 
 use crate::belief::vanishing;
+use crate::errors::check_memory;
 use crate::refusal::{invalid, refused};
 use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
@@ -12,7 +13,7 @@ use emberwatch_learning::learned::Learned;
 use emberwatch_model::{Model, ModelError, Shape};
 use pyo3::prelude::*;
 
-/// What the beliefs are made from.
+/// The kind of the beliefs, and what they are built from.
 pub struct Origin {
     pub kind: &'static BeliefKind,
     pub model: Option<Model>,
@@ -21,7 +22,7 @@ pub struct Origin {
     pub shape: Shape,
 }
 
-/// The name of each kind of belief that frames correct, and what it is.
+/// Returns the name and a description of each kind of belief that frames correct.
 #[pyfunction]
 pub fn belief_kinds() -> Vec<(&'static str, &'static str)> {
     of_frames().map(|kind| (kind.name, kind.about)).collect()
@@ -37,20 +38,47 @@ impl Origin {
         }
     }
 
-    /// Beliefs before the first frame.
-    pub fn estimators(
-        &self,
-        threads: &mut Pool,
-        n_worlds: usize,
-    ) -> anyhow::Result<Vec<Box<dyn Estimator>>> {
-        let built = threads.work(self.is_short(n_worlds), |threads| {
-            threads.each(0..n_worlds, |_| (self.kind.build)(&self.conditions()))
-        });
-        built.into_iter().collect()
+    /// Builds the belief about one world before the first frame.
+    pub fn estimator(&self) -> anyhow::Result<Box<dyn Estimator>> {
+        (self.kind.build)(&self.conditions())
     }
 
-    /// Whether a step is too short for other threads: that of the plain filter, and of one world, but for networks, whose
-    /// own threads must be among the pool's.
+    /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states.
+    ///
+    /// # Errors
+    /// If there is not enough memory, or the model or checkpoint gives no belief on this grid.
+    pub fn estimators(
+        &self,
+        py: Python<'_>,
+        threads: &mut Pool,
+        n_worlds: usize,
+        n_states: usize,
+    ) -> PyResult<Vec<Box<dyn Estimator>>> {
+        let memory = |of_world: usize| {
+            let what = format_args!("the beliefs about {n_worlds} worlds");
+            check_memory(py, what, n_worlds.saturating_mul(of_world))
+        };
+        // Every kind keeps a belief and its predictor; the first estimator, once built, reports all of its memory.
+        memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
+        let first = py.detach(|| self.estimator());
+        let first = first.map_err(|error| unfit(py, &error))?;
+        let (expected, got) = (self.shape, first.belief().shape());
+        if got != expected {
+            let expected = format!("a belief on {expected}");
+            return Err(invalid(py, "checkpoint", expected, got));
+        }
+        memory(first.memory_bytes())?;
+        let others = py.detach(|| {
+            threads.work(self.is_short(n_worlds), |threads| {
+                threads.each(1..n_worlds, |_| self.estimator())
+            })
+        });
+        let worlds: anyhow::Result<Vec<_>> = std::iter::once(Ok(first)).chain(others).collect();
+        worlds.map_err(|error| unfit(py, &error))
+    }
+
+    /// Returns whether a step is too short to share between threads: a step of the plain filter, or of a single world.
+    /// Networks start threads themselves, which must be the pool's.
     pub fn is_short(&self, n_worlds: usize) -> bool {
         let is_network = [&NEURAL, &NEURAL_SENSOR, &AUTOENCODER].contains(&self.kind);
         *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
@@ -62,18 +90,21 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
     kinds.filter(|kind| kind.input == Input::Frames)
 }
 
-/// The kind of a name, or of a label, among those that were learned or the others.
-pub fn kind_of(py: Python<'_>, name: &str, is_learned: bool) -> PyResult<&'static BeliefKind> {
+/// Finds a kind of belief by its name or label: among the learned kinds, or among the kinds that only need a model.
+pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
         |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
-    named(name).filter(serves).ok_or_else(|| {
-        let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
-        let expected = format!("one of {}", names.join(", "));
-        invalid(py, "kind", expected, format!("'{name}'"))
-    })
+    // Text that UTF-8 cannot encode is no name either.
+    let found = name.extract::<&str>().ok().and_then(named);
+    if let Some(kind) = found.filter(serves) {
+        return Ok(kind);
+    }
+    let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
+    let expected = format!("one of {}", names.join(", "));
+    Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
-/// The error of a first belief that is none.
+/// Makes the error of a prior that is no belief.
 pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
     match error {
         BeliefError::Simplex { cell, got } => {
@@ -84,7 +115,7 @@ pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
     }
 }
 
-/// The error of a model or a checkpoint that gives no belief.
+/// Makes the error of a model or a checkpoint from which no belief can be built.
 pub fn unfit(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     match error.downcast_ref::<ModelError>() {
         Some(error) => vanishing(py, error),

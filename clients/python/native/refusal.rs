@@ -1,11 +1,11 @@
-//! Errors of arguments that make no sense, and the words of the server's refusals.
+//! Errors of invalid arguments, and descriptions of the server's refusals.
 
 use crate::errors::error;
 use emberwatch_messages::message::Status;
 use pyo3::prelude::*;
 use std::fmt::Display;
 
-/// The name of a status code, and its sentence for people; `None` if no refusal has the code.
+/// Returns the name of a status code and a sentence that explains it; `None` if no refusal has the code.
 #[pyfunction]
 pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     let status = Status::try_from(status).ok()?;
@@ -14,7 +14,7 @@ pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     is_refusal.then_some((name.as_str()?.to_owned(), status.explain(detail)))
 }
 
-/// An impossible argument: `InvalidArgumentError`.
+/// Makes an `InvalidArgumentError`: "subject: expected ..., got ...".
 pub fn invalid(
     py: Python<'_>,
     subject: impl Display,
@@ -25,12 +25,12 @@ pub fn invalid(
     error(py, "invalid", words)
 }
 
-/// An `EmberwatchError` with a code.
+/// Makes an `EmberwatchError` with a code.
 pub fn failed(py: Python<'_>, problem: &str, code: &str) -> PyErr {
     error(py, "EmberwatchError", (problem, code))
 }
 
-/// An impossible argument, in a sentence of its own.
+/// Makes an `InvalidArgumentError` with this message.
 pub fn refused(py: Python<'_>, problem: impl Display) -> PyErr {
     error(py, "InvalidArgumentError", (problem.to_string(),))
 }

@@ -1,9 +1,9 @@
-//! Threads for work on several worlds at once.
+//! A thread pool for work on several worlds at once.
 
 use emberwatch_learning::parallel::in_parallel;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// A thread pool of one object alone: threads of a global pool do not survive a fork.
+/// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]
 pub struct Pool {
     /// The process that started the threads.
@@ -11,7 +11,7 @@ pub struct Pool {
     threads: Option<ThreadPool>,
 }
 
-/// Whether worlds are worked on in parallel.
+/// How many threads share the work.
 #[derive(Clone, Copy)]
 pub enum Threads {
     One,
@@ -19,8 +19,8 @@ pub enum Threads {
 }
 
 impl Pool {
-    /// Works on the threads of the pool, which the first call in a process starts. With `is_short`, works here: handing
-    /// the work to another thread would cost more than it gains.
+    /// Runs `work` on the threads of the pool, which the first call in a process starts. With `is_short`, runs it on
+    /// this thread: handing it to another would cost more than it gains.
     pub fn work<R: Send>(&mut self, is_short: bool, work: impl FnOnce(Threads) -> R + Send) -> R {
         if is_short {
             return work(Threads::One);
@@ -32,12 +32,12 @@ impl Pool {
         }
         match &self.threads {
             Some(threads) => threads.install(|| work(Threads::Several)),
-            // The system gives no threads.
+            // The system starts no more threads.
             None => work(Threads::One),
         }
     }
 
-    /// In a forked child: leaves the parent's threads alone, which do not run here.
+    /// In a forked child, forgets the parent's threads. They do not run here, and dropping the pool would wait for them.
     fn forget_others(&mut self) {
         if self.pid != std::process::id() {
             std::mem::forget(self.threads.take());
@@ -52,7 +52,7 @@ impl Drop for Pool {
 }
 
 impl Threads {
-    /// The results in order.
+    /// Applies `work` to each task. Returns the results in the order of the tasks.
     pub fn each<T: Send, U: Send>(
         self,
         tasks: impl IntoIterator<Item = T>,

@@ -254,7 +254,7 @@ def test_a_sum_of_one_is_not_enough_for_a_prior() -> None:
 
 def test_priors_of_another_shape_are_refused() -> None:
     for shape in ((2, 4, 4), (4, 4), (3, 0, 4)):
-        with refuses(r"prior: expected shape \(3, H, W\)"):
+        with refuses(r"prior: expected numbers of shape \(3, H, W\)"):
             known(WILDFIRE, prior=np.full(shape, 0.5))
     with pytest.raises(ValueError, match=r"expected shape \(3, 2, 2\)"):
         Transition(WILDFIRE, height=2, width=2).apply(np.ones((3, 2, 3)))

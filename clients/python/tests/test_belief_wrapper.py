@@ -148,7 +148,7 @@ def test_a_burn_in_is_simulated() -> None:
 
 
 def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="does not reveal it .* pass model="):
+    with pytest.raises(ValueError, match="the server hides it .* Pass model="):
         BeliefObservation(Stub(model=None))
     file = tmp_path / "model.toml"
     file.write_text(WILDFIRE.toml)
@@ -201,5 +201,5 @@ def test_it_observes_beliefs_of_other_kinds(tmp_path: Path) -> None:
     env = BeliefObservation(Stub(model=None), checkpoint=checkpoint)
     env.reset(seed=1)
     assert env.filter.kind == "neural" and env.step(None)[0] in env.observation_space
-    with refuses("prior: expected none beside a checkpoint"):
+    with refuses("prior: expected None with a checkpoint"):
         BeliefObservation(Stub(), checkpoint=checkpoint, prior="uniform")

@@ -1,9 +1,10 @@
-"""Beliefs of every kind: the Rust agent's numbers, many worlds as each alone, and refusals."""
+"""Beliefs of every kind: equal to the Rust agent's, one world or many; refusals of bad input."""
 
+import re
 import subprocess
 import textwrap
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ N_WORLDS = 3
 KNOWN = [name for name in belief.kinds() if name.startswith("known")]
 LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
 
-#: Kinds, and the checkpoints of those that were learned.
+#: Kinds, and for learned kinds a checkpoint.
 CASES: list[tuple[str, str | None]] = [
     *((kind, None) for kind in KNOWN),
     *((kind, "learned_filter") for kind in LEARNED),
@@ -77,7 +78,7 @@ def made(kind: str, checkpoint: Path | None, n_worlds: int | None = None) -> Bel
 
 
 def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArray[np.float32]]:
-    """The beliefs before each step of agents whose estimator is of a kind, `(S, n, H, W)`."""
+    """Yields the beliefs of agents with this estimator before each step, `(S, n, H, W)`."""
     spec = types.SimpleNamespace(
         **GRID,
         n_moves=16,
@@ -111,7 +112,7 @@ def test_beliefs_are_the_agents_to_the_bit(
             single.correct(frames[world])
             assert (many.belief[:, world] == single.belief).all()
             single.predict()
-            # Bit for bit, as the agent's.
+            # Equal to the agent in every bit, signs of zeros included.
             assert single.belief.tobytes() == expected[:, world].tobytes()
         many.predict()
         assert many.belief.tobytes() == expected.tobytes()
@@ -209,27 +210,133 @@ def test_certainty_that_is_wrong_costs_infinitely_much() -> None:
     assert belief.score(kept, nothing, np.array([[[0, 2]]], np.uint8), target=0).brier[0] == 0.5
 
 
-def test_arguments_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Path) -> None:
-    frame = np.full((16, 16), 255, np.uint8)
-    kept, many = made("known", None), made("known", None, N_WORLDS)
-    with refuses(f"kind: expected one of {', '.join(KNOWN)}, got 'learned'".replace("+", r"\+")):
-        made("learned", None)
+#: Arguments of `known`, of which one is wrong, and the errors.
+KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
+    ({"model": 7}, "model: expected text or a path, got 7"),
+    ({"kind": "learned"}, f"kind: expected one of {', '.join(KNOWN)}, got 'learned'"),
+    ({"kind": None}, f"kind: expected one of {', '.join(KNOWN)}, got None"),
+    ({"kind": "\ud800"}, "got '\\ud800'"),
+    ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got 'uniform'"),
+    ({"prior": PRIOR[:2]}, "prior: expected numbers of shape (3, H, W), got float32 of shape (2,"),
+    ({"prior": np.ones((3, 1, 1), bool)}, "prior: expected numbers of shape (3, H, W), got bool"),
+    ({"prior": np.full((3, 1, 1), 1e300)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
+    ({"prior": np.full((3, 1, 1), np.nan)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
+    ({"n_worlds": 0}, "n_worlds: expected an integer within 1 to 1048576, got 0"),
+    ({"n_worlds": True}, "n_worlds: expected an integer within 1 to 1048576, got True"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "error"), KNOWN_REFUSALS)
+def test_known_refuses_wrong_arguments(wrong: dict[str, Any], error: str) -> None:
+    right: dict[str, Any] = {"model": MODEL, "prior": PRIOR}
+    with refuses(re.escape(error)):
+        belief.known(**(right | wrong))
+
+
+FRAME = np.full((16, 16), 255, np.uint8)
+TRUTH = np.zeros((16, 16), np.uint8)
+WORLDS = "worlds: expected a mask or indices of 3 worlds, or a slice, got "
+
+
+def of_frame(value: int) -> NDArray[np.uint8]:
+    """Returns two frames whose only observed value is in the last cell of the second."""
+    frames = np.stack([FRAME, FRAME])
+    frames[1, -1, -1] = value
+    return frames
+
+
+#: Wrong calls of a belief about one world, or about three; the errors.
+REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
+    (
+        N_WORLDS,
+        lambda it: it.correct(FRAME),
+        "frame: expected shape (3, 16, 16) and type uint8, got (16, 16) and uint8",
+    ),
+    *(
+        (N_WORLDS, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}{worlds!r}")
+        for worlds in (3, [0, 3], [True, False], [0.5], True, [[0]], "0", 10**30)
+    ),
+    *(
+        (N_WORLDS, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}slice({worlds.start!r},")
+        for worlds in (slice("a", None), slice(None, None, 0))
+    ),
+    (
+        None,
+        lambda it: it.reset(keep_correlations=1),  # pyright: ignore[reportArgumentType]
+        "keep_correlations: expected True or False, got 1",
+    ),
+    (None, lambda it: it.score_states(FRAME), "states: expected values below 3, got 255"),
+    (
+        None,
+        lambda it: it.score_states(TRUTH, target=3),
+        "target: expected an integer within 0 to 2 (normal, latent, fire), got 3",
+    ),
+    *(
+        (
+            None,
+            lambda it, target=target: belief.score(it, FRAME[None], TRUTH[None], target=target),
+            f"target: expected an integer within 0 to 2 (normal, latent, fire), got {target!r}",
+        )
+        for target in (9, -1, True, "fire")
+    ),
+    (
+        None,
+        lambda _: belief.score("known", FRAME[None], TRUTH[None]),  # pyright: ignore
+        "belief: expected a Belief of `known` or `load`, got 'known'",
+    ),
+    (
+        None,
+        lambda it: belief.score(it, FRAME, TRUTH),
+        "observations: expected shape (K, 16, 16) with K >= 1, and type uint8, got (16, 16)",
+    ),
+    (
+        N_WORLDS,
+        lambda it: belief.score(it, FRAME[None], TRUTH[None]),
+        "observations: expected shape (K, 3, 16, 16) with K >= 1, and type uint8, got (1, 16, 16)",
+    ),
+    (
+        None,
+        lambda it: belief.score(it, FRAME[None], TRUTH[None].astype(int)),
+        "states: expected shape (K, 16, 16) with K >= 1, and type uint8, got (1, 16, 16) and int64",
+    ),
+    (
+        None,
+        lambda it: belief.score(it, of_frame(255), TRUTH[None]),
+        "states: expected 2 steps, as observations, got 1",
+    ),
+    (
+        None,
+        lambda it: belief.score(it, of_frame(3), np.stack([TRUTH, TRUTH])),
+        "observations: step 1, cell (15, 15): expected a value below 3, or 255, got 3",
+    ),
+    (
+        None,
+        lambda it: belief.score(it, FRAME[None], FRAME[None]),
+        "states: step 0, cell (0, 0): expected a value below 3, got 255",
+    ),
+]
+
+
+@pytest.mark.parametrize(("n_worlds", "call", "error"), REFUSALS)
+def test_a_refused_call_leaves_the_belief_as_it_was(
+    n_worlds: int | None, call: Callable[[Belief], Any], error: str
+) -> None:
+    kept = made("known", None, n_worlds)
+    kept.correct(np.full(kept.shape, 2, np.uint8))
+    before = kept.belief
+    with refuses(re.escape(error)):
+        call(kept)
+    assert (kept.belief == before).all()
+
+
+def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Path) -> None:
+    with refuses("checkpoint: expected text or a path, got None"):
+        belief.load(None, **GRID)  # pyright: ignore[reportArgumentType]
     with refuses("kind: expected one of learned, .*, got 'known'"):
         made("known", checkpoints / "learned_filter")
-    with refuses("n_worlds: expected an integer within 1 to"):
-        made("known", None, 0)
-    with refuses(r"frame: expected shape \(3, 16, 16\) and type uint8, got \(16, 16\)"):
-        many.correct(frame)
-    for worlds in (3, [0, 3], [True, False], [0.5]):
-        with refuses("worlds: expected a mask or indices of 3 worlds"):
-            many.predict(worlds)
-    with refuses("states: expected values below 3, got 255"):
-        kept.score_states(frame)
-    with refuses("states: expected shape .*, that of observations"):
-        belief.score(kept, frame[np.newaxis], frame)
-    with refuses("observations: expected shape"):
-        belief.score(kept, frame, frame)
-    # No checkpoint, one of another kind, and one that fits other worlds.
+    with refuses("kind: expected one of learned, .*, got 3"):
+        made(3, checkpoints / "learned_filter")  # pyright: ignore[reportArgumentType]
+    # No checkpoint, a checkpoint of another kind, and checkpoints of other worlds.
     (tmp_path / "text").write_text("no checkpoint")
     with refuses("checkpoint .*text: expected a whole safetensors file"):
         belief.load(tmp_path / "text", **GRID)
@@ -250,7 +357,7 @@ def test_a_neural_belief_with_a_known_sensor_weighs_what_it_sees(checkpoints: Pa
 
     plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
     shows = MODEL.observation_matrix.T
-    # But where a state would be less than impossible, beliefs show what the network predicts.
+    # Except where the inverse of the sensor gives a negative probability, which is cut off.
     possible = (noisy.belief > 1e-5).all(0)
     shown = np.tensordot(shows, noisy.belief, 1)
     assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)

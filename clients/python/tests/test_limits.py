@@ -155,6 +155,32 @@ print(len(lease.reset(range(32))))
     assert python(code, limit=memory.enter) == "32\n"
 
 
+@pytest.mark.parametrize(
+    # A belief alone takes 240 bytes and 3 KiB, with its tables and cavities 6 and 160 KiB.
+    ("kind", "side", "n_worlds"),
+    [("known", 4, 1 << 20), ("known+cavities", 16, 40_000)],
+)
+def test_beliefs_beyond_a_limit_are_refused_before_they_are_made(
+    kind: str, side: int, n_worlds: int
+) -> None:
+    code = """
+from emberwatch import belief
+from emberwatch.model import Model
+kind, side, n_worlds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+model = Model.named("wildfire-burnout")
+prior = belief.uniform_prior(model, height=side, width=side)
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+before = peak()
+tell(lambda: belief.known(model, prior=prior, kind=kind, n_worlds=n_worlds))
+print(peak() - before)
+"""
+    error, mebibytes = python(code, kind, side, n_worlds).splitlines()
+    assert "NotEnoughMemoryError no_memory memory: expected " in error
+    assert f" MiB for the beliefs about {n_worlds} worlds, got " in error
+    assert int(mebibytes) < 100
+
+
 def test_memory_errors_are_of_both_kinds() -> None:
     with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells") as caught:
         emberwatch.embed(worlds=1024, height=4096, width=4096)

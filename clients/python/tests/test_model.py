@@ -82,6 +82,12 @@ def test_wildfire_has_the_published_parameters() -> None:
     assert model.state_colors[2] == model.observation_colors[2] == (0xC8, 0x37, 0x1B)
 
 
+def test_the_edge_is_the_state_of_cells_outside_the_grid() -> None:
+    model, closed = Model.wildfire(), Model.from_toml(f'edge = "fire"\n{WILDFIRE}')
+    assert model.edge is None and closed.edge == 2
+    assert model != closed
+
+
 @pytest.mark.parametrize("file", sorted(CONFIG.iterdir()), ids=lambda file: file.stem)
 def test_files_are_read_as_the_oracle_reads_them(file: Path) -> None:
     model, expected = Model.from_toml(file.read_text()), oracle.parameters(file.read_text())

@@ -151,7 +151,11 @@ def test_other_threads_run_beside_work_on_large_grids() -> None:
     prior = initial_prior(WILDFIRE, height=600, width=600)
     beliefs, frames = np.repeat(prior[:, np.newaxis], 2, axis=1), np.zeros((2, 600, 600), np.uint8)
     phi = _native.Transition(WILDFIRE.toml, 600, 600)
-    meets(lambda: phi.apply(beliefs), errors.InvalidArgumentError, "filter for each thread")
+    meets(
+        lambda: phi.apply(beliefs),
+        errors.InvalidArgumentError,
+        "filter that no other thread is using",
+    )
     correct = partial(_native.correct, beliefs, WILDFIRE.observation_matrix, frames)
     meets(correct, errors.InvalidArgumentError, "in use")
 

@@ -1,4 +1,4 @@
-//! The checks that turn a [`ModelFile`] into arrays; the first that fails names its entry.
+//! Checks a [`ModelFile`] and converts it to arrays. An error names the first wrong entry.
 
 use super::cell_map::CellMap;
 use super::file::{
@@ -10,20 +10,20 @@ use ndarray::{Array1, Array2, Array4, ArrayViewMut1, s};
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 
-/// Range of weights and biases that are not zero, and of the size of rewards: no sum or product of
-/// those overflows or vanishes in `f64`.
+/// Range of the size of weights, biases and rewards that are not zero. Their sums and products neither overflow nor
+/// vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
-/// Most weights of all kernels: 512 MiB. 64 states with kernels of their own of 15 x 15 cells have 59 million.
+/// Maximum number of weights of all kernels, 512 MiB in total. 64 own-state kernels of 15 x 15 cells have 59 million.
 const MAX_WEIGHTS: usize = 1 << 26;
 
-/// Names that no state may have: policies have goals of these names beside the states.
+/// Names that no state may have. A policy's goal is the name of a state or one of these.
 const RESERVED: [&str; 5] = ["coverage", "exploit", "exploit_only", "explore", "learned"];
 
-/// How far a probability distribution in a model file may be from summing to one.
+/// Maximum distance from 1 of the sum of a distribution in a model file.
 const SUM_TOLERANCE: f64 = 1e-6;
 
-/// The checks of [`super::Model::new`]; each returns what it checked.
+/// The checks of [`super::Model::new`]. Each returns the checked values.
 pub(super) struct Checker<'a> {
     pub model: &'a str,
 }
@@ -39,6 +39,7 @@ impl Checker<'_> {
         })
     }
 
+    /// Checks the numbers of states, observations and zones, and their names and colours.
     pub fn counts_and_names(&self, file: &ModelFile) -> Result<(), ModelError> {
         let states: Vec<_> = file.states.iter().map(|s| (&s.name, &s.color)).collect();
         let observations: Vec<_> = file
@@ -90,6 +91,7 @@ impl Checker<'_> {
         Ok(())
     }
 
+    /// Returns one number per state. Each must be finite and not below `least`.
     pub fn per_state(
         &self,
         file: &ModelFile,
@@ -113,7 +115,7 @@ impl Checker<'_> {
         Ok(file.states.iter().map(value).collect())
     }
 
-    /// Checks that a number is neither too small nor too large to compute with.
+    /// Checks that a number is 0 or in [`RANGE`].
     fn size(&self, what: String, got: f64, is_zero: bool) -> Result<(), ModelError> {
         if is_zero || RANGE.contains(&got.abs()) {
             return Ok(());
@@ -122,6 +124,7 @@ impl Checker<'_> {
         self.wrong(what, &expected, format!("{got:e}"))
     }
 
+    /// Checks that values are a probability distribution.
     pub fn distribution(&self, what: &str, values: &[f64]) -> Result<(), ModelError> {
         if values.iter().any(|v| !v.is_finite() || *v < 0.0) {
             return self.wrong(what.into(), "probabilities >= 0", format!("{values:?}"));
@@ -133,7 +136,7 @@ impl Checker<'_> {
         Ok(())
     }
 
-    /// The observation matrices of the path and of each ring, side by side: shape `[S, O]`.
+    /// Returns the observation matrices of the path and of each ring next to each other, shape `[S, O]`.
     pub fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
         let (n_states, n_named) = (file.states.len(), file.observations.len());
         let sensor = file.sensor.clone().unwrap_or_default();
@@ -188,7 +191,7 @@ impl Checker<'_> {
         Ok(())
     }
 
-    /// The zone of each cell, if there are zones.
+    /// Returns the zone of each cell, if there are zones.
     pub fn zone_map(&self, file: &ModelFile) -> Result<Option<Grid<u8>>, ModelError> {
         let n_zones = file.zones.len();
         let Some(map) = &file.zone_map else {
@@ -207,7 +210,7 @@ impl Checker<'_> {
         }
     }
 
-    /// Where no robot may be, if the file says so.
+    /// Returns whether each cell is closed to robots, if the file has a no-fly map.
     pub fn no_fly(&self, file: &ModelFile) -> Result<Option<Grid<bool>>, ModelError> {
         let Some(map) = &file.no_fly else {
             return Ok(None);
@@ -227,7 +230,7 @@ impl Checker<'_> {
             .or_else(|(expected, got)| self.wrong(what.into(), &expected, got))
     }
 
-    /// One kernel for all cells, or one for each state that a cell itself can be in; as many for each zone.
+    /// Returns the kernels, zone by zone. Each zone has one kernel, or one per own state of the cell.
     pub fn kernels(&self, file: &ModelFile) -> Result<Vec<Array4<f64>>, ModelError> {
         let [height, width] = file.kernel_size;
         let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
@@ -260,7 +263,8 @@ impl Checker<'_> {
             if !filled.insert((zone, own, to, from)) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
-            // The centre of a cell's kernel is the cell itself: weights of other states there have no effect.
+            // The centre of the kernel is the cell itself, in its own state. Weights of other states have no effect
+            // there.
             let is_void =
                 |tap| entry.own.is_some() && own != from && tap == (height / 2, width / 2);
             for (row, col, weight) in self.weights(entry, file.kernel_size)? {
@@ -273,7 +277,7 @@ impl Checker<'_> {
         Ok(kernels)
     }
 
-    /// Checks that each zone has kernels, and each kernel a zone, if there are zones.
+    /// Checks that each kernel entry names a zone and each zone has an entry, if there are zones.
     fn check_zones(&self, file: &ModelFile) -> Result<(), ModelError> {
         let names: HashSet<&str> = file.zones.iter().map(|zone| zone.name.as_str()).collect();
         let mut with_kernel = HashSet::new();
@@ -299,7 +303,7 @@ impl Checker<'_> {
             None => Ok(()),
             Some(zone) => {
                 let what = format!("zone {:?}", zone.name);
-                self.wrong(what, "kernel entries of its own", "none")
+                self.wrong(what, "kernel entries with its name", "none")
             }
         }
     }
@@ -343,10 +347,18 @@ impl Checker<'_> {
         Ok(weights)
     }
 
-    /// The state of cells outside the grid.
+    /// Returns the state of the cells outside the grid, if the file names one.
     pub fn edge(&self, file: &ModelFile) -> Result<Option<usize>, ModelError> {
-        let edge = file.edge.as_deref();
-        edge.map(|name| self.state(file, name)).transpose()
+        let Some(name) = &file.edge else {
+            return Ok(None);
+        };
+        let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
+        let state = names.iter().position(|known| known == name);
+        if state.is_none() {
+            let expected = format!("the name of a state, one of {names:?}");
+            return self.wrong("edge".into(), &expected, format!("{name:?}"));
+        }
+        Ok(state)
     }
 
     fn state(&self, file: &ModelFile, name: &str) -> Result<usize, ModelError> {

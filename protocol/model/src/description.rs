@@ -5,18 +5,18 @@ use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, SensorEn
 use super::parameters::Model;
 use serde::{Deserialize, Serialize};
 
-/// What a recorded world says of its states.
+/// The names, observations and rewards of a recorded world's states.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
     /// Name shown to people.
     pub name: String,
-    /// What one step means in time, for people.
+    /// Duration of one step, for people.
     pub step: String,
     /// 1 for each cell where no robot may be, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
-    /// What a robot sees, as in a [`ModelFile`].
+    /// The sensor, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorEntry>,
     /// The states, in the order of their values.
@@ -25,7 +25,7 @@ pub struct Description {
     pub observations: Vec<ObservationEntry>,
 }
 
-/// One state of a description; keys and ranges are those of a [`StateEntry`].
+/// One state of a description. Keys and ranges are as in a [`StateEntry`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DescribedState {
@@ -41,11 +41,10 @@ pub struct DescribedState {
 }
 
 impl Description {
-    /// The model with these states in which each cell stays as it is: names, sensor and rewards are the recorded
-    /// world's, and the transition is not.
+    /// Builds the model with these states, observations and rewards, in which no cell changes its state.
     ///
     /// # Errors
-    /// If an entry is wrong; the error names it, what it must be and what it is.
+    /// If an entry is wrong. The error names it, the expected value and the given one.
     pub fn unchanging(&self) -> Result<Model, ModelError> {
         let share = 1.0 / self.states.len().max(1) as f64;
         let state = |state: &DescribedState| StateEntry {
@@ -78,10 +77,10 @@ impl Description {
         })
     }
 
-    /// The unchanging model of a description's text.
+    /// Parses a description and builds its unchanging model.
     ///
     /// # Errors
-    /// If it is not a description, or an entry is wrong.
+    /// If the text is not a description, or an entry is wrong.
     pub fn model_of(text: &str) -> Result<Model, ModelError> {
         let description: Self =
             toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;

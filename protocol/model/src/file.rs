@@ -7,20 +7,20 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use thiserror::Error;
 
-/// Most states, and most observations, of a model: 64.
+/// Maximum number of states, and of observations: 64.
 pub const MAX_VALUES: usize = 64;
 
-/// Largest kernel side: 15 cells.
+/// Maximum side of a kernel: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
 
-/// The least that the weights of a cell may sum to, as a share of the largest weight: the smallest
-/// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
+/// Minimum sum of a cell's weights, as a share of the largest weight. The smallest normal `f32` is 1e-38, so larger
+/// sums keep their precision.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
-/// Most zones: as many as a byte tells apart.
+/// Maximum number of zones: the number of values of a byte.
 pub const MAX_ZONES: usize = 256;
 
-/// Largest radius of a sensor: 8 cells.
+/// Maximum radius of a sensor: 8 cells.
 pub const MAX_RADIUS: usize = 8;
 
 /// A model as written in TOML; [`super::Model::new`] checks it.
@@ -29,28 +29,28 @@ pub const MAX_RADIUS: usize = 8;
 pub struct ModelFile {
     /// Name shown to people.
     pub name: String,
-    /// Rows and columns of the transition kernel, both odd.
+    /// Number of rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
-    /// Name of the state that cells outside the grid are always in; without it, they add no weight.
+    /// Name of the state of all cells outside the grid. Without it, they add no weight.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub edge: Option<String>,
-    /// The zone of each cell: its place in `zones`.
+    /// The zone of each cell, as an index in `zones`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone_map: Option<CellMap>,
     /// 1 for each cell where no robot may be.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
-    /// What a robot sees; without it, the cells of its path.
+    /// The sensor of a robot. Without it, a robot sees the cells of its path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorEntry>,
-    /// Kinds of land, each with kernels of its own.
+    /// Kinds of land, each with separate kernels.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub zones: Vec<ZoneEntry>,
     /// The states, in the order of their values.
     pub states: Vec<StateEntry>,
     /// The observations, in the order of their values.
     pub observations: Vec<ObservationEntry>,
-    /// The blocks `w[to, from]` of the kernel that are not zero.
+    /// The nonzero blocks `w[to, from]` of the kernels.
     pub kernel: Vec<KernelEntry>,
 }
 
@@ -84,18 +84,18 @@ pub struct ObservationEntry {
     pub color: String,
 }
 
-/// What a robot sees from its path.
+/// The sensor of a robot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SensorEntry {
-    /// Rows and columns that it sees beyond each cell of the path (a Chebyshev distance).
+    /// Number of rows and columns that it sees around each cell of the path (a Chebyshev distance).
     #[serde(default)]
     pub radius: usize,
-    /// The cells that pay.
+    /// The cells that earn a reward.
     #[serde(default)]
     pub pays: Pays,
-    /// The observation matrix of ring 1, 2 and so on; the last holds for the rings beyond. Without one, `observed_as`
-    /// of the states holds everywhere.
+    /// The observation matrices of ring 1, 2 and so on. The last one holds for all further rings. Without any,
+    /// `observed_as` of the states holds everywhere.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rings: Vec<RingEntry>,
 }
@@ -104,18 +104,18 @@ pub struct SensorEntry {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RingEntry {
-    /// `P(y | x)`: a row for each state, one entry per observation.
+    /// `P(y | x)`: one row per state, one entry per observation.
     pub observed_as: Vec<Vec<f64>>,
 }
 
-/// The distinct cells that earn their states' rewards.
+/// The choice of cells that earn the reward of their state. Each cell counts once.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Pays {
-    /// Those on the path.
+    /// Cells on the path.
     #[default]
     Visited,
-    /// Those in sight of the path.
+    /// Cells that are seen from the path.
     Seen,
 }
 
@@ -129,35 +129,35 @@ pub struct ZoneEntry {
     pub color: String,
 }
 
-/// One block `w[to, from]` of the kernel in a model file.
+/// One block `w[to, from]` of a kernel in a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KernelEntry {
-    /// Name of the zone; in all entries of a file, or in none.
+    /// Name of the zone, in all entries of a file or in none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone: Option<String>,
-    /// Name of the state that the cell itself is in at k; in all entries of a file, or in none.
+    /// Name of the cell's own state at step k, in all entries of a file or in none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub own: Option<String>,
-    /// Name of the state at k.
+    /// Name of the neighbour's state at step k.
     pub from: String,
-    /// Name of the state at k + 1.
+    /// Name of the cell's state at step k + 1.
     pub to: String,
     /// Factor on every weight.
     #[serde(default = "one")]
     pub scale: f64,
-    /// Weights `[row offset][column offset]`; the centre is the cell itself, rows grow downward.
+    /// Weights `[row offset][column offset]`. The centre is the cell itself, and rows grow downward.
     pub weights: Vec<Vec<f64>>,
 }
 
-/// Why a model file was rejected.
+/// The reason why a model file is rejected.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// Not TOML, or not of the model's form.
+    /// The text is not TOML, or lacks the structure of a model file.
     #[error("model file: {0}")]
     Toml(String),
-    /// Too few or too many states or observations.
+    /// There are too few or too many states or observations.
     #[error("model {model:?}: expected {least} to {most} {what}, got {got}")]
     Count {
         /// The model's name.
@@ -171,7 +171,7 @@ pub enum ModelError {
         /// Number in the file.
         got: usize,
     },
-    /// Two entries with one name.
+    /// Two entries have the same name.
     #[error("model {model:?}: {what} name {name:?} stands twice")]
     DuplicateName {
         /// The model's name.
@@ -181,15 +181,15 @@ pub enum ModelError {
         /// The repeated name.
         name: String,
     },
-    /// A file that cannot be read.
+    /// A file cannot be read.
     #[error("{path}: {problem}")]
     File {
         /// The file.
         path: String,
-        /// Why not.
+        /// The system's error.
         problem: String,
     },
-    /// A kernel entry that names a state the model lacks.
+    /// A kernel entry names an unknown state.
     #[error("model {model:?}: kernel entry names state {name:?}, expected one of {known:?}")]
     UnknownState {
         /// The model's name.
@@ -199,19 +199,19 @@ pub enum ModelError {
         /// The model's states.
         known: Vec<String>,
     },
-    /// A number or a size that cannot be right.
+    /// An entry has a wrong value.
     #[error("model {model:?}: {what}: expected {expected}, got {got}")]
     Value {
         /// The model's name.
         model: String,
-        /// Which entry.
+        /// The entry.
         what: String,
-        /// What it must be.
+        /// The expected value.
         expected: String,
-        /// What it is.
+        /// The given value.
         got: String,
     },
-    /// A cell whose transition weights can all be zero: eq. 3 would divide by zero.
+    /// The transition weights of a cell can all be zero: eq. 3 would divide by zero.
     #[error(
         "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to zero, \
          expected a positive sum whatever its neighbourhood: give the centre of the kernel a \
@@ -225,7 +225,7 @@ pub enum ModelError {
         /// The first such cell.
         cell: Cell,
     },
-    /// A cell whose transition weights can all be so small that eq. 3 divides noise by noise.
+    /// The transition weights of a cell can all be so small that eq. 3 divides rounding errors.
     #[error(
         "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} of \
          the largest weight, expected at least {LEAST_SHARE:e} whatever its neighbourhood"
@@ -237,16 +237,16 @@ pub enum ModelError {
         shape: Shape,
         /// The first such cell.
         cell: Cell,
-        /// What its weights can sum to, as a share of the largest weight.
+        /// The smallest sum of its weights, as a share of the largest weight.
         share: f64,
     },
 }
 
 impl ModelFile {
-    /// Reads a model file, and the maps that stand beside it.
+    /// Reads a model file, and the map files in its folder. [`super::Model::new`] checks the entries.
     ///
     /// # Errors
-    /// If a file cannot be read or is not of its form. What it says is yet to be checked.
+    /// If a file cannot be read or parsed.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let failed = |path: &Path, problem: String| ModelError::File {
             path: path.display().to_string(),
@@ -264,7 +264,7 @@ impl ModelFile {
 }
 
 impl KernelEntry {
-    /// Names the entry in errors.
+    /// Returns the name of the entry for errors.
     pub(super) fn what(&self) -> String {
         let pair = format!("from {:?} to {:?}", self.from, self.to);
         let zone = self.zone.iter().map(|zone| format!("in zone {zone:?} "));
@@ -276,7 +276,7 @@ impl KernelEntry {
     }
 }
 
-/// Colour of a `#rrggbb` text as `[red, green, blue]`.
+/// Parses a colour `#rrggbb` to `[red, green, blue]`.
 pub fn parse_color(text: &str) -> Option<[u8; 3]> {
     let digits = text
         .strip_prefix('#')

@@ -21,6 +21,7 @@ pub mod task;
 pub mod text;
 pub mod transition;
 pub mod vectors;
+pub mod zoned;
 
 pub use airspace::{Airspace, SeenCell};
 pub use cell_map::CellMap;

@@ -1,7 +1,8 @@
 //! The parameters of the hidden Markov model on a grid, for simulators and filters.
 //!
-//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of eq. 1.
-//! [`super::file`] is the file format. [`super::transition`] applies them to beliefs, [`super::dynamics`] to states.
+//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of
+//! eq. 1. [`super::file`] is the file format. [`super::transition`] applies them to beliefs, [`super::dynamics`] to
+//! states.
 
 use super::airspace::Airspace;
 use super::built_in::MODELS;
@@ -12,7 +13,7 @@ use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
 use std::sync::Arc;
 
-/// A checked model: every model that exists can be simulated and filtered.
+/// A checked model. Every value of this type can be simulated and filtered.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     file: ModelFile,
@@ -23,29 +24,29 @@ pub struct Model {
     reward: Array1<f64>,
     edge: Option<usize>,
     zone_map: Option<Arc<Grid<u8>>>,
-    /// Where no robot may be.
+    /// Whether each cell is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
 }
 
 impl Model {
-    /// The built-in wildfire model (`config/models/wildfire.toml`).
+    /// Returns the built-in wildfire model (`config/models/wildfire.toml`).
     pub fn wildfire() -> Self {
         Self::built_in("wildfire").expect("invariant: the wildfire is built in")
     }
 
-    /// The built-in model of a name (`config/models`).
+    /// Finds a built-in model by its name (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
         let (_, text) = MODELS.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);
         Some(model.expect("invariant: built-in models are valid, as a test shows"))
     }
 
-    /// The names of the built-in models.
+    /// Lists the names of the built-in models.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
         Self::built_in_files().map(|(name, _)| name)
     }
 
-    /// The built-in models: name, and text of the file.
+    /// Lists the built-in models: the name, and the text of the file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
         MODELS.iter().copied()
     }
@@ -53,13 +54,13 @@ impl Model {
     /// Reads and checks a model file's text.
     ///
     /// # Errors
-    /// If an entry is wrong; the error names it, what it must be and what it is.
+    /// If an entry is wrong. The error names it, the expected value and the given one.
     pub fn from_toml(text: &str) -> Result<Self, ModelError> {
         let file = toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
         Self::new(file)
     }
 
-    /// Reads and checks a model file and the maps beside it.
+    /// Reads and checks a model file, and the map files in its folder.
     ///
     /// # Errors
     /// If a file cannot be read, or an entry is wrong.
@@ -67,7 +68,7 @@ impl Model {
         Self::new(ModelFile::read(path)?)
     }
 
-    /// The same with a sensor that sees so many rows and columns beyond each cell of the path.
+    /// Replaces the radius of the sensor: the number of rows and columns that it sees around each cell of the path.
     ///
     /// # Errors
     /// If the radius is over 8.
@@ -85,7 +86,7 @@ impl Model {
     /// Checks a model file and lays out its arrays.
     ///
     /// # Errors
-    /// If an entry is wrong; the error names it, what it must be and what it is.
+    /// If an entry is wrong. The error names it, the expected value and the given one.
     pub fn new(file: ModelFile) -> Result<Self, ModelError> {
         let check = Checker { model: &file.name };
         check.counts_and_names(&file)?;
@@ -112,11 +113,11 @@ impl Model {
         })
     }
 
-    /// Checks that its maps are of a grid, and that eq. 3 never divides by zero or nearly zero there, whatever the
-    /// states.
+    /// Checks that the model's maps fit a grid, and that eq. 3 cannot divide by zero or nearly zero there.
     ///
     /// # Errors
-    /// If they are not, or it can; the error names the first such cell.
+    /// If a map has another grid, or if the weights of a cell can sum to nearly zero. The error names the first such
+    /// cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let maps = [
             ("zone_map", self.zone_map.as_ref().map(|map| map.dim())),
@@ -144,14 +145,14 @@ impl Model {
             let (row, col) = (kernel_height / 2, kernel_width / 2);
             least[[row, col]] = column_sums[[own, row, col]];
         }
-        // Of all zones: they are computed with one scale.
+        // The largest of all zones, because they are computed with one scale.
         let in_zones = self.kernels.iter().skip(own).step_by(self.n_own());
         let largest = in_zones
             .flatten()
             .chain(&self.bias)
             .copied()
             .fold(f64::MIN_POSITIVE, f64::max);
-        // Cells further than a kernel from the edges are all alike: look at one of them.
+        // Cells further than a kernel from the edges have the same weights, so one row and column of them is enough.
         let distinct = |side: usize, kernel: usize| {
             (0..side).filter(move |&at| at <= kernel || at + kernel >= side)
         };
@@ -175,7 +176,7 @@ impl Model {
         Ok(())
     }
 
-    /// Checks the least share of the largest weight that a cell's weights can sum to.
+    /// Checks the smallest possible sum of a cell's weights, as a share of the largest weight.
     fn check_share(&self, share: f64, shape: Shape, cell: Cell) -> Result<(), ModelError> {
         let model = || self.name().into();
         if share <= 0.0 {
@@ -193,28 +194,30 @@ impl Model {
         Ok(())
     }
 
-    /// The model's name.
+    /// Returns the model's name.
     pub fn name(&self) -> &str {
         &self.file.name
     }
 
-    /// The file that the model was made from; serialises to a model file again.
+    /// Returns the file of the model. It can be serialised to a model file again.
     pub fn file(&self) -> &ModelFile {
         &self.file
     }
 
-    /// Number of states S.
+    /// Returns the number of states S.
     pub fn n_states(&self) -> usize {
         self.file.states.len()
     }
 
-    /// Number of observations O: those that the file names, once for each observation matrix of the sensor.
+    /// Returns the number of observations O: the number in the file times the number of observation matrices.
     pub fn n_observations(&self) -> usize {
         self.likelihood.ncols()
     }
 
-    /// Observation matrices of the sensor: of the path itself, then of each ring around it, up to the radius; the last
-    /// holds for the rings beyond. Observation `y` by matrix `m` has the number `m * O / n_rings + y`.
+    /// Returns the number of the sensor's observation matrices: one for the path, then one per ring around it.
+    ///
+    /// The last one holds for all further rings up to the radius. Observation `y` by matrix `m` has the number
+    /// `m * O / n_rings + y`.
     pub fn n_rings(&self) -> usize {
         1 + self
             .file
@@ -223,7 +226,7 @@ impl Model {
             .map_or(0, |sensor| sensor.rings.len())
     }
 
-    /// Names of the observations: those of rings further out end in the ring.
+    /// Returns the names of the observations. In rings around the path, the name ends with the number of the ring.
     pub fn observation_names(&self) -> Vec<String> {
         let names = (0..self.n_rings()).flat_map(|ring| {
             self.file.observations.iter().map(move |it| match ring {
@@ -234,30 +237,30 @@ impl Model {
         names.collect()
     }
 
-    /// Whether a cell's weights depend on the state that it is in itself.
+    /// Whether a cell's weights depend on its own state.
     pub fn sees_own_state(&self) -> bool {
         self.n_own() > 1
     }
 
-    /// Kernels of a zone: 1, or S if cells see their own state.
+    /// Returns the number of kernels per zone: 1, or one per own state.
     fn n_own(&self) -> usize {
         self.kernels.len() / self.n_zones()
     }
 
-    /// Number of zones, 1 where all cells are alike.
+    /// Returns the number of zones, 1 without a zone map.
     pub fn n_zones(&self) -> usize {
         self.file.zones.len().max(1)
     }
 
-    /// The zone of each cell, shape `[H, W]`, where cells differ.
+    /// Returns the zone of each cell, shape `[H, W]`, if the model has zones.
     pub fn zone_map(&self) -> Option<&Arc<Grid<u8>>> {
         self.zone_map.as_ref()
     }
 
-    /// Where robots of a grid may fly, and what they see from there.
+    /// Returns the cells where robots may fly, and the cells that they see from there.
     ///
     /// # Errors
-    /// If maps are of another grid.
+    /// If a map has another grid.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
         self.check_on(shape)?;
         let sensor = self.file.sensor.clone().unwrap_or_default();
@@ -270,50 +273,51 @@ impl Model {
         ))
     }
 
-    /// Transition weights `w[to, from, row, col]`, shape `[S, S, KH, KW]`, all `>= 0` (eq. 2): one kernel
-    /// for all cells, or one for each state that a cell itself can be in; as many for each zone, one zone after the
-    /// other.
+    /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`, all `>= 0` (eq. 2).
+    ///
+    /// Each zone has one kernel, or one per own state of the cell. The kernels of a zone follow each other.
     pub fn kernels(&self) -> &[Array4<f64>] {
         &self.kernels
     }
 
-    /// The first of [`Model::kernels`]: that of all cells, unless there are zones or [`Model::sees_own_state`].
+    /// Returns the first of [`Model::kernels`]. It is the only one unless the model has zones or own-state kernels.
     pub fn kernel(&self) -> &Array4<f64> {
         &self.kernels[0]
     }
 
-    /// Transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
+    /// Returns the transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
     pub fn bias(&self) -> &Array1<f64> {
         &self.bias
     }
 
-    /// The state that cells outside the grid are always in; `None`: they add no weight.
+    /// Returns the state of all cells outside the grid. With `None`, they add no weight.
     pub fn edge(&self) -> Option<usize> {
         self.edge
     }
 
-    /// `P(y | x)`, shape `[S, O]`; each row sums to one for each of the [`Model::n_rings`] matrices (eq. 1).
+    /// Returns `P(y | x)`, shape `[S, O]`: [`Model::n_rings`] matrices next to each other, whose rows sum to one (eq.
+    /// 1).
     pub fn likelihood(&self) -> &Array2<f64> {
         &self.likelihood
     }
 
-    /// Distribution of each cell at the start of burn-in, shape `[S]`.
+    /// Returns the distribution of each cell's state at the start of burn-in, shape `[S]`.
     pub fn initial(&self) -> &Array1<f64> {
         &self.initial
     }
 
-    /// Reward for each distinct visited cell by its state, shape `[S]`.
+    /// Returns the reward of each state per distinct visited cell, shape `[S]`.
     pub fn reward(&self) -> &Array1<f64> {
         &self.reward
     }
 
-    /// Names of the states.
+    /// Returns the names of the states.
     pub fn state_names(&self) -> Vec<String> {
         let states = self.file.states.iter();
         states.map(|state| state.name.clone()).collect()
     }
 
-    /// The state that pays most (the first of them): fire in the wildfire model.
+    /// Returns the state with the highest reward, the first of several: fire in the wildfire model.
     pub fn target_state(&self) -> usize {
         let better = |best, state| {
             if self.reward[state] > self.reward[best] {
@@ -325,7 +329,7 @@ impl Model {
         (0..self.n_states()).fold(0, better)
     }
 
-    /// The state of a name.
+    /// Finds a state by its name.
     pub fn state_named(&self, name: &str) -> Option<usize> {
         self.file.states.iter().position(|state| state.name == name)
     }

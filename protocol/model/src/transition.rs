@@ -1,22 +1,23 @@
 //! The transition operator `Phi` on beliefs: the predictor `u_{k+1} = Phi(p_k)` of paper eqs. 2-4.
 //!
-//! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` with `(A, C)`
-//! the centre of the kernel and `x` zero outside the grid, or certain of the model's `edge` state there (eq. 2: a
-//! cross-correlation, not a flipped convolution), then divided by its sum over `m` (eq. 3). [`super::dynamics`] draws realised states
-//! from the same operator.
+//! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` with `(A, C)` the centre of the
+//! kernel (eq. 2: a cross-correlation, not a flipped convolution). Outside the grid `x` is zero, or certain of the
+//! model's `edge` state. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the same
+//! operator.
 //!
-//! Where the weights see the cell's own state `o`, `phi[m | o]` has the weights of `o`, and its centre tap
-//! sees `o` itself: `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it takes the
-//! cell and its neighbours for independent, as the filter does.
+//! If the kernels depend on the cell's own state `o`, `phi[m | o]` has the weights of `o`, and the cell at the centre
+//! of the kernel is in state `o`. Then `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it
+//! assumes that the cell and its neighbours are independent, as the filter does.
 //!
-//! Where a land has zones, each cell has the weights of its zone.
+//! If the model has zones, each cell has the weights of its zone.
 //!
-//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs` have these sums as they stand, and compare for any models and grids.
+//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs` compute these sums directly, and compare them for
+//! random models and grids.
 //!
-//! Two things make it fast, both without a change of meaning. The belief is copied into planes with
-//! a margin, so no cell is special and many are computed at once. And taps that weigh alike are added up
-//! before they are multiplied (`rows.rs`). Every lane does the same operations in the same order and none is fused, so
-//! results are bit-identical on every platform.
+//! Two optimisations keep the results. The belief is copied into planes with a margin, so that all cells are computed
+//! alike and many at once. And the beliefs of taps with equal weights are added before they are multiplied
+//! (`rows.rs`). Every lane does the same operations in the same order and none is fused, so results are bit-identical
+//! on every platform.
 
 mod layout;
 mod rows;
@@ -24,82 +25,34 @@ mod rows;
 use super::file::ModelError;
 use super::grid::{Grid, Shape};
 use super::parameters::Model;
-use super::vectors::vectorised;
-use layout::{LANES, Layout};
+use super::vectors::{LANES, vectorised};
+use super::zoned::ZonedNumbers;
+use layout::Layout;
 use ndarray::{Array3, Array4, NdFloat};
-use rows::{Kernels, Own, Slots, kernel_rows, taps_that_weigh_alike};
-use std::collections::HashMap;
+use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
 use std::sync::Arc;
 
-/// `Phi` for one model on one grid, with its work space: give each thread its own clone.
+/// The operator `Phi` for one model on one grid, with its work space. Each thread needs a clone.
 ///
-/// `f32` is what everything uses; `f64` is for checks.
+/// Programs use `f32`, and tests also `f64`.
 #[derive(Debug, Clone)]
 pub struct Transition<T = f32> {
     shape: Shape,
     n_states: usize,
     layout: Layout,
-    /// Groups of taps that weigh alike: where each reads, relative to a cell's place in `planes`.
+    /// Groups of taps with equal weights. Each tap is a distance from a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
-    land: Arc<Land<T>>,
-    /// The belief with a margin of zeros, in the plane of the edge's state of ones.
+    /// The weights that differ between zones.
+    slots: Arc<ZonedNumbers<T>>,
+    /// The belief, one plane per state. Margins are 0, and 1 in the plane of the model's edge state.
     planes: Vec<T>,
-    /// The inputs of each group, added up.
+    /// The sum of the beliefs at the taps of each group.
     sums: Vec<[T; LANES]>,
-    /// The weight of each next state, before eq. 3 divides.
+    /// The weight of each next state, before the division of eq. 3.
     weights: Vec<[T; LANES]>,
-    /// The same in one own state.
+    /// The weight of each next state given one own state.
     own_weights: Vec<[T; LANES]>,
-}
-
-/// What differs between the zones of a land.
-#[derive(Debug)]
-struct Land<T> {
-    /// Weights that differ.
-    n_slots: usize,
-    /// The pattern of zones that each [`LANES`] cells have, row by row; none where zones do not differ.
-    of_chunk: Vec<u32>,
-    /// For each pattern the slots of its lanes.
-    slots: Vec<[T; LANES]>,
-}
-
-impl<T: NdFloat> Land<T> {
-    fn new(zones: Option<&Grid<u8>>, slots: &Slots<T>) -> Self {
-        let mut land = Self {
-            n_slots: slots.len(),
-            of_chunk: Vec::new(),
-            slots: Vec::new(),
-        };
-        let mut patterns = HashMap::new();
-        for row in zones
-            .filter(|_| land.n_slots > 0)
-            .iter()
-            .flat_map(|map| map.rows())
-        {
-            for cells in row.to_vec().chunks(LANES) {
-                let mut pattern = [0; LANES];
-                pattern[..cells.len()].copy_from_slice(cells);
-                let n_known = patterns.len() as u32;
-                let number = *patterns.entry(pattern).or_insert(n_known);
-                if number == n_known {
-                    let of_lanes = |slot: &Vec<T>| pattern.map(|zone| slot[usize::from(zone)]);
-                    land.slots.extend(slots.iter().map(of_lanes));
-                }
-                land.of_chunk.push(number);
-            }
-        }
-        land
-    }
-
-    /// The slots of a chunk's lanes.
-    #[inline(always)]
-    fn slots(&self, chunk: usize) -> &[[T; LANES]] {
-        let Some(&pattern) = self.of_chunk.get(chunk) else {
-            return &[];
-        };
-        &self.slots[pattern as usize * self.n_slots..][..self.n_slots]
-    }
 }
 
 impl<T: NdFloat> Transition<T> {
@@ -113,21 +66,22 @@ impl<T: NdFloat> Transition<T> {
         let land = (model.zone_map().map(|map| &**map), model.n_zones());
         let mut transition = Self::on_land(model.kernels(), &bias, shape, land);
         if let Some(edge) = model.edge() {
-            // Inside the margins `load` replaces them.
+            // `load` replaces the values inside the margins.
             let planes = &mut transition.planes;
             planes[edge * transition.layout.plane..][..transition.layout.plane].fill(T::one());
         }
         Ok(transition)
     }
 
-    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid:
-    /// one kernel for all cells, or one for each state that a cell itself can be in.
-    /// All are finite and 0 or more; where a cell's weights can all be 0, its prediction is NaN.
+    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid.
+    ///
+    /// There is one kernel, or one per own state of the cell. All weights must be finite and 0 or more. If all
+    /// weights of a cell are 0, its prediction is NaN.
     pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
         Self::on_land(kernels, bias, shape, (None, 1))
     }
 
-    /// [`Self::of_weights`] with as many kernels for each zone. The map has the zone of each cell, shape `[H, W]`.
+    /// Like [`Self::of_weights`], with kernels for each zone. The map has the zone of each cell, shape `[H, W]`.
     fn on_land(
         kernels: &[Array4<f64>],
         bias: &[f64],
@@ -160,11 +114,11 @@ impl<T: NdFloat> Transition<T> {
             own_weights: vec![[T::zero(); LANES]; n_states],
             groups,
             kernels,
-            land: Arc::new(Land::new(zones, &slots)),
+            slots: Arc::new(ZonedNumbers::new(&slots, zones)),
         }
     }
 
-    /// Writes `Phi(belief)` to `out`, both `[S, H, W]`; each cell of the belief must sum to one.
+    /// Writes `Phi(belief)` to `out`, both `[S, H, W]`. Each cell of the belief must sum to one.
     ///
     /// # Panics
     /// If an array has another shape or is not row-major.
@@ -189,7 +143,7 @@ impl<T: NdFloat> Transition<T> {
         );
     }
 
-    /// Copies the belief inside the margins.
+    /// Copies the belief into the planes, inside the margins.
     fn load(&mut self, belief: &[T]) {
         let (Layout { above, left, .. }, width) = (self.layout, self.shape.width());
         let states = belief.chunks_exact(self.shape.n_cells());
@@ -201,10 +155,10 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
+    /// Computes eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
     #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     fn weigh(&mut self, at: usize, chunk: usize) {
-        let slots = self.land.slots(chunk);
+        let slots = self.slots.of_chunk(chunk);
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
         }
@@ -226,7 +180,7 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Eq. 3 for the cells from `(row, col)` on, as far as the grid goes.
+    /// Computes eq. 3 for the cells of a chunk, from `(row, col)` on, up to the edge of the grid.
     #[inline(always)]
     fn store(&self, row: usize, col: usize, out: &mut [T]) {
         let mut total = [T::zero(); LANES];
@@ -253,17 +207,23 @@ impl<T: NdFloat> Transition<T> {
             }
         }
     }
+
+    /// Returns about how many bytes of memory it takes: the belief with margins, and work space.
+    pub fn memory_bytes(&self) -> usize {
+        let n_lanes = self.sums.len() + self.weights.len() + self.own_weights.len();
+        size_of_val(&*self.planes) + n_lanes * size_of::<[T; LANES]>()
+    }
 }
 
-/// The [`LANES`] values from a place on.
+/// Returns the [`LANES`] values from a place on.
 #[inline(always)]
 fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
     planes[at..]
         .first_chunk()
-        .expect("invariant: the layout has room for LANES cells at every tap")
+        .expect("invariant: the layout holds LANES cells from every tap on")
 }
 
-/// The sum of the [`LANES`] values at each of the offsets.
+/// Returns the sum of the [`LANES`] values at several offsets.
 #[inline(always)]
 fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
     let mut sum = [T::zero(); LANES];

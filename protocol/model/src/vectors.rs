@@ -2,6 +2,9 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
+/// Number of cells computed at once: four AVX2 registers of `f32`. Independent sums hide the latency of additions.
+pub const LANES: usize = 32;
+
 /// Does `work`, compiled for AVX-512, AVX2 and plain vectors. No operation is fused, so the results are the same.
 ///
 /// Only what is inlined is compiled so: write `#[inline(always)]` before the closure and the functions that it calls.

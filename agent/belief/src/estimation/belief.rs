@@ -1,7 +1,7 @@
 //! A [`Belief`]: one probability distribution over states per cell, on the simplex by construction.
 //!
-//! Estimators produce beliefs (the `u` and `p` of paper eqs. 5 and 6), objectives read them; the
-//! uncertainty that attracts an exploring robot is their entropy (eq. 14).
+//! Estimators compute beliefs (the `u` and `p` of paper eqs. 5 and 6), and objectives read them. An exploring robot is
+//! attracted by their entropy (eq. 14).
 
 use emberwatch_model::Model;
 use emberwatch_model::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
@@ -9,8 +9,8 @@ use ndarray::{ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// How far from one a cell's probabilities may sum: about 400 roundings of an `f32`, more than any
-/// softmax or normalisation leaves and less than any real mistake.
+/// Maximum distance from 1 of the sum over a cell's probabilities. It is about 400 rounding errors of an `f32`: a
+/// softmax or normalisation leaves less, and a mistake leaves more.
 const SUM_TOLERANCE: f32 = 5e-5;
 
 /// One distribution over states per cell, shape `[S, H, W]`; each cell sums to one.
@@ -21,7 +21,7 @@ pub struct Belief {
     shape: Shape,
 }
 
-/// Which of two sums over the states counts as a cell's entropy.
+/// A definition of a cell's entropy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EntropyKind {
@@ -32,16 +32,16 @@ pub enum EntropyKind {
     Mean,
 }
 
-/// Numbers that are no belief.
+/// The reason why numbers are not a belief.
 #[derive(Debug, Error, PartialEq)]
 pub enum BeliefError {
-    /// A grid that no [`Shape`] allows.
+    /// The grid is refused by [`Shape`].
     #[error("belief: {0}")]
     Shape(#[from] ShapeError),
-    /// A cell whose numbers are no distribution.
+    /// A cell's numbers are not a probability distribution.
     #[error("belief of cell {cell}: expected probabilities >= 0 with sum 1, got {got:?}")]
     Simplex { cell: Cell, got: Vec<f32> },
-    /// A state that the model lacks.
+    /// The model has no such state.
     #[error("belief from states: cell {cell}: expected a state below {n_states}, got {got}")]
     State {
         cell: Cell,
@@ -51,17 +51,21 @@ pub enum BeliefError {
 }
 
 impl Belief {
+    /// Gives all states the same probability in every cell.
     pub fn uniform(n_states: usize, shape: Shape) -> Self {
         Self::everywhere(&vec![1.0 / n_states as f32; n_states], shape)
     }
 
-    /// The model's distribution at the start of burn-in, in every cell.
+    /// Gives every cell the model's distribution at the start of burn-in.
     pub fn from_initial(model: &Model, shape: Shape) -> Self {
         let initial: Vec<f32> = model.initial().iter().map(|&p| p as f32).collect();
         Self::everywhere(&initial, shape)
     }
 
-    /// Certainty about given states, shape `[H, W]`: what an oracle believes.
+    /// Gives each cell's state, shape `[H, W]`, the probability 1. This is the belief of an oracle.
+    ///
+    /// # Errors
+    /// If a state is not below `n_states`.
     pub fn from_states(states: &Grid<u8>, n_states: usize) -> Result<Self, BeliefError> {
         let (height, width) = states.dim();
         let shape = Shape::new(height, width)?;
@@ -85,7 +89,10 @@ impl Belief {
         })
     }
 
-    /// Checks probabilities of shape `[S, H, W]`, such as a network's.
+    /// Checks probabilities of shape `[S, H, W]`, such as the output of a network.
+    ///
+    /// # Errors
+    /// If a cell's probabilities are not a distribution. The error names the first such cell.
     pub fn from_probabilities(probabilities: Probabilities) -> Result<Self, BeliefError> {
         let (_, height, width) = probabilities.dim();
         let shape = Shape::new(height, width)?;
@@ -112,20 +119,22 @@ impl Belief {
         })
     }
 
-    /// The probabilities of one cell's states, by its row-major index.
+    /// Returns the probabilities of one cell's states. `index` is the cell's row-major index.
     pub fn states(&self, index: usize) -> Vec<f64> {
         let states = self.as_slice()[index..].iter();
         let states = states.step_by(self.shape.n_cells());
         states.map(|&p| f64::from(p)).collect()
     }
 
-    /// All probabilities as little-endian `f32`.
+    /// Returns all probabilities, `[S, H, W]` and row-major, as little-endian `f32`.
     pub fn to_bytes(&self) -> Vec<u8> {
         let numbers = self.as_slice().iter();
         numbers.flat_map(|p| p.to_le_bytes()).collect()
     }
 
-    /// A belief of such bytes; `None` if they are not one of the shape `[S, H, W]`.
+    /// Reads the bytes of [`Self::to_bytes`].
+    ///
+    /// Returns `None` if they are not a belief of the shape `dim`, `[S, H, W]`: see [`Self::from_probabilities`].
     pub fn from_bytes(bytes: &[u8], dim: (usize, usize, usize)) -> Option<Self> {
         let (numbers, []) = bytes.as_chunks::<4>() else {
             return None;
@@ -135,30 +144,35 @@ impl Belief {
         Self::from_probabilities(probabilities).ok()
     }
 
+    /// Returns the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
+    /// Returns the number of states S.
     pub fn n_states(&self) -> usize {
         self.probabilities.dim().0
     }
 
-    /// All probabilities, shape `[S, H, W]`.
+    /// Returns all probabilities, shape `[S, H, W]`.
     pub fn probabilities(&self) -> &Probabilities {
         &self.probabilities
     }
 
-    /// All probabilities, shape `[S, H, W]`.
+    /// Returns a view of all probabilities, shape `[S, H, W]`.
     pub fn view(&self) -> ArrayView3<'_, f32> {
         self.probabilities.view()
     }
 
-    /// Probability of one state, shape `[H, W]`; `state` must be below S.
+    /// Returns the probability of one state in each cell, shape `[H, W]`.
+    ///
+    /// # Panics
+    /// If `state` is not below S.
     pub fn probability(&self, state: usize) -> ArrayView2<'_, f32> {
         self.probabilities.index_axis(Axis(0), state)
     }
 
-    /// Entropy of each cell (eq. 14) in nats, with `0 log 0 = 0`; shape `[H, W]`.
+    /// Computes the entropy of each cell in nats (eq. 14), shape `[H, W]`. `0 log 0` counts as 0.
     pub fn entropy(&self, kind: EntropyKind) -> Grid<f32> {
         let scale = match kind {
             EntropyKind::Sum => -1.0,
@@ -173,23 +187,24 @@ impl Belief {
         Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
     }
 
-    /// The probabilities, state by state and row-major.
+    /// Returns the probabilities, state by state and row-major.
     pub fn as_slice(&self) -> &[f32] {
         let slice = self.probabilities.as_slice();
         slice.expect("invariant: beliefs are row-major")
     }
 
-    /// The probabilities, for estimators, which keep each cell on the simplex themselves.
+    /// Like [`Self::as_slice`], for estimators. The caller must keep each cell on the simplex.
     pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
         let slice = self.probabilities.as_slice_mut();
         slice.expect("invariant: beliefs are row-major")
     }
 
-    /// For estimators, which keep each cell on the simplex themselves.
+    /// Like [`Self::probabilities`], for estimators. The caller must keep each cell on the simplex.
     pub(crate) fn probabilities_mut(&mut self) -> &mut Probabilities {
         &mut self.probabilities
     }
 
+    /// Gives every cell the same distribution.
     pub(crate) fn everywhere(distribution: &[f32], shape: Shape) -> Self {
         let (height, width) = shape.dim();
         let dim = (distribution.len(), height, width);
@@ -215,11 +230,11 @@ impl From<Belief> for Probabilities {
     }
 }
 
-/// Natural logarithm of a probability, good to a few units in the last place, and some finite number
-/// at zero, so that `p * ln(p)` is 0 there.
+/// Computes the natural logarithm of a probability, with an error of a few units in the last place.
 ///
-/// Without branches or calls, so that the loop over cells is vectorised. Polynomial of the Cephes library's `logf` (S. Moshier) on `m - 1`, where
-/// `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`.
+/// At 0 it is a finite number, so that `p * ln(p)` is 0. There are no branches or calls, so that the loop over cells
+/// is vectorised. The polynomial in `m - 1` is from `logf` of the Cephes library (S. Moshier), where `p = m 2^e` with
+/// `m` in `sqrt(1/2)..sqrt(2)`.
 #[inline]
 fn ln(p: f32) -> f32 {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;

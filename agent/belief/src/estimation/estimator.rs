@@ -32,6 +32,12 @@ pub trait Estimator: Send + Any {
     /// The belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
     fn belief(&self) -> &Belief;
 
+    /// Returns about how many bytes of memory the estimator takes: by default four times its belief, for the belief, its
+    /// predictor and work space.
+    fn memory_bytes(&self) -> usize {
+        4 * size_of_val(self.belief().as_slice())
+    }
+
     /// `P(y | x)`, shape `[S, O]`, of an estimator whose belief predicts frames.
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         None

@@ -16,45 +16,48 @@ use emberwatch_model::{Model, ModelError};
 use ndarray::Array2;
 use std::borrow::Cow;
 
-/// Filter of one world.
+/// The Bayes filter of one world.
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
     transition: Transition,
-    /// In the place of the transition, unless it is the mean field.
+    /// Replaces the transition if the prediction is not the mean field.
     prediction: Option<Prediction>,
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Where the transition writes; what the belief was before it was corrected.
+    /// Buffer for the next predictor. With cavities, the belief before the next correction.
     predictor: Probabilities,
-    /// Checksum of the parameters, which give the belief its meaning.
+    /// Checksum of the parameters. Beliefs of filters with other parameters have another meaning.
     checksum: u32,
 }
 
 impl BayesFilter {
-    /// A filter of a known model with the predictor `u_0`.
+    /// Creates the filter of a known model, with `prior` as the predictor `u_0`. It predicts by the mean field.
+    ///
+    /// # Errors
+    /// If eq. 3 could divide by zero on the prior's grid, or a map of the model has another grid.
     ///
     /// # Panics
-    /// If the prior has another number of states than the model.
+    /// If the prior and the model have different numbers of states.
     pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {
         let expected = model.n_states();
         assert_eq!(prior.n_states(), expected, "prior: expected other states");
         let transition = Transition::new(model, prior.shape())?;
         let checksum = known_checksum(model);
         let likelihood = model.likelihood().clone();
-        Ok(Self::of(transition, likelihood, prior, checksum))
+        Ok(Self::new(transition, likelihood, prior, checksum))
     }
 
-    /// A filter with learned parameters and the predictor `u_0`.
+    /// Creates a filter with learned parameters, and `prior` as the predictor `u_0`. It predicts by the mean field.
     ///
     /// # Panics
-    /// If the prior has another number of states.
+    /// If the prior and the parameters have different numbers of states.
     pub fn learned(tables: &Tables, prior: Belief) -> Self {
         let (transition, likelihood, checksum) = parameters(tables, &prior);
-        Self::of(transition, likelihood, prior, checksum)
+        Self::new(transition, likelihood, prior, checksum)
     }
 
-    /// The same filter with another prediction by the same learned parameters.
+    /// Sets the kind of prediction of a filter with learned parameters. `tables` are these parameters.
     pub fn predicting_learned(self, tables: &Tables, kind: PredictionKind) -> Self {
         let weights = Weights {
             kernels: &tables.kernels(),
@@ -65,7 +68,7 @@ impl BayesFilter {
         self.predicting(weights, kind)
     }
 
-    fn of(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
+    fn new(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
         Self {
             transition,
             prediction: None,
@@ -76,7 +79,7 @@ impl BayesFilter {
         }
     }
 
-    /// The same filter of a known model with another prediction.
+    /// Sets the kind of prediction of a known model's filter. `model` is this model.
     pub fn predicting_known(self, model: &Model, kind: PredictionKind) -> Self {
         self.predicting(model.into(), kind)
     }
@@ -88,36 +91,30 @@ impl BayesFilter {
         self
     }
 
-    /// Tells the prediction what has changed the belief since it was predicted.
-    pub(super) fn corrected(&mut self) {
+    /// Corrects the cavities after the belief was corrected.
+    pub(super) fn correct_cavities(&mut self) {
         if let Some(prediction) = &mut self.prediction {
             let before = self.predictor.as_slice().expect("invariant: row-major");
             prediction.correct(before, self.belief.as_slice());
             if prediction.has_cavities() {
-                // What a further correction of the same step begins with.
+                // A second correction in the same step starts from this belief.
                 self.predictor.assign(self.belief.probabilities());
             }
         }
     }
 
-    /// Names the beliefs of filters of a known model, see [`Handover::kind`].
+    /// Returns [`Handover::kind`] for filters of a known model.
     pub fn handover_of_known(model: &Model, kind: PredictionKind) -> String {
         handover_of(known_checksum(model), kind)
     }
 
-    /// Bytes of [`Handover::to_bytes`].
+    /// Returns the number of bytes of [`Handover::to_bytes`].
     pub(super) fn n_bytes(&self) -> usize {
         let cavities = self.prediction.as_ref().map_or(0, Prediction::n_bytes);
         4 * self.belief.as_slice().len() + cavities
     }
 
-    /// Takes newer learned parameters of the same dimensions; the belief stays. It predicts by the mean field.
-    pub fn set_tables(&mut self, tables: &Tables) {
-        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
-        self.prediction = None;
-    }
-
-    /// The belief and `P(y | x)`, shape `[S, O]`.
+    /// Returns the belief and `P(y | x)`, shape `[S, O]`.
     pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
         (&self.belief, &self.likelihood)
     }
@@ -129,10 +126,10 @@ impl BayesFilter {
 
 impl Estimator for BayesFilter {
     /// # Panics
-    /// If the frame is of another grid or was decoded for more observations than the model has.
+    /// If the frame has another grid or more observations than the model.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         correct(&mut self.belief, &self.likelihood, frame)?;
-        self.corrected();
+        self.correct_cavities();
         Ok(())
     }
 
@@ -141,7 +138,7 @@ impl Estimator for BayesFilter {
             let predictor = self.predictor.as_slice_mut();
             let predictor = predictor.expect("invariant: row-major");
             prediction.predict(self.belief.as_slice(), predictor);
-            // The same belief in both: what it was before corrections, which the cavities follow.
+            // Both hold the predictor: the next correction of the cavities compares the belief with it.
             self.belief.as_mut_slice().copy_from_slice(predictor);
             return;
         }
@@ -150,7 +147,15 @@ impl Estimator for BayesFilter {
         std::mem::swap(belief, &mut self.predictor);
     }
 
-    /// The predictor `u_k`, or after [`Estimator::correct`] the posterior `p_k`.
+    fn memory_bytes(&self) -> usize {
+        let prediction = self.prediction.as_ref();
+        size_of::<Self>()
+            + 2 * size_of_val(self.belief.as_slice())
+            + self.transition.memory_bytes()
+            + prediction.map_or(0, Prediction::memory_bytes)
+    }
+
+    /// Returns the predictor `u_k`, or the posterior `p_k` after [`Estimator::correct`].
     fn belief(&self) -> &Belief {
         &self.belief
     }
@@ -188,25 +193,25 @@ impl Handover for BayesFilter {
         let Some(belief) = belief else {
             return false;
         };
-        let is_taken = match &mut self.prediction {
+        let is_restored = match &mut self.prediction {
             Some(prediction) => prediction.restore(rest),
             None => rest.is_empty(),
         };
-        if is_taken {
+        if is_restored {
             self.predictor.assign(belief.probabilities());
             self.belief = belief;
         }
-        is_taken
+        is_restored
     }
 }
 
 fn handover_of(checksum: u32, kind: PredictionKind) -> String {
-    let of_kind = match kind {
+    let kind = match kind {
         PredictionKind::MeanField => "",
         PredictionKind::SecondOrder => " of second order",
         PredictionKind::Cavities => " with cavities",
     };
-    format!("bayes_filter{of_kind} {checksum:08x}, probabilities [S, H, W] as f32")
+    format!("bayes_filter{kind} {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 fn known_checksum(model: &Model) -> u32 {

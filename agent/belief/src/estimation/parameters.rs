@@ -1,8 +1,9 @@
-//! The unknown parameters: free numbers that become weights `w >= 0`, rows of `O` and `u_0`.
+//! The parameters of a learned filter, as unconstrained numbers: weights `w >= 0`, rows of `O`, and the first belief
+//! `u_0`.
 //!
-//! `w = softplus(kernel)`; each row of `P(y | x)` and the first belief are softmaxes. Free numbers
-//! are kept in ±[`BOUND`], so that no weight or probability vanishes and eqs. 3 and 5 never divide
-//! by zero.
+//! `w` is the softplus of the first tensor. Each row of `P(y | x)` and the first belief are softmaxes of the others.
+//! All unconstrained numbers are clamped to ±[`BOUND`]. So no weight or probability vanishes, and eqs. 3 and 5 never
+//! divide by zero.
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::randomness::split_mix;
@@ -11,37 +12,39 @@ use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
+/// Maximum size of an unconstrained number. Weights are at least 1e-7, probabilities at least 1e-14.
 pub const BOUND: f32 = 16.0;
 
-/// Weight of a cell's own state when learning starts; that of a neighbour; and what other states get
-/// of either. Chosen by what a robot can expect of something that lasts and spreads.
+/// First weight of the cell itself for staying in its state. The first weights suit states that last and spread.
 const OWN_WEIGHT: f64 = 1.0;
+/// First weight of a neighbour for the cell taking the neighbour's state.
 const NEIGHBOUR_WEIGHT: f64 = 0.1;
+/// Share of either weight for each other next state.
 const OTHER_STATE: f64 = 0.005;
 
-/// Logit by which a state is seen as its own observation when learning starts: .87 of three.
+/// First logit for observing a state as itself. Among three observations, the probability is 0.86.
 const OWN_OBSERVATION: f32 = 2.5;
 
-/// Noise on the first logits and, relative, on the first weights: states without an observation of
-/// their own must not start alike.
+/// Noise on the first logits, and relative noise on the first weights. Without it, states that share an observation
+/// would learn the same parameters.
 const NOISE: f32 = 0.1;
 
+/// The dimensions of a learned filter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Dimensions {
     pub n_states: usize,
     pub n_observations: usize,
-    /// Rows and columns of the kernel, odd.
+    /// Number of rows and columns of the kernel, both odd.
     pub kernel: (usize, usize),
-    /// Whether each state that a cell itself can be in has a kernel of its own. A checkpoint's tensors tell it.
+    /// Whether there is one kernel per own state of the cell. A checkpoint stores it as the shape of a tensor.
     #[serde(skip)]
     pub sees_own_state: bool,
-    /// Observation matrices of the sensor, at least 1. A checkpoint's tensors tell it.
+    /// Number of the sensor's observation matrices M, at least 1. A checkpoint stores it as the shape of a tensor.
     #[serde(skip, default = "one")]
     pub n_matrices: usize,
 }
 
-/// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
+/// Three tensors in the order of [`Parameters::NAMES`]: unconstrained numbers, or their gradients or moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
@@ -50,19 +53,20 @@ pub struct Parameters {
     pub tensors: [Vec<f32>; 3],
 }
 
-/// What the free numbers stand for.
+/// The weights and probabilities that [`Parameters`] stand for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`. With own-state kernels, the centre only counts where
+    /// `from` is `own`.
     pub kernel: Vec<f32>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<f32>,
-    /// The belief about every cell before the first frame, shape `[S]`.
+    /// The belief about each cell before the first frame, shape `[S]`.
     pub initial: Vec<f32>,
 }
 
-/// Dimensions that no model has.
+/// The reason why dimensions are out of range.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum DimensionsError {
@@ -83,10 +87,10 @@ pub enum DimensionsError {
 }
 
 impl Dimensions {
-    /// Checks them against the limits of a model.
+    /// Checks the dimensions against the limits of a model.
     ///
     /// # Errors
-    /// Names the first that is out of range.
+    /// If one is out of range. The error names the first.
     pub fn check(self) -> Result<Self, DimensionsError> {
         let counts = [
             ("states", 2, self.n_states),
@@ -109,7 +113,7 @@ impl Dimensions {
         Ok(self)
     }
 
-    /// Shapes of the tensors, in the order of [`Parameters::NAMES`].
+    /// Returns the shapes of the tensors, in the order of [`Parameters::NAMES`].
     pub fn shapes(&self) -> [Vec<usize>; 3] {
         let (states, (height, width)) = (self.n_states, self.kernel);
         let mut kernel = vec![states, states, height, width];
@@ -123,7 +127,7 @@ impl Dimensions {
         [kernel, likelihood, vec![states]]
     }
 
-    /// Number of kernels: one for all cells, or one for each state that a cell itself can be in.
+    /// Returns the number of kernels: 1, or one per own state.
     pub fn n_own(&self) -> usize {
         if self.sees_own_state {
             self.n_states
@@ -132,11 +136,12 @@ impl Dimensions {
         }
     }
 
-    /// Observations of each matrix of the sensor.
+    /// Returns the number of observations per observation matrix.
     pub fn n_of_matrix(&self) -> usize {
         self.n_observations / self.n_matrices
     }
 
+    /// Returns the number of entries of each tensor.
     pub fn lengths(&self) -> [usize; 3] {
         self.shapes().map(|shape| shape.iter().product())
     }
@@ -146,8 +151,10 @@ impl Parameters {
     /// Names of the tensors in files and messages.
     pub const NAMES: [&'static str; 3] = ["kernel", "likelihood", "initial"];
 
-    /// Where learning starts: states last, spread to neighbours, and look like the observation of
-    /// their own number, if there is one; alike for every state of the cell itself.
+    /// Returns the parameters with which learning starts.
+    ///
+    /// States last, spread to neighbours, and are mostly observed as the observation with their own number, if there is
+    /// one. All own-state kernels start alike, up to noise.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
         // Uniform in -1..1.
@@ -175,6 +182,7 @@ impl Parameters {
         }
     }
 
+    /// Returns tensors of zeros.
     pub fn zeros(dimensions: Dimensions) -> Self {
         let tensors = dimensions.lengths().map(|length| vec![0.0; length]);
         Self {
@@ -183,6 +191,7 @@ impl Parameters {
         }
     }
 
+    /// Computes the weights and probabilities.
     pub fn tables(&self) -> Tables {
         let [kernel, _, initial] = &self.tensors;
         let cast = |numbers: Vec<f64>| numbers.into_iter().map(|number| number as f32).collect();
@@ -195,13 +204,13 @@ impl Parameters {
         }
     }
 
-    /// `P(y | x)`, shape `[S, O]`.
+    /// Computes `P(y | x)`, shape `[S, O]`.
     pub fn likelihood(&self) -> Vec<f64> {
         let rows = self.tensors[1].chunks_exact(self.dimensions.n_of_matrix());
         rows.flat_map(softmax).collect()
     }
 
-    /// Gradients by the free numbers from gradients by the tables.
+    /// Applies the chain rule: from gradients with respect to [`Tables`] to gradients with respect to the parameters.
     pub fn chain(&self, by_tables: &[Vec<f64>; 3]) -> Self {
         let [kernel, likelihood, initial] = &self.tensors;
         let [by_kernel, by_likelihood, by_initial] = by_tables;
@@ -221,13 +230,14 @@ impl Parameters {
         }
     }
 
-    /// The first tensor that holds a number that is not finite.
+    /// Returns the name of the first tensor with an infinite number or NaN.
     pub fn not_finite(&self) -> Option<&'static str> {
         let tensors = Self::NAMES.into_iter().zip(&self.tensors);
         let wrong = |(_, numbers): &(&str, &Vec<f32>)| !numbers.iter().all(|x| x.is_finite());
         tensors.into_iter().find(wrong).map(|(name, _)| name)
     }
 
+    /// Clamps all numbers to ±[`BOUND`].
     pub fn bound(&mut self) {
         for number in self.tensors.iter_mut().flatten() {
             *number = number.clamp(-BOUND, BOUND);
@@ -236,13 +246,15 @@ impl Parameters {
 }
 
 impl Tables {
-    /// The learned belief before the first frame, in every cell.
+    /// Returns the learned belief before the first frame, the same in every cell.
     pub fn prior(&self, shape: Shape) -> Belief {
         Belief::everywhere(&self.initial, shape)
     }
 
-    /// A model's own parameters: what learning would have to find. Without its bias: beliefs sum to
-    /// one, so away from the edges a bias is equal weights of all states.
+    /// Returns the parameters of a model, the solution that learning looks for.
+    ///
+    /// The bias is left out. Beliefs sum to one, so away from the edges a bias equals weights that are the same for all
+    /// states.
     ///
     /// # Panics
     /// If the model has several zones.
@@ -264,7 +276,7 @@ impl Tables {
         }
     }
 
-    /// The weights as arrays of shape `[S, S, KH, KW]`: one for all cells, or one for each own state.
+    /// Returns the kernels, each of shape `[S, S, KH, KW]`: one for all own states, or one per own state.
     pub fn kernels(&self) -> Vec<Array4<f64>> {
         let (n, (height, width)) = (self.dimensions.n_states, self.dimensions.kernel);
         let kernel = |weights: &[f32]| {
@@ -276,7 +288,7 @@ impl Tables {
         kernels.map(kernel).collect()
     }
 
-    /// `P(y | x)` as an array of shape `[S, O]`.
+    /// Returns `P(y | x)` as an array of shape `[S, O]`.
     pub fn likelihood_array(&self) -> Array2<f64> {
         let numbers = self.likelihood.iter().map(|&p| f64::from(p));
         let dim = (self.dimensions.n_states, self.dimensions.n_observations);

@@ -1,9 +1,9 @@
 //! A Bayes filter whose corrections reach the neighbours of visited cells.
 //!
-//! The filter of eqs. 5 and 6 takes cells as independent given the frames, and corrects visited cells only. States are
-//! strongly correlated in space. Here the innovation of each visited cell is spread to its neighbourhood with learned
-//! [`Correlations`], as optimal interpolation does (Gandin 1963); the prediction stays eq. 6, and no covariance is
-//! kept from step to step.
+//! The filter of eqs. 5 and 6 assumes that cells are independent given the frames, and corrects visited cells only.
+//! But states are strongly correlated in space. This filter spreads the innovation of each visited cell to its
+//! neighbourhood by optimal interpolation (Gandin 1963), with learned [`Correlations`]. The prediction stays eq. 6,
+//! and no covariance is kept between steps.
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
@@ -17,22 +17,23 @@ use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::borrow::Cow;
 
-/// How ages and sums are written. The limit is more than any grid's.
+/// Encoding of ages and correlations. The limit exceeds the size on the largest grid.
 const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
     .with_fixed_int_encoding()
     .with_limit();
 
-/// A filter of one world whose cells inform each other.
+/// The filter of one world, with corrections that reach the neighbours of visited cells.
 #[derive(Debug, Clone)]
 pub struct SpatialFilter {
     filter: BayesFilter,
+    /// The state whose probability is spread.
     state: usize,
     correlations: Correlations,
     ages: Ages,
     spread: Spread,
 }
 
-/// A filter, whose corrections reach the neighbours of visited cells if their correlations with a state are given.
+/// Wraps a filter in a [`SpatialFilter`] if a state and its correlations are given.
 pub fn correcting(
     filter: BayesFilter,
     neighbours: Option<(usize, Correlations)>,
@@ -44,16 +45,18 @@ pub fn correcting(
 }
 
 impl SpatialFilter {
-    /// Names the beliefs of filters that spread the probability of a state on top of a named filter's, see
-    /// [`Handover::kind`].
+    /// Returns [`Handover::kind`] for spatial filters. `filter` is the kind of the wrapped filter, and `state` the
+    /// state whose probability is spread.
     pub fn handover_of(filter: &str, state: usize) -> String {
         format!("spatial {filter}, ages and sums of state {state} as bincode")
     }
 
-    /// Spreads the probability of `state`, the one that pays, with correlations learned before, or from nothing.
+    /// Wraps a filter. Corrections spread the probability of `state`, the state with the highest reward.
+    ///
+    /// `correlations` are learned further from each frame. The default starts without any.
     ///
     /// # Panics
-    /// If there is no such state.
+    /// If the filter has no such state.
     pub fn new(filter: BayesFilter, state: usize, correlations: Correlations) -> Self {
         let n_states = filter.belief().n_states();
         assert!(state < n_states, "state: expected less than {n_states}");
@@ -66,20 +69,20 @@ impl SpatialFilter {
         }
     }
 
-    /// What it has learned of how cells vary together.
+    /// Returns the learned correlations between cells.
     pub fn correlations(&self) -> &Correlations {
         &self.correlations
     }
 
-    /// Goes on with what another filter has learned of how cells vary together.
+    /// Replaces the learned correlations between cells.
     pub fn set_correlations(&mut self, correlations: Correlations) {
         self.correlations = correlations;
     }
 
-    /// Takes in what was seen at some cells, by index, one after the other; each cell once.
+    /// Corrects the belief with observations of distinct cells, one after the other: row-major index and observation.
     ///
     /// # Errors
-    /// [`ZeroEvidence`]; the belief is then as it was.
+    /// If an observation is impossible under the belief. The belief is then unchanged.
     pub fn correct_in_order(
         &mut self,
         seen: impl Iterator<Item = (usize, u8)>,
@@ -101,14 +104,14 @@ impl SpatialFilter {
             self.spread.spread(index, &innovation, states);
         }
         self.spread.end(self.filter.belief_mut(), &mut self.ages);
-        self.filter.corrected();
+        self.filter.correct_cavities();
         Ok(())
     }
 }
 
 impl Estimator for SpatialFilter {
     /// # Panics
-    /// If the frame is of another grid.
+    /// If the frame has another grid.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
         assert_eq!(dim, expected, "frame: expected the belief's grid");
@@ -122,6 +125,11 @@ impl Estimator for SpatialFilter {
     fn predict(&mut self) {
         self.filter.predict();
         self.ages.grow();
+    }
+
+    fn memory_bytes(&self) -> usize {
+        // `Ages` and `Spread` keep 10 bytes per cell.
+        self.filter.memory_bytes() + size_of::<Self>() + 10 * self.ages.as_slice().len()
     }
 
     fn belief(&self) -> &Belief {
@@ -161,11 +169,11 @@ impl Handover for SpatialFilter {
             return false;
         };
         let fits = n_read == own.len() && ages.as_slice().len() == self.ages.as_slice().len();
-        let is_taken = fits && self.filter.restore(belief);
-        if is_taken {
+        let is_restored = fits && self.filter.restore(belief);
+        if is_restored {
             (self.ages, self.correlations) = (ages, correlations);
         }
-        is_taken
+        is_restored
     }
 }
 

@@ -1,4 +1,6 @@
-//! The Bayes filter of the true model (paper section III.A, masked as in III.C), and one whose corrections reach the
+//! Bayes filters of the true model (paper section III.A, masked as in III.C).
+//!
+//! They differ in their prediction (mean field, second order or cavities), and in whether corrections reach the
 //! neighbours of visited cells.
 
 use super::kind::{BeliefKind, Conditions, Input};
@@ -22,7 +24,7 @@ pub const KNOWN: BeliefKind = BeliefKind {
 pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
     name: "known+second-order",
     label: "second_order_filter",
-    about: "the filter with the mean of eq. 3's ratio, not the ratio of means",
+    about: "known, predicting with the mean of the ratio in eq. 3",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::SecondOrder)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::SecondOrder)?)),
     ..KNOWN
@@ -31,7 +33,7 @@ pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
     label: "cavity_filter",
-    about: "the same; and no cell is predicted from its own echo in its neighbours",
+    about: "known, predicting without a cell's own echo in its neighbours",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::Cavities)?)),
     ..KNOWN
@@ -40,7 +42,7 @@ pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
     label: "spatial_filter",
-    about: "the same; what a cell shows corrects its neighbours, too",
+    about: "known, where observations also correct the neighbours of visited cells",
     handover: Some(|model| spatial_handover(model, PredictionKind::MeanField)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::MeanField)?)),
     ..KNOWN
@@ -49,26 +51,28 @@ pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
     label: "spatial_cavity_filter",
-    about: "cavities, and what a cell shows corrects its neighbours, too",
+    about: "known+spatial, predicting as known+cavities does",
     handover: Some(|model| spatial_handover(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::Cavities)?)),
     ..KNOWN
 };
 
+/// Builds the filter of the true model.
 fn filter(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<BayesFilter> {
     let model = conditions.model()?;
     Ok(BayesFilter::known(model, conditions.prior()?)?.predicting_known(model, kind))
 }
 
+/// Builds the filter of the true model with corrections that reach the neighbours of visited cells.
 fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialFilter> {
-    let (state, unknown) = (conditions.model()?.target_state(), Correlations::default());
-    Ok(SpatialFilter::new(
+    let (filter, state) = (
         filter(conditions, kind)?,
-        state,
-        unknown,
-    ))
+        conditions.model()?.target_state(),
+    );
+    Ok(SpatialFilter::new(filter, state, Correlations::default()))
 }
 
+/// Names the bytes of a spatial filter, see `Handover::kind`.
 fn spatial_handover(model: &Model, kind: PredictionKind) -> String {
     SpatialFilter::handover_of(
         &BayesFilter::handover_of_known(model, kind),
@@ -84,7 +88,7 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn beliefs_that_agents_leave_are_named_without_an_agent() {
+    fn handover_names_match_the_estimators() {
         let (model, shape) = (Model::wildfire(), Shape::new(4, 5).expect("test shape"));
         let conditions = Conditions {
             model: Some(&model),
@@ -100,8 +104,8 @@ mod tests {
             &KNOWN_SPATIAL_CAVITIES,
         ] {
             let estimator = (kind.build)(&conditions).expect("a filter");
-            let of_estimator = estimator.handover().map(|it| it.kind());
-            assert_eq!(kind.handover.map(|of| of(&model)), of_estimator);
+            let expected = estimator.handover().map(|it| it.kind());
+            assert_eq!(kind.handover.map(|name| name(&model)), expected);
         }
     }
 }

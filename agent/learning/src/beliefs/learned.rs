@@ -1,6 +1,7 @@
-//! The Bayes filter with learned parameters, and one whose corrections reach the neighbours of visited cells.
+//! Bayes filters with learned parameters.
 //!
-//! Its kernels see the neighbours of a cell, or the cell's own state, too: what they see is the shape of a tensor.
+//! They differ in their prediction, and in whether corrections reach the neighbours of visited cells. Their kernels may
+//! depend on a cell's own state: a checkpoint stores this as the shape of the kernel tensor.
 
 use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy};
 use super::world_form::WorldForm;
@@ -34,7 +35,7 @@ pub const LEARNED: BeliefKind = BeliefKind {
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     label: "learned_spatial_filter",
-    about: "the same; what a cell shows corrects its neighbours, too",
+    about: "learned, where observations also correct the neighbours of visited cells",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
     },
@@ -44,7 +45,7 @@ pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
 pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+cavities",
     label: "learned_cavity_filter",
-    about: "the learned filter, predicting as known+cavities does",
+    about: "learned, predicting as known+cavities does",
     build: |conditions| {
         Ok(model(conditions)?.estimator(false, PredictionKind::Cavities, conditions.shape))
     },
@@ -54,26 +55,28 @@ pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
 pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+spatial+cavities",
     label: "learned_spatial_cavity_filter",
-    about: "both: cavities, and what a cell shows corrects others",
+    about: "learned+spatial, predicting as known+cavities does",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::Cavities, conditions.shape))
     },
     ..LEARNED
 };
 
+/// Returns the learned filter of the checkpoint.
 fn model<'a>(conditions: &Conditions<'a>) -> Result<&'a LearnedModel> {
     let model = conditions.learned.get::<LearnedModel>();
     model.context("checkpoint: expected one of a filter, got none")
 }
 
-/// A filter that was learned: all that acting on it needs.
+/// A learned filter: everything that an agent needs to act on its belief.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedModel {
-    /// The free numbers, and what they stand for.
     pub parameters: Parameters,
+    /// The weights and probabilities that the parameters stand for.
     pub tables: Tables,
+    /// The state with the highest reward.
     pub target: usize,
-    /// How much that state of one cell says of its neighbours'.
+    /// How the target state of one cell correlates with that state in its neighbours.
     pub correlations: Correlations,
 }
 
@@ -87,7 +90,9 @@ impl LearnedModel {
         }
     }
 
-    /// Before the first frame. `is_spatial`: whether its corrections reach the neighbours of visited cells.
+    /// Builds an estimator with the belief before the first frame.
+    ///
+    /// If `is_spatial`, corrections reach the neighbours of visited cells.
     pub fn estimator(
         &self,
         is_spatial: bool,
@@ -100,7 +105,7 @@ impl LearnedModel {
         correcting(filter, is_spatial.then(neighbours))
     }
 
-    /// Its parameters by name.
+    /// Returns the parameters as named tensors.
     pub fn tensors(&self) -> [NamedTensor; 3] {
         named_tensors(&self.parameters, "")
     }
@@ -121,7 +126,7 @@ impl LearnedBelief for LearnedModel {
     }
 }
 
-/// A learned filter, without its tensors.
+/// The part of a [`LearnedModel`] that a checkpoint stores besides the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedModel {
     dimensions: Dimensions,
@@ -130,6 +135,7 @@ pub struct SavedModel {
 }
 
 impl SavedModel {
+    /// Takes the stored part from a model.
     pub fn of(model: &LearnedModel) -> Self {
         Self {
             dimensions: model.parameters.dimensions,
@@ -138,7 +144,7 @@ impl SavedModel {
         }
     }
 
-    /// With its tensors.
+    /// Loads the model with the tensors of a checkpoint.
     pub fn read(&self, part: &Part<'_>) -> Result<LearnedModel> {
         let dimensions = dimensions_of(self.dimensions, part)?;
         let parameters = read_parameters(dimensions, part, "")?;
@@ -147,18 +153,19 @@ impl SavedModel {
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
 
+    /// Returns the number of observations.
     pub fn n_observations(&self) -> usize {
         self.dimensions.n_observations
     }
 }
 
-/// Refuses a target that is no state.
+/// Checks that the target is a state.
 pub fn check_target(target: usize, n_states: usize) -> Result<()> {
     let expected = format!("less than {n_states}");
     check(target < n_states, "target", expected, target)
 }
 
-/// The tensors of parameters, or of their moments, whose names end alike.
+/// Returns the tensors of parameters or moments. Their names are [`Parameters::NAMES`] with a suffix.
 pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] {
     let shapes = parameters.dimensions.shapes();
     [0, 1, 2].map(|at| {
@@ -167,17 +174,18 @@ pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] 
     })
 }
 
-/// Whether a filter's kernels see the cell's own state, by the axes of their tensor.
+/// Whether a stored filter has own-state kernels: their tensor has five axes.
 pub fn sees_own_state(part: &Part<'_>) -> bool {
     let shape = part.shape(Parameters::NAMES[0]);
     shape.is_some_and(|shape| shape.len() == 5)
 }
 
-/// A filter's dimensions with those that its tensors alone tell: observation matrices, and whether its kernels see the
-/// cell's own state.
+/// Completes the dimensions of a stored filter with the dimensions that only its tensors contain.
+///
+/// These are the number of observation matrices, and whether there are own-state kernels.
 ///
 /// # Errors
-/// If no filter has such, or had kernels for zones of land.
+/// If they are out of range, or the filter has kernels for zones.
 pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
     check(
         part.shape("zones").is_none(),
@@ -194,10 +202,10 @@ pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensio
         ..dimensions
     };
     let checked = dimensions.check();
-    checked.map_err(|error| wrong("dimensions", "those of a filter", error))
+    checked.map_err(|error| wrong("dimensions", "dimensions of a learned filter", error))
 }
 
-/// Parameters or moments of such dimensions, whose names end alike.
+/// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.
 pub fn read_parameters(
     dimensions: Dimensions,
     part: &Part<'_>,

@@ -1,8 +1,12 @@
-//! The neural belief as an estimator: what each cell showed and when, and what a network makes of it, alone or as a
-//! correction of a filter's belief.
+//! The neural belief: an estimator whose network predicts the next observation of each cell.
 //!
-//! The belief is about observations, S = O: after a frame, visited cells are what they showed. With a known sensor it is
-//! about states: what a cell will show is traced back to what it is, and a frame corrects that by Bayes' rule (eq. 5).
+//! The network reads each cell's last observation and its age. It may also read a filter's prediction and correct it.
+//!
+//! The belief is about observations instead of states, so S = O. After a frame, it is certain of the observations of
+//! visited cells. If the observation matrix is known, the belief is about states: `sensor.rs` converts predicted
+//! observations to states, and a frame corrects the states by Bayes' rule (eq. 5).
+
+mod sensor;
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::{LearnedModel, SavedModel, check_target};
@@ -17,18 +21,19 @@ use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, MAX_VALUES, Shape};
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
-use ndarray::{Array2, Axis, s};
+use ndarray::Array2;
+use sensor::{inverse, states_from_observations};
 use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::borrow::Cow;
 
-/// Before the names of the tensors of the filter that a network corrects.
+/// Prefix of the tensor names of the corrected filter.
 const FILTER: &str = "filter.";
 
 pub const NEURAL: BeliefKind = BeliefKind {
     name: "neural",
     label: "neural_belief",
-    about: "a network that keeps space, learned from what was seen",
+    about: "a learned network on the grid, from last observations to predicted ones",
     input: Input::Frames,
     knows_model: false,
     learned_by: Some(LearnedBy {
@@ -49,32 +54,29 @@ pub const NEURAL: BeliefKind = BeliefKind {
 pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     name: "neural+sensor",
     label: "neural_sensor_belief",
-    about: "the same about states, with the true model's observation matrix",
+    about: "neural about states, with the true model's observation matrix",
     knows_model: true,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
         let model = model.context("checkpoint: expected one of a neural belief, got none")?;
         let estimator = model.estimator(conditions.shape).context("checkpoint")?;
         let likelihood = conditions.model()?.likelihood().clone();
-        Ok(Box::new(estimator.seen_through(likelihood)?))
+        Ok(Box::new(estimator.with_sensor(likelihood)?))
     },
     ..NEURAL
 };
 
-/// What is traced back to a state is at least this.
-const LEAST: f64 = 1e-6;
-
-/// A neural belief that was learned: all that acting on it needs.
+/// A learned neural belief: everything that an agent needs to act on it.
 #[derive(Debug, Clone)]
 pub struct NeuralModel {
     pub network: NeuralBelief,
-    /// The filter that it corrects, if it does.
+    /// The filter whose prediction the network corrects, if any.
     pub filter: Option<Box<LearnedModel>>,
-    /// The value that pays most.
+    /// The observation with the highest reward.
     pub target: usize,
 }
 
-/// Alike where they believe alike.
+/// Models are equal if their beliefs are.
 impl PartialEq for NeuralModel {
     fn eq(&self, other: &Self) -> bool {
         let parameters = |model: &Self| model.network.parameters().ok();
@@ -85,12 +87,12 @@ impl PartialEq for NeuralModel {
 }
 
 impl NeuralModel {
-    /// Before the first frame.
+    /// Builds an estimator with the belief before the first frame.
     pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
         estimator(&self.network, self.filter.as_deref(), shape)
     }
 
-    /// Its parameters by name.
+    /// Returns the parameters as named tensors.
     pub fn tensors(&self) -> Result<Vec<NamedTensor>> {
         let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
         let parameters = self.network.parameters()?.into_iter();
@@ -114,7 +116,9 @@ impl LearnedBelief for NeuralModel {
     }
 }
 
-/// Before the first frame; a filter that the network corrects reaches the neighbours of visited cells.
+/// Builds an estimator with the belief before the first frame.
+///
+/// Corrections of the filter, if there is one, reach the neighbours of visited cells.
 pub fn estimator(
     network: &NeuralBelief,
     filter: Option<&LearnedModel>,
@@ -124,7 +128,10 @@ pub fn estimator(
     Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 
-/// A network whose parameters are still to be read; refuses numbers of observations that no world has.
+/// Creates a network with first parameters, which a checkpoint then replaces.
+///
+/// # Errors
+/// If no world has this number of observations.
 pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelief> {
     let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
     let fits = fits.contains(&n_observations);
@@ -132,13 +139,13 @@ pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelie
     Ok(NeuralBelief::new(n_observations, 0, device)?)
 }
 
-/// The tensors of a filter that a network corrects.
+/// Returns the tensors of a corrected filter, with the prefix `filter.`.
 pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTensor> + use<> {
     let named = |(name, shape, numbers)| (format!("{FILTER}{name}"), shape, numbers);
     filter.tensors().into_iter().map(named)
 }
 
-/// A filter that a network corrects, about so many observations.
+/// Loads a corrected filter, and checks its number of observations.
 pub fn read_corrected(
     saved: &SavedModel,
     n_observations: usize,
@@ -149,16 +156,17 @@ pub fn read_corrected(
     saved.read(&part.part(FILTER))
 }
 
-/// A neural belief, without its tensors.
+/// The part of a [`NeuralModel`] that a checkpoint stores besides the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedNeuralModel {
     n_observations: usize,
     target: usize,
-    /// The filter that it corrects.
+    /// The filter whose prediction the network corrects.
     filter: Option<Box<SavedModel>>,
 }
 
 impl SavedNeuralModel {
+    /// Takes the stored part from a model.
     pub fn of(model: &NeuralModel) -> Self {
         let filter = model.filter.as_deref();
         Self {
@@ -168,7 +176,7 @@ impl SavedNeuralModel {
         }
     }
 
-    /// With its tensors; the network computes on `device`.
+    /// Loads the model with the tensors of a checkpoint. The network computes on `device`.
     pub fn read(&self, part: &Part<'_>, device: &Device) -> Result<NeuralModel> {
         check_target(self.target, self.n_observations)?;
         let mut network = new_network(self.n_observations, device)?;
@@ -183,25 +191,26 @@ impl SavedNeuralModel {
     }
 }
 
+/// The neural belief of one world.
 pub struct NeuralEstimator {
     network: NeuralBelief,
-    /// Whose belief the network corrects.
+    /// The filter whose prediction the network corrects, if any.
     filter: Option<Box<dyn Estimator>>,
-    /// What that predicts, `[O, H, W]`.
+    /// The observations that the filter predicts, `[O, H, W]`.
     base: Option<Probabilities>,
     sightings: Sightings,
-    /// What frames of the present step will show; after a frame, what it showed at visited cells.
+    /// The belief about the next observation of each cell, or about its state if the sensor is known.
     belief: Belief,
-    /// `P(y | x)`: a cell shows what it is believed to show, or what a known sensor makes of its state.
+    /// `P(y | x)` of the known sensor, shape `[S, O]`. Otherwise the identity.
     likelihood: Array2<f64>,
-    /// The inverse of that, if the sensor is known.
-    from_shown: Option<Array2<f64>>,
-    /// Why the last prediction failed, if it did.
+    /// The inverse of `likelihood`, if the sensor is known.
+    inverse: Option<Array2<f64>>,
+    /// The error of the last prediction, if it failed.
     failure: Option<NetworkError>,
 }
 
 impl NeuralEstimator {
-    /// Before the first frame; `filter`: whose belief the network corrects, if it was learned so.
+    /// Creates the belief before the first frame. `filter` is required if the network was trained to correct one.
     pub fn new(
         network: &NeuralBelief,
         filter: Option<Box<dyn Estimator>>,
@@ -216,16 +225,16 @@ impl NeuralEstimator {
             base,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
-            from_shown: None,
+            inverse: None,
             failure: None,
         })
     }
 
-    /// The same about states, which a sensor shows with `P(y | x)`, shape `[S, S]`.
+    /// Makes the belief about states. `likelihood` is the sensor's observation matrix `P(y | x)`, shape `[S, S]`.
     ///
     /// # Errors
-    /// If the matrix has another shape, or no inverse.
-    pub fn seen_through(mut self, likelihood: Array2<f64>) -> Result<Self> {
+    /// If the matrix has another shape or no inverse.
+    pub fn with_sensor(mut self, likelihood: Array2<f64>) -> Result<Self> {
         let (expected, got) = (self.likelihood.dim(), likelihood.dim());
         ensure!(
             expected == got,
@@ -236,23 +245,23 @@ impl NeuralEstimator {
         let inverse = inverse
             .context("the sensor: expected states that look different, got some that look alike")?;
         self.likelihood = likelihood;
-        self.from_shown = Some(inverse);
-        self.predicted(self.belief.probabilities().clone());
+        self.inverse = Some(inverse);
+        self.set_predicted(self.belief.probabilities().clone());
         Ok(self)
     }
 
-    /// Takes the distribution of what each cell will show, `[O, H, W]`.
-    fn predicted(&mut self, mut shown: Probabilities) {
-        if let Some(inverse) = &self.from_shown {
-            trace_back(&mut shown, inverse);
+    /// Sets the belief from the predicted distribution of each cell's next observation, `[O, H, W]`.
+    fn set_predicted(&mut self, mut observations: Probabilities) {
+        if let Some(inverse) = &self.inverse {
+            states_from_observations(&mut observations, inverse);
         }
-        self.belief = belief(shown);
+        self.belief = belief(observations);
     }
 }
 
 impl Estimator for NeuralEstimator {
     /// # Errors
-    /// Also if the prediction before failed.
+    /// If the frame is impossible under the belief, or the last prediction failed.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         if let Some(failure) = self.failure.take() {
             return Err(EstimatorError::Network(failure.into()));
@@ -302,7 +311,7 @@ impl Handover for NeuralEstimator {
         let checksum = crc32fast::hash(&bytes);
         let filter = self.filter.as_ref().and_then(|it| it.handover());
         let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
-        let sensor = if self.from_shown.is_some() {
+        let sensor = if self.inverse.is_some() {
             let numbers = self.likelihood.iter().flat_map(|p| p.to_le_bytes());
             let checksum = crc32fast::hash(&numbers.collect::<Vec<u8>>());
             format!(" through {checksum:08x}")
@@ -345,7 +354,7 @@ impl Handover for NeuralEstimator {
     }
 }
 
-/// Predicts all estimators; worlds that share a network are predicted in one pass.
+/// Predicts several estimators. Worlds with the same network are predicted in one pass.
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
     for estimator in estimators {
@@ -357,16 +366,16 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
         }
     }
     in_parallel(others, |estimator| estimator.predict());
-    in_parallel(networks.iter_mut(), |it| it.pass());
-    networks.sort_by_key(|it| it.kind_of_pass());
-    for alike in networks.chunk_by_mut(|a, b| a.kind_of_pass() == b.kind_of_pass()) {
-        NeuralEstimator::predict_all(alike);
+    in_parallel(networks.iter_mut(), |it| it.advance());
+    networks.sort_by_key(|it| it.pass_key());
+    for group in networks.chunk_by_mut(|a, b| a.pass_key() == b.pass_key()) {
+        NeuralEstimator::predict_all(group);
     }
 }
 
 impl NeuralEstimator {
     /// Advances the sightings and the corrected filter by one step.
-    fn pass(&mut self) {
+    fn advance(&mut self) {
         self.sightings.pass();
         if let Some(filter) = &mut self.filter {
             filter.predict();
@@ -375,7 +384,7 @@ impl NeuralEstimator {
     }
 
     /// Returns the key by which worlds are grouped into passes: network, grid, and whether a filter is corrected.
-    fn kind_of_pass(&self) -> (usize, [usize; 2], bool) {
+    fn pass_key(&self) -> (usize, [usize; 2], bool) {
         let (height, width) = self.sightings.shape().dim();
         (self.network.id(), [height, width], self.base.is_some())
     }
@@ -387,7 +396,7 @@ impl NeuralEstimator {
         match predicted {
             Ok(predicted) => {
                 for (estimator, probabilities) in all.iter_mut().zip(predicted) {
-                    estimator.predicted(probabilities);
+                    estimator.set_predicted(probabilities);
                 }
             }
             Err(failure) => {
@@ -399,168 +408,16 @@ impl NeuralEstimator {
     }
 }
 
-/// Turns the distribution of what each cell shows into that of what it is, by the inverse of `P(y | x)`. No state is ruled
-/// out, as what a network predicts is no exact mixture of what states show.
-fn trace_back(shown: &mut Probabilities, inverse: &Array2<f64>) {
-    let (n, height, width) = shown.dim();
-    let mut states = vec![0.0; n];
-    for (row, col) in (0..height * width).map(|cell| (cell / width, cell % width)) {
-        for (state, p) in states.iter_mut().enumerate() {
-            let parts =
-                (0..n).map(|seen| f64::from(shown[[seen, row, col]]) * inverse[[seen, state]]);
-            *p = parts.sum::<f64>().max(LEAST);
-        }
-        let total: f64 = states.iter().sum();
-        for (state, p) in states.iter().enumerate() {
-            shown[[state, row, col]] = (p / total) as f32;
-        }
-    }
-}
-
-/// The inverse of a square matrix, by Gauss and Jordan's elimination with pivots; `None` if it has none.
-fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
-    let n = matrix.nrows();
-    let mut both = ndarray::concatenate![Axis(1), *matrix, Array2::<f64>::eye(n)];
-    for col in 0..n {
-        let size = |row: &usize| both[[*row, col]].abs();
-        let pivot = (col..n).max_by(|a, b| size(a).total_cmp(&size(b)))?;
-        if size(&pivot) < 1e-9 {
-            return None;
-        }
-        (0..2 * n).for_each(|at| both.swap([col, at], [pivot, at]));
-        let own = &both.row(col) / both[[col, col]];
-        for row in 0..n {
-            let factor = if row == col { 0.0 } else { both[[row, col]] };
-            both.row_mut(row).scaled_add(-factor, &own);
-        }
-        both.row_mut(col).assign(&own);
-    }
-    Some(both.slice(s![.., n..]).to_owned())
-}
-
 fn belief(probabilities: Probabilities) -> Belief {
     let belief = Belief::from_probabilities(probabilities);
     belief.expect("invariant: a softmax is on the simplex")
 }
 
-/// What an estimator whose belief is about X_{k+1} expects frames to show, `[O, H, W]`.
+/// Returns the distribution of each cell's next observation, `[O, H, W]`, under a belief about X_{k+1}.
 fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
     let likelihood = estimator.likelihood()?;
     Some(observations(estimator.belief(), &likelihood))
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use emberwatch_belief::estimation::BayesFilter;
-    use emberwatch_network::{Device, Lesson};
-
-    fn estimator() -> NeuralEstimator {
-        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-        NeuralEstimator::new(&network, None, shape()).expect("a belief")
-    }
-
-    fn shape() -> Shape {
-        Shape::new(2, 3).expect("test shape")
-    }
-
-    fn frame(values: &[u8]) -> Frame {
-        Frame::from_bytes(shape(), 3, values).expect("test frame")
-    }
-
-    #[test]
-    fn visited_cells_are_what_they_showed_until_the_next_step() {
-        let mut estimator = estimator();
-        let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
-        assert!(
-            value(&estimator, 1)
-                .iter()
-                .all(|p| (p - 1.0 / 3.0).abs() < 1e-6)
-        );
-        let seen = frame(&[255, 2, 255, 255, 255, 255]);
-        estimator.correct(&seen).expect("possible");
-        assert_eq!(value(&estimator, 1), [0.0, 0.0, 1.0]);
-        assert!((value(&estimator, 0)[2] - 1.0 / 3.0).abs() < 1e-6);
-        estimator.predict();
-        assert!(
-            (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
-            "nothing is learned"
-        );
-    }
-
-    #[test]
-    fn with_a_known_sensor_an_untrained_network_is_the_filter() {
-        let model = emberwatch_model::Model::wildfire();
-        let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
-        let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-        let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
-            .expect("a belief")
-            .seen_through(model.likelihood().clone())
-            .expect("an inverse");
-        let mut expected = filter();
-        for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
-            own.correct(&frame(&values)).expect("possible");
-            expected.correct(&frame(&values)).expect("possible");
-            let off = (&own.belief().view() - &expected.belief().view()).mapv(f32::abs);
-            assert!(off.iter().all(|off| *off < 1e-4), "{off}");
-            own.predict();
-            expected.predict();
-        }
-    }
-
-    #[test]
-    fn many_of_several_networks_predict_together_as_each_alone() {
-        let networks = [1, 2].map(|seed| {
-            let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
-            let lesson = Lesson {
-                before: Sightings::new(shape()),
-                frame: vec![(0, 1), (4, 2)],
-                base: Vec::new(),
-            };
-            let updates = (0..3).map(|_| network.update(0.05, std::slice::from_ref(&lesson)));
-            assert!(updates.into_iter().all(|loss| loss.is_ok()));
-            network
-        });
-        let estimators = || -> Vec<Box<dyn Estimator>> {
-            let filter = || {
-                let model = emberwatch_model::Model::wildfire();
-                BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter")
-            };
-            let mut all: Vec<Box<dyn Estimator>> = vec![Box::new(filter())];
-            // Networks in turn, with a filter below and without.
-            for index in 0..8 {
-                let below = (index % 4 > 1).then(|| Box::new(filter()) as Box<dyn Estimator>);
-                let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
-                let mut estimator = estimator.expect("a belief");
-                let seen = [255, 255, index as u8 % 3, 255, 1, 255];
-                estimator.correct(&frame(&seen)).expect("possible");
-                all.push(Box::new(estimator));
-            }
-            all
-        };
-        let (mut together, mut alone) = (estimators(), estimators());
-        predict_together(together.iter_mut().map(|it| &mut **it).collect());
-        for (index, (together, alone)) in together.iter().zip(&mut alone).enumerate() {
-            let before = alone.belief().clone();
-            alone.predict();
-            assert!(together.belief() == alone.belief(), "{index}");
-            assert!(*alone.belief() != before, "{index}");
-        }
-    }
-
-    #[test]
-    fn another_goes_on_from_its_bytes() {
-        let (mut first, mut second) = (estimator(), estimator());
-        for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
-            first.correct(&frame(&values)).expect("possible");
-            first.predict();
-        }
-        let bytes = first.to_bytes();
-        assert!(!second.restore(&bytes[1..]) && second.sightings == Sightings::new(shape()));
-        assert!(second.restore(&bytes));
-        assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
-        let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
-        let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
-        assert_ne!(other.kind(), first.kind());
-    }
-}
+mod tests;

@@ -28,7 +28,6 @@ pub struct LearningConfig {
     pub streams: usize,
     pub block_windows: usize,
     pub replay_frames: usize,
-    pub full_frames: bool,
     pub rate: f64,
     pub observation_rate: f64,
     pub beta1: f64,

@@ -52,7 +52,7 @@ pub const FILTER: LearnerKind = LearnerKind {
     adopt: |contents, config| {
         config.kernels = KernelKind::of(sees_own_state(&contents.part("")));
         if let Ok(settings) = contents.settings() {
-            config.learning.full_frames = settings.learning.full_frames;
+            config.full_frames = settings.full_frames;
         }
     },
     read: |contents, _, learned| {
@@ -67,8 +67,8 @@ pub const FILTER: LearnerKind = LearnerKind {
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     let dimensions = dimensions(on.config, &on.worlds)?;
     ensure!(
-        !on.config.learning.full_frames || on.info.coverage != CoverageRule::Path,
-        "learning.full_frames: expected a server with --coverage client or full, got path"
+        !on.config.full_frames || on.info.coverage != CoverageRule::Path,
+        "full_frames: expected a server with --coverage client or full, got path"
     );
     Ok(Box::new(match on.contents {
         Some(contents) => FilterLearner::resume(contents, dimensions, on.worlds, on.config)?,
@@ -224,7 +224,7 @@ impl Actor for FilterLearner {
 
 impl Learning for FilterLearner {
     fn wants_full_frames(&self) -> bool {
-        self.config.learning.full_frames
+        self.config.full_frames
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {

@@ -197,7 +197,7 @@ class Server:
         """Closes it. May be called again."""
 
 class Options:
-    """Beliefs about worlds of one robot each, and the plans there; worlds count from 0."""
+    """Beliefs and plans of worlds with one robot each; worlds are numbered from 0."""
 
     def __init__(
         self,
@@ -210,24 +210,24 @@ class Options:
     ) -> None:
         """Checks all arguments.
 
-        `watched`: the instance on which beliefs are shown, and which is the first world there.
+        `watched`: the instance in which beliefs are published, and the number there of world 0.
         """
 
     @property
     def estimator(self) -> str:
-        """What keeps the beliefs."""
+        """Name of the estimator that keeps the beliefs."""
 
     def begin(self, worlds: list[int], seeds: list[int]) -> None:
-        """New beliefs before the first frame."""
+        """Starts episodes: the first belief in each of `worlds`, and a seed."""
 
     def take_over(self, world: int, kind: str, data: bytes) -> bool:
-        """Goes on with the belief that was left for the present step, if it fits."""
+        """Continues with a belief of another client about the present step; False: no fit."""
 
     def left(self, world: int) -> tuple[str, bytes] | None:
-        """Kind and bytes of a belief, for the next who flies there."""
+        """Returns the kind and the bytes of a belief, for the next client."""
 
     def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Takes in an earlier step: bytes of `wire.RESULT_DTYPE`, frames `(n, H, W)`."""
+        """Updates beliefs with an earlier step: bytes as of `plan`, frames `(n, H, W)`."""
 
     def plan(
         self,
@@ -236,14 +236,16 @@ class Options:
         frames: NDArray[np.uint8] | None,
         flown: list[int] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Takes in the present step, unless it is in the belief, and plans.
+        """Updates beliefs with the present step, unless `frames` is None, then plans.
+
+        `results`: bytes of `wire.RESULT_DTYPE`.
 
         Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
         worlds, new arrays.
         """
 
     def close(self) -> None:
-        """Forgets all. May be called again."""
+        """Drops all beliefs. May be called again."""
 
 class Flights:
     """The present path of each robot, as far as it is flown. Rows are robots.
@@ -404,10 +406,10 @@ class Recording:
         """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
 
 def estimator_names() -> list[tuple[str, str]]:
-    """The name of each estimator that options can be planned on, and what it is."""
+    """Returns the name and a description of each estimator on which options can be planned."""
 
 def option_names() -> tuple[list[str], list[str]]:
-    """The names of options, and those of the numbers that describe the plan of each."""
+    """Returns the names of the options, and of the features that describe each plan."""
 
 def read_model(text: str) -> dict[str, Any]:
     """The fields of `Model` but `toml`; raises `ValueError` for what is no model file."""
@@ -438,11 +440,14 @@ class Transition:
     def __getnewargs__(self) -> tuple[str, int, int]: ...
 
 class Estimators:
-    """Beliefs of one kind about some worlds. `chosen` is a mask of worlds, `(n,)`."""
+    """Beliefs of one kind about n worlds; `Belief` checks the arguments.
+
+    `chosen` is a mask of worlds, `(n,)`.
+    """
 
     @staticmethod
     def known(model: str, prior: NDArray[np.float32], kind: str, n_worlds: int) -> Estimators:
-        """Of a model file's text; `prior` is that of each world, `(S, H, W)`."""
+        """Builds beliefs from a model file's text; `prior`, `(S, H, W)`, is the same for all."""
 
     @staticmethod
     def load(
@@ -452,7 +457,7 @@ class Estimators:
         model: str | None,
         n_worlds: int,
     ) -> Estimators:
-        """Of a checkpoint; `grid` is height and width, `model` a model file's text."""
+        """Loads beliefs; `grid` is height and width, `model` a model file's text."""
 
     @property
     def kind(self) -> str: ...
@@ -461,34 +466,36 @@ class Estimators:
     @property
     def target_state(self) -> int: ...
     @property
+    def n_observations(self) -> int: ...
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Number of worlds, height and width."""
 
     def belief(self) -> NDArray[np.float32]:
-        """`(S, n, H, W)`, a new array."""
+        """Returns a new array, `(S, n, H, W)`."""
 
     def entropy(self) -> NDArray[np.float32]:
-        """Nats, `(n, H, W)`, a new array."""
+        """Returns a new array, `(n, H, W)`, in nats."""
 
     def reset(self, chosen: NDArray[np.bool_], keeps_correlations: bool) -> None: ...
     def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None:
-        """With frames of all worlds, `(n, H, W)`."""
+        """Corrects the chosen worlds; `frames` has one for each world, `(n, H, W)`."""
 
     def predict(self, chosen: NDArray[np.bool_]) -> None: ...
     def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
-        """Log loss, Brier score and accuracy against states `(n, H, W)`, `(n,)` each."""
+        """Returns log loss, Brier score and accuracy for states `(n, H, W)`, `(n,)` each."""
 
     def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
-        """Log-likelihood of frames `(n, H, W)` and number of seen cells, `(n,)` each."""
+        """Returns the log-likelihood of frames `(n, H, W)` and observed cells, `(n,)` each."""
 
 def belief_kinds() -> list[tuple[str, str]]:
-    """The name of each kind of belief that frames correct, and what it is."""
+    """Returns the name and a description of each kind of belief that frames correct."""
 
 def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
-    """Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
+    """Applies Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
-    """How often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
+    """Returns how often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
 
 def beam_search(
     values: NDArray[np.float32],

@@ -1,7 +1,7 @@
-"""`BeliefObservation`: what a filter or another belief makes of the frames, as the observation.
+"""`BeliefObservation`: replaces the observed frame by a belief about all cells.
 
-A frame shows a path; the belief is what all frames so far say about every cell. For learning
-without memory, the belief is the better observation.
+A frame shows only the cells of one path. A belief sums up all frames so far, so that a policy
+without memory can act on it.
 """
 
 from collections.abc import Generator
@@ -24,42 +24,45 @@ from emberwatch.model import Model
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
-    """Runs a belief beside an environment and observes it: by default the known model's filter.
+    """Keeps a belief about an environment's world and observes it: by default the Bayes filter.
 
-    For single environments: wrap those of a vector one by one. `terminated` and `truncated` pass
-    through; only `reset` begins a new belief. Where ``info["step"]`` tells the world's k, as in
-    Emberwatch's own environments, the belief follows it: a step that only flies a move changes
-    nothing, and one that flies several paths predicts as often, though it sees the last frame only.
-    Elsewhere, a step is taken for one of the world.
+    Wraps single environments; wrap the environments of a vector one by one. `terminated` and
+    `truncated` pass through; only `reset` resets the belief.
+
+    Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
+    it. After a step that only makes one move of a path, the belief stays. After a step that flies
+    several paths, it predicts once per path and corrects with the last frame. In environments that
+    do not report k, each step of the environment is one step of the world.
 
     ## Observations
     After `reset`, the prior about ``X_0``, the world after its burn-in. A step moves the world from
-    ``X_k`` to ``X_{k+1}`` and its frame shows ``X_{k+1}``: the filter predicts, then corrects, and
-    the observation is the posterior about ``X_{k+1}`` given all frames (eqs. 5 and 6). The Rust
-    agent's belief has the same numbers; its planner then looks one step further ahead, at the
-    predictor of what the next path will meet: `emberwatch.belief.Transition` makes it from this
-    observation.
+    ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter predicts, then corrects. The
+    observation is the posterior about ``X_{k+1}``, given all frames (eqs. 5 and 6), with the same
+    numbers as the Rust agent's. The agent plans on the predictor of the state that the next path
+    meets; compute it from this observation with `emberwatch.belief.Transition`.
 
     - ``dtype="float32"``: `Box` of 0 to 1, shape (S, H, W), each cell's sum one.
     - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S): an image for convolutional
-      policies, as of Stable-Baselines3.
-    - ``keep=True``: a `Dict` of the original observations (a lone frame as ``"frame"``) and
+      policies, such as those in Stable-Baselines3.
+    - ``keep=True``: a `Dict` of the original observations (a single frame as ``"frame"``) and
       ``"belief"``.
 
     ## Priors
     - ``"simulated"``: how often each cell of 64 simulated worlds is in each state after the
-      burn-in. The first time it takes some seconds; ``~/.cache/emberwatch`` keeps it.
+      burn-in. Takes some seconds the first time, then comes from ``~/.cache/emberwatch``.
     - ``"initial"``: the model's initial distribution, right for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
     - An array of shape (S, H, W), each cell's sum one.
-    - ``None``: ``"simulated"`` if the environment has a burn-in, else ``"initial"``.
+    - ``None``: ``"simulated"`` if the environment has a burn-in, otherwise ``"initial"``.
 
     ## Arguments
-    `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-    ``"frame"``. `model`, a `Model`, its name, or the path or the text of its file, is for servers
-    that do not reveal theirs; else it is ``env.unwrapped.model``. `kind` is one of
-    `emberwatch.belief.kinds`. With `checkpoint`, a file of `emberwatch-agent train`, the belief is
-    the learned one, as of `emberwatch.belief.load`: it has its own prior and S, and needs no model.
+    - `env`: observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
+      ``"frame"``.
+    - `model`: a `Model`, its name, or the path or the text of its file. Only for servers that do
+      not reveal their model; the default is ``env.unwrapped.model``.
+    - `kind`: a key of `emberwatch.belief.kinds`.
+    - `checkpoint`: a file of `emberwatch-agent train`. The belief is then the one that
+      `emberwatch.belief.load` makes, with its own prior and S; it needs no model.
     """
 
     def __init__(
@@ -94,24 +97,24 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             burn_in = int(getattr(env.unwrapped, "burn_in", 0))
             known_model = _model_of(env, model)
             first = prior_of(prior, known_model, **grid, burn_in=burn_in)
-            self._belief = known(known_model, prior=first, kind=kind or "known")
+            self._belief = known(known_model, prior=first, kind="known" if kind is None else kind)
         elif prior is not None:
-            raise invalid("prior", "none beside a checkpoint, which has its own", prior)
+            raise invalid("prior", "None with a checkpoint, which has a prior", prior)
         else:
             is_hidden = model is None and getattr(env.unwrapped, "model", None) is None
             found = None if is_hidden else _model_of(env, model)
             self._belief = load(checkpoint, **grid, kind=kind, model=found)
-        #: Whether an episode has begun, and no step is unfinished.
+        #: Whether an episode has begun and no step was interrupted.
         self._is_begun = False
         self._step = 0
         self.observation_space = self._space(original, height, width)
 
     @property
     def filter(self) -> Belief:
-        """The belief of the current episode, for its entropy or its states."""
+        """The belief of the current episode, such as for its entropy or its state names."""
         if not self._is_begun:
             raise gymnasium.error.ResetNeeded(
-                "BeliefObservation: call reset first, also after a step that did not finish"
+                "BeliefObservation: call reset first; after an interrupted step, too"
             )
         return self._belief
 
@@ -122,7 +125,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
         self._belief.reset()
-        self._belief.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        self._belief.correct(_frame_of(observation))  # shows nothing, unless resumed
         self._is_begun = True
         return self._observe(observation), info
 
@@ -140,7 +143,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     @contextmanager
     def _between(self) -> Generator[None]:
-        """Without a belief until what the environment does now is taken in; a refusal keeps it."""
+        """Marks the belief as outdated during a call; a refused call has changed nothing."""
         was_begun, self._is_begun = self._is_begun, False
         try:
             yield
@@ -176,19 +179,19 @@ def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) ->
     revealed = getattr(env.unwrapped, "model", None)
     if not isinstance(revealed, Model):
         raise InvalidArgumentError(
-            "BeliefObservation: expected the world's model, got none: the server does not reveal "
-            "it (--reveal-model false); pass model=, a Model, its name or the path of its file"
+            "BeliefObservation: expected the world's model, got none, as the server hides it "
+            "(--reveal-model false). Pass model=: a Model, its name or the path of its file"
         )
     return revealed
 
 
 def _parts_of(whole: Any, kind: type[Any] = dict) -> dict[str, Any]:
-    """The parts of an observation, or of its space: those of a dictionary, or a lone frame."""
+    """Returns the parts of an observation or a space by name; a single frame is ``"frame"``."""
     return dict(whole) if isinstance(whole, kind) else {"frame": whole}
 
 
 def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
-    """Height and width of the frame."""
+    """Returns the frame's height and width."""
     match parts.get("frame"):
         case spaces.Box(shape=(height, width, 1), dtype=np.dtypes.UInt8DType()):
             return height, width
@@ -198,5 +201,5 @@ def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
 
 
 def _frame_of(observation: Any) -> NDArray[np.uint8]:
-    """The frame, shape (H, W)."""
+    """Returns the frame, shape (H, W)."""
     return _parts_of(observation)["frame"][:, :, 0]

@@ -7,7 +7,7 @@ use super::super::grid::Shape;
 use super::super::parameters::Model;
 use super::lanes::LANES;
 
-/// The state of places off the grid, which add no weight.
+/// Marks places outside the grid that add no weight.
 pub(super) const OFF_GRID: u8 = 255;
 
 #[derive(Debug, Clone)]
@@ -15,7 +15,7 @@ pub(super) struct Places {
     width: usize,
     pub(super) stride: usize,
     margins: [usize; 2],
-    /// `X_k`, and in the margin the model's edge state or [`OFF_GRID`].
+    /// `X_k`. The margin has the model's edge state, or [`OFF_GRID`].
     pub(super) states: Vec<u8>,
     /// By home: random bytes, then states and marks of undecided cells, then `X_{k+1}`.
     pub(super) next: Vec<u8>,
@@ -34,7 +34,7 @@ impl Places {
         }
     }
 
-    /// The number of places, and that of homes.
+    /// Returns the number of places and the number of homes.
     pub(super) fn lengths(model: &Model, shape: Shape) -> (usize, usize) {
         let (_, _, kernel_height, kernel_width) = model.kernel().dim();
         let stride = shape.width() + kernel_width - 1;

@@ -69,6 +69,10 @@ fn wrong_entries_are_rejected_by_name() {
     );
     check(|f| f.kernel[0].scale = f64::NAN, "got NaN");
     check(|f| f.kernel[0].to = "ash".into(), "names state \"ash\"");
+    check(
+        |f| f.edge = Some("sea".into()),
+        "edge: expected the name of a state, one of [\"normal\", \"latent\", \"fire\"], got \"sea\"",
+    );
     check(|f| f.kernel_size = [3, 5], "expected 3 rows of 5 weights");
     check(
         |f| f.kernel_size = [2, 3],

@@ -1,9 +1,7 @@
 //! Where beliefs lie while [`super::Transition`] works on them.
 
 use super::super::grid::Shape;
-
-/// Cells computed at once, four AVX2 registers of `f32`. Independent sums hide the latency of adds.
-pub(super) const LANES: usize = 32;
+use super::super::vectors::LANES;
 
 /// Where a cell of a state lies in the planes: half a kernel of margin on each side, and on the
 /// right up to a whole number of [`LANES`].

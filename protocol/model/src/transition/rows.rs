@@ -9,7 +9,8 @@
 //! A weight that differs between zones has a *slot*: a number for each lane, by the zones of the cells there. Most
 //! weights of a land do not differ.
 
-use super::layout::{LANES, Layout};
+use super::super::vectors::LANES;
+use super::layout::Layout;
 use ndarray::{Array4, NdFloat, s};
 
 /// For each next state its bias and its weight for some of the groups.

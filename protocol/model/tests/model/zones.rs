@@ -203,7 +203,7 @@ fn zones_that_do_not_fit_are_refused_by_name() {
     );
     check(
         &|f| f.zones.push(zone_entry(2)),
-        "zone \"z2\": expected kernel entries of its own",
+        "zone \"z2\": expected kernel entries with its name",
     );
     check(
         &|f| drop(f.zones.pop()),

@@ -1,60 +1,21 @@
-//! Several cells side by side, one in each lane of a vector, and planes with margins to read them from.
+//! Arithmetic on [`LANES`] cells at once, one per lane of a vector.
 //!
-//! Loops are written out, as closures of iterators are not always compiled for the vectors of the processor. Every lane does the same operations in the same order and none is fused, so results are bit-identical on every platform.
+//! Loops are written out, because closures of iterators are not always compiled for the vectors of the processor. Every
+//! lane does the same operations in the same order and none is fused, so results are bit-identical on every platform.
 
-use emberwatch_model::Shape;
+pub use emberwatch_model::vectors::LANES;
 
-/// Cells that are computed at once.
-pub const LANES: usize = 32;
-
+/// One number for each cell of a chunk.
 pub type Lanes = [f32; LANES];
 
-/// Where a grid's cells lie in a plane that has a margin of zeros around them.
-#[derive(Debug, Clone, Copy)]
-pub struct Planes {
-    margin: [usize; 2],
-    stride: usize,
-    pub length: usize,
-}
-
-impl Planes {
-    /// Margins are as wide as a kernel with such sides reaches.
-    pub fn new(shape: Shape, kernel: [usize; 2]) -> Self {
-        let margin = kernel.map(|side| side / 2);
-        let stride = shape.width().next_multiple_of(LANES) + 2 * margin[1];
-        Self {
-            margin,
-            stride,
-            length: (shape.height() + 2 * margin[0]) * stride,
-        }
-    }
-
-    /// The index of a cell in its plane.
-    pub fn place(&self, [row, col]: [usize; 2]) -> usize {
-        (row + self.margin[0]) * self.stride + col + self.margin[1]
-    }
-
-    /// From a cell's place to the place of the neighbour at a tap of the kernel.
-    pub fn offset(&self, [row, col]: [usize; 2]) -> isize {
-        (row * self.stride + col) as isize - self.place([0, 0]) as isize
-    }
-
-    /// Copies a grid's cells, row-major, into a plane.
-    pub fn put(&self, shape: Shape, from: &[f32], to: &mut [f32]) {
-        let width = shape.width();
-        for (row, from) in from.chunks_exact(width).enumerate() {
-            to[self.place([row, 0])..][..width].copy_from_slice(from);
-        }
-    }
-}
-
+/// Returns the [`LANES`] numbers from an index on.
 #[inline(always)]
-pub fn lanes_from(planes: &[f32], at: usize) -> &Lanes {
-    let lanes = planes[at..].first_chunk();
-    lanes.expect("invariant: margins have room for lanes at every neighbour")
+pub fn lanes_from(numbers: &[f32], at: usize) -> &Lanes {
+    let lanes = numbers[at..].first_chunk();
+    lanes.expect("invariant: planes hold LANES numbers from every neighbour on")
 }
 
-/// `to += a b`.
+/// Computes `to += a b`.
 #[inline(always)]
 pub fn add_product(to: &mut Lanes, a: &Lanes, b: &Lanes) {
     for lane in 0..LANES {
@@ -62,6 +23,7 @@ pub fn add_product(to: &mut Lanes, a: &Lanes, b: &Lanes) {
     }
 }
 
+/// Computes `to += from`.
 #[inline(always)]
 pub fn add(to: &mut Lanes, from: &Lanes) {
     for lane in 0..LANES {
@@ -69,6 +31,7 @@ pub fn add(to: &mut Lanes, from: &Lanes) {
     }
 }
 
+/// Computes `to *= by`.
 #[inline(always)]
 pub fn multiply(to: &mut Lanes, by: &Lanes) {
     for lane in 0..LANES {
@@ -76,7 +39,7 @@ pub fn multiply(to: &mut Lanes, by: &Lanes) {
     }
 }
 
-/// `a / b`.
+/// Returns `a / by`.
 #[inline(always)]
 pub fn divided(a: f32, by: &Lanes) -> Lanes {
     let mut to = [0.0; LANES];
@@ -86,6 +49,7 @@ pub fn divided(a: f32, by: &Lanes) -> Lanes {
     to
 }
 
+/// Returns the sum of several numbers for each lane.
 #[inline(always)]
 pub fn sum(all: &[Lanes]) -> Lanes {
     let mut sum = [0.0; LANES];
@@ -95,17 +59,19 @@ pub fn sum(all: &[Lanes]) -> Lanes {
     sum
 }
 
-/// `exp(-a b)` of products that are not negative, to a few units in the last place: a power of two, and a polynomial for
-/// the rest.
+/// Returns `exp(-a b)` for `a b >= 0`, with an error of a few units in the last place.
+///
+/// Writes `exp(-a b)` as `2^n exp(y)` with an integer `n` and `|y| <= ln(2) / 2`, and computes `exp(y)` by its Taylor
+/// polynomial of degree 6.
 #[inline(always)]
 pub fn exponential(a: &Lanes, b: &Lanes) -> Lanes {
-    // A number whose last bits, once another is added to it, hold that one's nearest whole number.
-    const ROUNDED: f32 = 12_582_912.0;
+    // 1.5 * 2^23: a sum with it is rounded to an integer, which stands in its lowest bits.
+    const ROUNDING: f32 = 12_582_912.0;
     let mut to = [0.0; LANES];
     for lane in 0..LANES {
         let x = (a[lane] * b[lane] * -std::f32::consts::LOG2_E).max(-120.0);
-        let rounded = x + ROUNDED;
-        let y = (x - (rounded - ROUNDED)) * std::f32::consts::LN_2;
+        let rounded = x + ROUNDING;
+        let y = (x - (rounded - ROUNDING)) * std::f32::consts::LN_2;
         let polynomial = 1.0
             + y * (1.0
                 + y * (0.5 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y * (1.0 / 120.0 + y / 720.0)))));

@@ -1,8 +1,10 @@
+mod exact;
+
 use super::*;
-use emberwatch_model::Grid;
-use emberwatch_model::Model;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::transition::Transition;
+use emberwatch_model::{Grid, Model};
+use exact::divergence;
 use ndarray::Array4;
 
 fn belief(n_states: usize, shape: Shape, seed: u64) -> Belief {
@@ -82,7 +84,17 @@ fn an_edge_is_a_frame_of_cells_in_its_state() {
     }
 }
 
-/// A fire that ignites with `f / (a f + b)` from `f` of four burning neighbours, and burns out with a tenth.
+/// The weights of a grid without zones or an edge state.
+fn weights<'a>(kernels: &'a [Array4<f64>], bias: &'a [f64]) -> Weights<'a> {
+    Weights {
+        kernels,
+        bias,
+        zones: (None, 1),
+        edge: None,
+    }
+}
+
+/// A fire: a cell with `f` burning neighbours of four ignites with probability `f / (a f + b)`, and burns out with 0.1.
 fn fire() -> Vec<Array4<f64>> {
     let (a, b) = (0.7, 1.8);
     let mut kernels = vec![Array4::zeros((3, 3, 3, 3)); 3];
@@ -92,183 +104,13 @@ fn fire() -> Vec<Array4<f64>> {
             kernels[0][[0, n, row, col]] = 1.0 - a;
         }
     }
-    // What neighbours that do not burn add to the total, the centre has less.
+    // The centre makes up for the weights of neighbours that do not burn.
     kernels[0][[0, 0, 1, 1]] = b - 4.0 * (1.0 - a);
     for (m, p) in [(1, 0.9), (2, 0.1)] {
         kernels[1][[m, 1, 1, 1]] = p;
     }
     kernels[2][[2, 2, 1, 1]] = 1.0;
     kernels
-}
-
-/// All states of a small grid.
-struct Exact {
-    shape: Shape,
-    /// Of each joint state and cell, the distribution of the cell's next state.
-    next: Vec<Vec<[f64; 3]>>,
-    joint: Vec<f64>,
-}
-
-impl Exact {
-    fn new(shape: Shape, weights: Weights<'_>, first: &[u8]) -> Self {
-        let kernels = weights.kernels;
-        let n = 3_usize.pow(shape.n_cells() as u32);
-        let state = |joint: usize, cell: usize| joint / 3_usize.pow(cell as u32) % 3;
-        let next = |joint: usize| {
-            let cell = |index: usize| {
-                let (cell, own) = (shape.cell(index), state(joint, index));
-                let mut sums = [0, 1, 2].map(|m| weights.bias[m]);
-                let kernel = &kernels[own % kernels.len()];
-                for (a, c) in (0..9).map(|at| (at / 3, at % 3)) {
-                    let (row, col) = (
-                        (cell.row + a).wrapping_sub(1),
-                        (cell.col + c).wrapping_sub(1),
-                    );
-                    if row < shape.height() && col < shape.width() {
-                        let n = state(joint, row * shape.width() + col);
-                        (0..3).for_each(|m| sums[m] += kernel[[m, n, a, c]]);
-                    }
-                }
-                let total: f64 = sums.iter().sum();
-                sums.map(|weight| weight / total)
-            };
-            (0..shape.n_cells()).map(cell).collect()
-        };
-        let mut joint = vec![0.0; n];
-        let index = first
-            .iter()
-            .rev()
-            .fold(0, |index, state| 3 * index + usize::from(*state));
-        joint[index] = 1.0;
-        Self {
-            shape,
-            next: (0..n).map(next).collect(),
-            joint,
-        }
-    }
-
-    fn predict(&mut self) {
-        let mut joint = vec![0.0; self.joint.len()];
-        for (next, p) in self.next.iter().zip(&self.joint).filter(|(_, p)| **p > 0.0) {
-            let mut all = vec![*p];
-            // The last cell counts most.
-            for cell in next.iter().rev() {
-                all = all.iter().flat_map(|p| cell.map(|q| p * q)).collect();
-            }
-            joint.iter_mut().zip(all).for_each(|(to, p)| *to += p);
-        }
-        self.joint = joint;
-    }
-
-    fn correct(&mut self, seen: impl Iterator<Item = (usize, u8)>) {
-        for (cell, value) in seen {
-            let step = 3_usize.pow(cell as u32);
-            for (joint, p) in self.joint.iter_mut().enumerate() {
-                *p *= if joint / step % 3 == usize::from(value) {
-                    0.9
-                } else {
-                    0.05
-                };
-            }
-        }
-        let total: f64 = self.joint.iter().sum();
-        self.joint.iter_mut().for_each(|p| *p /= total);
-    }
-
-    fn of(&self, cell: usize, state: usize) -> f64 {
-        let step = 3_usize.pow(cell as u32);
-        let all = self.joint.iter().enumerate();
-        all.filter(|(joint, _)| joint / step % 3 == state)
-            .map(|(_, p)| p)
-            .sum()
-    }
-
-    /// A state after the one at `joint`, by chance.
-    fn draw(&self, joint: usize, random: &mut impl FnMut() -> f64) -> usize {
-        let cells = self.next[joint].iter().rev();
-        cells.fold(0, |to, cell| {
-            let mut u = random();
-            let state = cell.iter().position(|p| {
-                u -= p;
-                u < 0.0
-            });
-            3 * to + state.unwrap_or(2)
-        })
-    }
-}
-
-/// Kullback-Leibler divergence of each kind's marginals from the exact ones, mean over steps and cells: of frames that show
-/// one cell in `one_in`, none for 0.
-fn divergence(
-    (weights, burning): (Weights<'_>, u8),
-    shape: Shape,
-    kind: PredictionKind,
-    (one_in, n_worlds): (u64, u64),
-) -> f64 {
-    let mut first = vec![0; shape.n_cells()];
-    first[0] = burning;
-    let start = Exact::new(shape, weights, &first);
-    let states = Grid::from_shape_vec(shape.dim(), first).expect("a grid");
-    let (mut sum, mut count) = (0.0, 0.0);
-    for world in 0..n_worlds {
-        let mut exact = Exact {
-            joint: start.joint.clone(),
-            next: start.next.clone(),
-            shape,
-        };
-        let mut belief = Belief::from_states(&states, 3).expect("states");
-        let mut prediction = Prediction::new(weights, kind, &belief);
-        let mut truth = start.joint.iter().position(|p| *p > 0.0).expect("a state");
-        let mut n_drawn = 0;
-        let mut random = || {
-            n_drawn += 1;
-            (split_mix(world, n_drawn) >> 11) as f64 / (1_u64 << 53) as f64
-        };
-        for _ in 0..12 {
-            truth = exact.draw(truth, &mut random);
-            exact.predict();
-            predict(&mut prediction, &mut belief);
-            for cell in 0..exact.shape.n_cells() {
-                for (state, q) in belief.states(cell).into_iter().enumerate() {
-                    let p = exact.of(cell, state);
-                    sum += if p > 0.0 {
-                        p * (p / q.max(1e-12)).ln()
-                    } else {
-                        0.0
-                    };
-                }
-                count += 1.0;
-            }
-            let mut seen = Vec::new();
-            for cell in 0..exact.shape.n_cells() {
-                if one_in > 0 && random() * (one_in as f64) < 1.0 {
-                    let state = truth / 3_usize.pow(cell as u32) % 3;
-                    let u = random();
-                    let other = (state + if u < 0.05 { 1 } else { 2 }) % 3;
-                    seen.push((cell, if u < 0.1 { other as u8 } else { state as u8 }));
-                }
-            }
-            exact.correct(seen.iter().copied());
-            let before = belief.as_slice().to_vec();
-            let n_cells = exact.shape.n_cells();
-            let numbers = belief.as_mut_slice();
-            for (cell, value) in seen {
-                let like = |state: usize| {
-                    if state == usize::from(value) {
-                        0.9
-                    } else {
-                        0.05
-                    }
-                };
-                let total: f32 = (0..3)
-                    .map(|state| numbers[state * n_cells + cell] * like(state))
-                    .sum();
-                (0..3).for_each(|state| numbers[state * n_cells + cell] *= like(state) / total);
-            }
-            prediction.correct(&before, belief.as_slice());
-        }
-    }
-    sum / count
 }
 
 const KINDS: [PredictionKind; 3] = [
@@ -278,15 +120,10 @@ const KINDS: [PredictionKind; 3] = [
 ];
 
 #[test]
-fn each_cure_comes_closer_to_all_states_enumerated() {
+fn each_kind_is_closer_to_the_exact_filter_than_the_one_before() {
     let (kernels, bias) = (fire(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
-    // Bounds: a tenth above what was measured.
+    let weights = weights(&kernels, &bias);
+    // Bounds: a tenth above measured values.
     for ([height, width], one_in, n_worlds, bounds) in [
         ([2, 3], 0, 1, [0.134, 0.098, 0.076]),
         ([2, 3], 5, 40, [0.170, 0.128, 0.082]),
@@ -301,7 +138,7 @@ fn each_cure_comes_closer_to_all_states_enumerated() {
     }
 }
 
-/// A kernel of the paper's form: all cells have the same weights, whatever they are themselves.
+/// The paper's kernels do not depend on the own state.
 #[test]
 fn the_second_order_is_closer_for_the_papers_kernels() {
     let mut kernel = Array4::zeros((3, 3, 3, 3));
@@ -318,13 +155,8 @@ fn the_second_order_is_closer_for_the_papers_kernels() {
         }
     }
     let (kernels, bias) = ([kernel], [0.01, 0.001, 0.001]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
-    // Bounds: a tenth above what was measured.
+    let weights = weights(&kernels, &bias);
+    // Bounds: a tenth above measured values.
     for ([height, width], one_in, n_worlds, bounds) in [
         ([2, 3], 0, 1, [0.634, 0.116]),
         ([2, 3], 5, 40, [0.637, 0.136]),
@@ -342,7 +174,7 @@ fn the_second_order_is_closer_for_the_papers_kernels() {
     }
 }
 
-/// Neighbours act on every own state, most on the second of three, as in learned kernels.
+/// Own-state kernels like learned ones: neighbours influence each own state, and state 1 most.
 fn learned_like() -> Vec<Array4<f64>> {
     let kernel = |own: usize| {
         Array4::from_shape_fn((3, 3, 3, 3), |(m, n, row, col)| {
@@ -359,23 +191,20 @@ fn learned_like() -> Vec<Array4<f64>> {
 #[test]
 fn cavities_stay_distributions_where_several_own_states_act() {
     let (kernels, bias) = (learned_like(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     let shape = Shape::new(4, 35).expect("shape");
     let mut belief = belief(3, shape, 3);
     let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
-    assert_eq!(prediction.held, Some(1), "not the last own state");
+    assert_eq!(prediction.susceptible, Some(1), "not the last own state");
     for _ in 0..4 {
         predict(&mut prediction, &mut belief);
         for cavity in 0..prediction.offsets.len() {
             for (row, col) in [(0, 0), (2, 17), (3, 34)] {
-                let place = prediction.planes.place([row, col]);
-                let plane = |state| (cavity * 3 + state) * prediction.planes.length + place;
-                let sum: f32 = (0..3).map(|state| prediction.beliefs[plane(state)]).sum();
+                let place = prediction.beliefs.planes.place([row, col]);
+                let plane = |state| (cavity * 3 + state) * prediction.beliefs.planes.length + place;
+                let sum: f32 = (0..3)
+                    .map(|state| prediction.beliefs.probabilities[plane(state)])
+                    .sum();
                 assert!((sum - 1.0).abs() < 1e-4, "{cavity} ({row}, {col}): {sum}");
             }
         }
@@ -385,25 +214,89 @@ fn cavities_stay_distributions_where_several_own_states_act() {
 #[test]
 fn a_correction_changes_the_cavities_of_its_cells_alone() {
     let (kernels, bias) = (fire(), [0.0; 3]);
-    let weights = Weights {
-        kernels: &kernels,
-        bias: &bias,
-        zones: (None, 1),
-        edge: None,
-    };
+    let weights = weights(&kernels, &bias);
     let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
     let mut belief = Belief::from_states(&states, 3).expect("states");
     let mut prediction = Prediction::new(weights, PredictionKind::Cavities, &belief);
     predict(&mut prediction, &mut belief);
-    let (before, cavities) = (belief.as_slice().to_vec(), prediction.beliefs.clone());
+    let (before, cavities) = (
+        belief.as_slice().to_vec(),
+        prediction.beliefs.probabilities.clone(),
+    );
     let mut after = before.clone();
     (0..3).for_each(|state| after[state * 5] = [0.1, 0.8, 0.1][state]);
     prediction.correct(&before, &after);
-    let planes = prediction.beliefs.chunks_exact(prediction.planes.length);
-    for (new, old) in planes.zip(cavities.chunks_exact(prediction.planes.length)) {
+    let planes = prediction
+        .beliefs
+        .probabilities
+        .chunks_exact(prediction.beliefs.planes.length);
+    for (new, old) in planes.zip(cavities.chunks_exact(prediction.beliefs.planes.length)) {
         for col in 1..5 {
-            let place = prediction.planes.place([0, col]);
+            let place = prediction.beliefs.planes.place([0, col]);
             assert_eq!(new[place], old[place], "column {col}");
         }
     }
+}
+
+#[test]
+fn unseen_cells_stay_distributions_for_ever() {
+    let model = Model::built_in("wildfire-burnout").expect("built in");
+    let shape = Shape::new(3, 5).expect("shape");
+    let mut belief = belief(model.n_states(), shape, 3);
+    let mut prediction = Prediction::new((&model).into(), PredictionKind::Cavities, &belief);
+    for _ in 0..20_000 {
+        predict(&mut prediction, &mut belief);
+    }
+    assert!(prediction.clone().restore(&prediction.to_bytes()));
+    let sums = belief.view().sum_axis(ndarray::Axis(0));
+    assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 3e-5));
+}
+
+#[test]
+fn only_bytes_of_cavities_are_restored() {
+    let (kernels, bias) = (fire(), [0.0; 3]);
+    let weights = Weights {
+        edge: Some(2),
+        ..weights(&kernels, &bias)
+    };
+    let shape = Shape::new(3, 35).expect("shape");
+    let mut first_belief = belief(3, shape, 3);
+    let new = |kind| Prediction::new(weights, kind, &belief(3, shape, 4));
+    let (mut first, mut second) = (new(PredictionKind::Cavities), new(PredictionKind::Cavities));
+    predict(&mut first, &mut first_belief);
+    let (bytes, unchanged) = (first.to_bytes(), second.beliefs.probabilities.clone());
+    // Eight neighbours.
+    assert_eq!(bytes.len(), 4 * 8 * 3 * 3 * 35);
+    let with = |number: usize, p: f32| {
+        let mut bytes = bytes.clone();
+        bytes[4 * number..][..4].copy_from_slice(&p.to_le_bytes());
+        bytes
+    };
+    let last = bytes.len() / 4 - 1;
+    for (name, refused) in [
+        ("nothing", Vec::new()),
+        ("a number too few", bytes[4..].to_vec()),
+        ("a byte too many", [&bytes[..], &[0]].concat()),
+        ("zeros", vec![0; bytes.len()]),
+        ("a sum over one", with(0, 1.0005)),
+        ("a negative number", with(last, -0.5)),
+        ("no number", with(last, f32::NAN)),
+    ] {
+        assert!(!second.restore(&refused), "{name}");
+        assert_eq!(second.beliefs.probabilities, unchanged, "{name}");
+    }
+    assert!(second.restore(&bytes));
+    let mut second_belief = first_belief.clone();
+    predict(&mut first, &mut first_belief);
+    predict(&mut second, &mut second_belief);
+    assert_eq!(
+        (first_belief, first.to_bytes()),
+        (second_belief, second.to_bytes())
+    );
+    let mut second_order = new(PredictionKind::SecondOrder);
+    assert_eq!(
+        (second_order.n_bytes(), second_order.to_bytes().len()),
+        (0, 0)
+    );
+    assert!(second_order.restore(&[]) && !second_order.restore(&bytes));
 }

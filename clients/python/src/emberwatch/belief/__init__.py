@@ -1,14 +1,15 @@
-"""Beliefs about worlds: what the frames so far say about every cell.
+"""Beliefs about worlds: the probability of each state in each cell, given the frames so far.
 
-`known` and `load` make a `Belief` of any kind that the Rust agent has; `score` says how well one
-fits recorded worlds. `wrappers.BeliefObservation` runs one beside an environment.
+`known` makes a `Belief` from a model, `load` from a checkpoint. Both offer every kind of belief
+that the Rust agent has. `score` compares a belief with recorded worlds.
+`wrappers.BeliefObservation` adds a belief to an environment.
 
-The plain one is the Bayes filter of a known model (paper section III.A, masked as in section
-III.C): a frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5), and the transition
-turns that into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent
-given the frames, so this is an approximation even with the true model.
+The plain kind is the Bayes filter of a known model (paper section III.A, masked as in section
+III.C). A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5). The transition turns
+the posterior into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). The filter treats cells as
+independent given the frames, so it is an approximation even with the true model.
 
-Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
+Beliefs have shape (S, H, W) with S states: a distribution in each cell.
 """
 
 from collections.abc import Sequence
@@ -21,35 +22,42 @@ from emberwatch.belief.estimators import Belief as Belief
 from emberwatch.belief.estimators import kinds as kinds
 from emberwatch.belief.estimators import known as known
 from emberwatch.belief.estimators import load as load
+from emberwatch.belief.prior import distribution
+from emberwatch.belief.prior import initial_prior as initial_prior
+from emberwatch.belief.prior import uniform_prior as uniform_prior
 from emberwatch.belief.scoring import BeliefScores as BeliefScores
 from emberwatch.belief.scoring import score as score
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 from emberwatch.errors import invalid
 from emberwatch.model import Model
 
-_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
-
 
 class Filters:
-    """The plain filters of many worlds in double precision, for the environments' observations.
+    """Bayes filters of many worlds in double precision, for the environments' observations.
 
-    Beliefs have shape (S, n_worlds, H, W). The recorded bytes of observations depend on these
-    numbers; for anything else, `known` makes the agent's, which are single precision.
+    Beliefs have shape (S, n_worlds, H, W). Environments keep double precision because their
+    observations must not change from release to release. For other uses, `known` makes the agent's
+    filter, in single precision.
     """
 
     def __init__(self, model: Model, prior: NDArray[np.floating], n_worlds: int) -> None:
-        """`prior`, shape (S, H, W), is that of each world."""
-        self._prior = _distribution(prior, n_states=model.n_states)[:, np.newaxis]
+        """Starts all worlds from the same `prior`, shape (S, H, W)."""
+        first = distribution(prior, n_states=model.n_states)
+        first /= first.sum(axis=0)
+        self._prior = first[:, np.newaxis]
         _, _, height, width = self._prior.shape
         self._transition = Transition(model, height=height, width=width, n_worlds=n_worlds)
         self._likelihood = np.ascontiguousarray(model.observation_matrix)
-        #: The posterior ``p_k`` given the last frames.
+        #: The posterior ``p_k``, given the frames up to the last.
         self.posterior = np.repeat(self._prior, n_worlds, axis=1)
-        #: The predictor ``u_{k+1}`` of what the next paths will meet.
+        #: The predictor ``u_{k+1}``, about the states that the next paths meet.
         self.predictor = self.posterior
 
     def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
-        """Begins with the prior in some worlds, and corrects it; `frames` are those of all."""
+        """Resets the worlds `indices` to the prior, then corrects them with their frames.
+
+        `frames` has one frame per world, shape (n_worlds, H, W).
+        """
         chosen = list(indices)
         belief = np.repeat(self._prior, len(chosen), axis=1)
         _native.correct(belief, self._likelihood, frames[chosen])
@@ -57,7 +65,10 @@ class Filters:
         self.predictor = self._transition.apply(self.posterior)
 
     def update(self, frames: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
-        """One step of the worlds `moved`; `frames`, `(n_worlds, H, W)`, are those of all."""
+        """Corrects the worlds `moved` with their frames, then predicts.
+
+        `frames` has one frame per world, shape (n_worlds, H, W).
+        """
         if moved.all():
             belief = self.predictor
             _native.correct(belief, self._likelihood, frames)
@@ -73,14 +84,15 @@ class Transition:
     """The operator ``Phi`` on beliefs (eqs. 2-4) for one model on one grid.
 
     ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
-    (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
-    over ``m`` (eq. 3).
+    (A, C) the centre of the kernel (eq. 2), then divided by its sum over ``m`` (eq. 3). Outside the
+    grid ``x`` is zero, or one in the model's `edge` state.
 
-    Where the weights see the cell's own state ``o``, ``phi[m | o]`` has the weights of ``o``, its
-    centre tap sees ``o`` itself, and ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``: a mean
-    field, which takes neighbours for independent, as the filter does.
+    A model whose weights depend on the cell's own state ``o`` has a kernel for each ``o``. Its
+    ``phi[m | o]`` uses the kernel of ``o``, whose centre sees ``o`` itself, and
+    ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``. This is a mean field: it treats neighbours
+    as independent, as the filter does.
 
-    It keeps work space: share none between threads.
+    Threads must not share one, as it keeps work space.
     """
 
     def __init__(
@@ -92,7 +104,7 @@ class Transition:
         self._operator = _native.Transition(model.toml, height, width)
 
     def apply(self, belief: NDArray[np.floating]) -> NDArray[np.float64]:
-        """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
+        """Returns ``Phi(belief)``: a new array of the same shape; each cell's sum is one."""
         if belief.shape != self._shape:
             raise invalid("belief", f"shape {self._shape}", belief.shape)
         belief = np.asarray(belief, np.float64)
@@ -101,35 +113,10 @@ class Transition:
         return self._operator.apply(beliefs).reshape(self._shape)
 
 
-def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
-    return np.tile(model.initial[:, None, None], (1, height, width))
-
-
-def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
-    return np.full((model.n_states, height, width), 1.0 / model.n_states)
-
-
 def entropy(belief: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
+    """Returns the Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; (H, W)."""
     total = np.zeros(belief.shape[1:])
-    # State by state, as memory for all is got and given back in each call, which takes most time.
+    # State by state: allocating temporary arrays for all states takes longer than the arithmetic.
     for probability in belief:
         total += probability * np.log(np.where(probability > 0.0, probability, 1.0))
     return np.maximum(0.0, 0.0 - total)
-
-
-def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:
-    """A copy of the prior, each cell's sum exactly one."""
-    belief = np.array(prior, dtype=np.float64, order="C")
-    if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
-        raise invalid("prior", f"shape ({n_states}, H, W)", belief.shape)
-    total = belief.sum(axis=0)
-    fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
-    if not fine.all():
-        row, col = (int(i) for i in np.argwhere(~fine)[0])
-        got = belief[:, row, col].tolist()
-        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
-    belief /= total
-    return belief

@@ -1,6 +1,6 @@
-"""The field's figures of merit of some worlds' runs, as `docs/figures-of-merit.md` defines them.
+"""Figures of merit of runs in several worlds, which `docs/figures-of-merit.md` defines.
 
-They need no model: only which state is the target, and for two of them the hidden states.
+They need no model, only the number of the target state; two of them need the hidden states.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Merit:
 
 
 class MeritTally:
-    """The figures of some worlds while they go on, together."""
+    """Running figures of merit of several worlds, which step together."""
 
     def __init__(
         self, n_worlds: int, shape: tuple[int, int], *, target: int, recent_steps: int

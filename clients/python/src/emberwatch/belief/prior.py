@@ -1,4 +1,4 @@
-"""What can be known about a world before its first frame: a filter's first belief."""
+"""Priors: a filter's belief about a world before its first frame."""
 
 import functools
 from typing import Literal
@@ -7,22 +7,55 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.belief import initial_prior, uniform_prior
-from emberwatch.common.arguments import as_array, as_count
+from emberwatch.common.arguments import as_array, as_count, told
 from emberwatch.errors import invalid
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
 """A prior by name, see `wrappers.BeliefObservation`."""
 
+_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
+
+
+def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """Returns the model's distribution at the start of the burn-in in each cell, (S, H, W)."""
+    return np.tile(model.initial[:, None, None], (1, height, width))
+
+
+def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """Returns equal probabilities of all states, (S, H, W), as in the authors' demonstration."""
+    return np.full((model.n_states, height, width), 1.0 / model.n_states)
+
+
+def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
+    """Checks that a prior has shape (S, H, W) and is a distribution in each cell.
+
+    Returns a copy in double precision.
+    """
+    expected = f"numbers of shape ({n_states}, H, W)"
+    given = as_array(prior, "prior", expected)
+    fits = given.ndim == 3 and given.shape[0] == n_states and given.size > 0
+    if not fits or given.dtype.kind not in "fiu":
+        got = told(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
+        raise invalid("prior", expected, got)
+    with np.errstate(all="ignore"):  # what overflows is refused below
+        belief = np.array(given, np.float64, order="C")
+        is_one = np.abs(belief.sum(axis=0) - 1.0) <= _SUM_TOLERANCE
+    fine = is_one & (belief >= 0.0).all(axis=0)
+    if not fine.all():
+        row, col = (int(i) for i in np.argwhere(~fine)[0])
+        got = belief[:, row, col].tolist()
+        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
+    return belief
+
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
-    """How often each cell of 64 simulated worlds is in each state after the burn-in.
+    """Returns how often each cell of 64 simulated worlds is in each state after the burn-in.
 
-    Their seeds do not depend on any environment's. Shape (S, H, W); the same array again for the
-    same arguments, so it cannot be written to. The agents' beliefs begin with it, too, and it is
-    kept for later processes where they keep theirs, in ``~/.cache/emberwatch``.
+    Shape (S, H, W), read-only: calls with the same arguments share the array. The seeds of these
+    worlds are fixed and belong to no environment. The agent starts from the same prior. The first
+    call simulates for some seconds; later processes read the prior from ``~/.cache/emberwatch``.
     """
     height = as_count(height, "height", 1, _native.MAX_SIDE)
     width = as_count(width, "width", 1, _native.MAX_SIDE)
@@ -40,7 +73,10 @@ def prior_of(
     width: int,
     burn_in: int,
 ) -> NDArray[np.floating]:
-    """A prior by name, or as given; None: ``"simulated"`` after a burn-in, else ``"initial"``."""
+    """Returns a prior by name, or the given array after a check of its shape.
+
+    None: ``"simulated"`` after a burn-in, ``"initial"`` without one.
+    """
     if prior is None:
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):

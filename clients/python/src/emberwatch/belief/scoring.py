@@ -1,44 +1,45 @@
-"""How well a belief fits recorded sequences of frames and hidden states."""
+"""Scores of a belief on recorded sequences of frames and hidden states."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.estimators import Belief
-from emberwatch.common.arguments import as_array
+from emberwatch.belief.estimators import Belief, target_of
+from emberwatch.common.arguments import as_array, told
+from emberwatch.common.codes import UNOBSERVED
 from emberwatch.errors import invalid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeliefScores:
-    """Figures of each step: shape (K,), or (K, n_worlds) of a belief about several worlds."""
+    """Scores of each step: shape (K,), or (K, n_worlds) for a belief about several worlds."""
 
     #: Mean over all cells of ``-log p`` in nats, with `p` the posterior probability of the cell's
-    #: state: 0 is perfect; infinite where a state was ruled out that is there.
+    #: true state. 0 is perfect; infinite if the belief ruled out the true state of a cell.
     log_loss: NDArray[np.float64]
     #: Mean over all cells of ``(p - 1[state is the target])**2``, with `p` the posterior
-    #: probability of the target state: 0 is perfect, 1 the worst.
+    #: probability of the target state. 0 is perfect, 1 is the worst.
     brier: NDArray[np.float64]
-    #: Share of the cells whose most probable state is the true one, 0 to 1.
+    #: Share of the cells whose most probable state is the true state, 0 to 1.
     accuracy: NDArray[np.float64]
-    #: Of the predictor, before the frame: mean over the seen cells of ``-log P(y)`` in nats; NaN in
-    #: steps without a seen cell.
+    #: Mean over the observed cells of ``-log P(y)`` in nats, with ``P(y)`` the probability of the
+    #: observation `y` under the predictor. NaN in steps without an observed cell.
     predicted_log_loss: NDArray[np.float64]
-    #: Seen cells.
+    #: Number of observed cells.
     n_seen: NDArray[np.int64]
 
     def mean(self) -> dict[str, Any]:
-        """The mean of each figure over the steps, by name; one for each world if there are several.
+        """Returns the mean of each score over the steps, by name.
 
-        Steps count alike; for `predicted_log_loss`, seen cells do.
+        Each is a number, or has shape (n_worlds,). All steps have the same weight, except in
+        `predicted_log_loss`, where all observed cells have.
         """
         figures = ("log_loss", "brier", "accuracy")
         means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}
-        sums = np.where(self.n_seen > 0, self.predicted_log_loss * self.n_seen, 0.0).sum(axis=0)
-        n_seen = self.n_seen.sum(axis=0)
-        means["predicted_log_loss"] = np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)[()]
+        sums = np.nansum(self.predicted_log_loss * self.n_seen, axis=0)
+        means["predicted_log_loss"] = _per_cell(sums, self.n_seen.sum(axis=0))[()]
         return means
 
 
@@ -50,35 +51,37 @@ def score(
     target: int | None = None,
     keep_correlations: bool = False,
 ) -> BeliefScores:
-    """Scores a belief on a recorded sequence, or on one for each of its worlds.
+    """Scores a belief on a recorded sequence, or on one sequence for each of its worlds.
 
-    The belief is reset first. In each step k it is corrected with frame k, its posterior is scored
-    against state k, and it predicts step k + 1. All cells count, seen or not.
+    Resets the belief first. In each step k it scores the prediction of frame k, corrects the belief
+    with this frame, scores the posterior against state k, and predicts step k + 1. The posterior is
+    scored in all cells, observed or not.
 
-    A learned belief numbers its states itself: `log_loss` and `accuracy` mean something only if its
-    state numbers are those of `states`. `brier` compares the belief's own target state with
-    `target`.
+    A learned belief numbers its states itself. Its `log_loss` and `accuracy` are meaningful only if
+    these numbers agree with `states`. `brier` compares the probability of the belief's own target
+    state with the cells where `states` equals `target`.
 
     Args:
         belief: Made by `known` or `load`, for one world, or for as many as there are sequences.
-        observations: Frames, shape (K, H, W), or (K, n_worlds, H, W); 255 where nothing was
-            observed. K is at least 1.
-        states: Hidden states of the same shape.
+        observations: Frames, type uint8, shape (K, H, W) or (K, n_worlds, H, W), 255 in unobserved
+            cells. K is at least 1.
+        states: Hidden states of the same shape and type, below S.
         target: The number in `states` of the state that pays most; None: the belief's own.
-        keep_correlations: As of `Belief.reset`: what a belief with `+spatial` learned on earlier
-            sequences stays.
+        keep_correlations: As in `Belief.reset`: whether kinds with `+spatial` keep what they have
+            learned on earlier sequences.
 
     Raises:
-        InvalidArgumentError: If shapes differ, or a value is no observation or no state of the
-            belief.
-        EmberwatchError: Code ``"impossible_frame"``: the belief rules a frame out.
+        InvalidArgumentError: If an array does not have the belief's shape, type or values, or
+            `target` is no state. The belief does not change.
+        EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the belief.
     """
-    frames = as_array(observations, "observations", "an array")
-    truths = as_array(states, "states", "an array")
-    if truths.shape != frames.shape:
-        raise invalid("states", f"shape {frames.shape}, that of observations", truths.shape)
-    if frames.ndim not in (3, 4) or not len(frames):
-        raise invalid("observations", "shape (K, H, W) or (K, n_worlds, H, W)", frames.shape)
+    if not isinstance(cast("object", belief), Belief):
+        raise invalid("belief", "a Belief of `known` or `load`", told(belief))
+    frames = _sequence(observations, "observations", belief, belief.n_observations)
+    truths = _sequence(states, "states", belief, len(belief.state_names))
+    if len(truths) != len(frames):
+        raise invalid("states", f"{len(frames)} steps, as observations", len(truths))
+    target = target_of(belief, target)
     belief.reset(keep_correlations=keep_correlations)
     rows = list[tuple[Any, ...]]()
     for frame, truth in zip(frames, truths, strict=True):
@@ -93,6 +96,31 @@ def score(
         log_loss=losses,
         brier=briers,
         accuracy=accuracies,
-        predicted_log_loss=np.where(n_seen > 0, -sums / np.maximum(n_seen, 1.0), np.nan),
+        predicted_log_loss=_per_cell(-sums, n_seen),
         n_seen=n_seen.astype(np.int64),
     )
+
+
+def _per_cell(sums: NDArray[np.float64], n_seen: NDArray[Any]) -> NDArray[np.float64]:
+    """Divides sums by numbers of seen cells; NaN where no cell was seen."""
+    return np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)
+
+
+def _sequence(
+    values: NDArray[np.uint8], name: str, belief: Belief, n_values: int
+) -> NDArray[np.uint8]:
+    """Checks the frames, or the hidden states, of K steps."""
+    shape = ", ".join(map(str, belief.shape))
+    expected = f"shape (K, {shape}) with K >= 1, and type uint8"
+    given = as_array(values, name, expected)
+    if given.shape[1:] != belief.shape or not given.size or given.dtype != np.uint8:
+        raise invalid(name, expected, f"{given.shape} and {given.dtype}")
+    is_wrong, unless = given >= n_values, ""
+    if name == "observations":
+        is_wrong &= given != UNOBSERVED
+        unless = f", or {UNOBSERVED}"
+    if is_wrong.any():
+        step, *cell = (int(i) for i in np.argwhere(is_wrong)[0])
+        where = f"{name}: step {step}, cell {tuple(cell[-2:])}"
+        raise invalid(where, f"a value below {n_values}{unless}", given[(step, *cell)])
+    return given

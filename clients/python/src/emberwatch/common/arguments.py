@@ -53,11 +53,18 @@ def as_integer(value: object) -> int | None:
 
 
 def as_count(value: object, subject: str, least: int, most: int) -> int:
-    """Checks an integer that is not below `least` nor above `most`."""
-    number = as_integer(value)
+    """Checks an integer within `least` to `most`; refuses True and False."""
+    number = None if isinstance(value, bool) else as_integer(value)
     if number is not None and least <= number <= most:
         return number
     raise invalid(subject, f"an integer within {least} to {most}", told(value))
+
+
+def as_flag(value: object, subject: str) -> bool:
+    """Checks a switch: True or False, of Python or NumPy."""
+    if isinstance(value, bool | np.bool_):
+        return bool(cast("bool", value))
+    raise invalid(subject, "True or False", told(value))
 
 
 def as_seeds(

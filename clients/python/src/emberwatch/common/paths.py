@@ -11,9 +11,11 @@ BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def utf8(subject: str, path: str | os.PathLike[str]) -> str:
-    """A path as programs, messages and GDAL take it: in UTF-8, whatever the locale is."""
+    """Checks a path, and encodes it as UTF-8 in any locale, as programs and GDAL read it."""
     try:
         text = os.fsencode(path).decode()
+    except TypeError:
+        raise invalid(subject, "text or a path", repr(path)) from None
     except UnicodeError:
         text = "\0"
     if "\0" in text:

@@ -24,11 +24,11 @@ Color = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Description:
-    """What is known of states and observations: of recorded worlds, that is all.
+    """States and observations of a model; recorded worlds have a description and no model.
 
-    S is the number of states, O that of observations: those that the file names, once for each
-    observation matrix of the sensor. Two descriptions are equal if all they say is, whatever their
-    files look like.
+    S is the number of states. O is the number of observed values: the observations in the file,
+    once for each observation matrix of the sensor. Two descriptions are equal if all their fields
+    but `toml` are.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Description:
     state_colors: tuple[Color, ...]
     """By state."""
     observation_names: tuple[str, ...]
-    """By observed value; those of rings around the path end in the ring, as in `fire ring 1`."""
+    """By observed value. Names of rings around the path end in the ring, as in `fire ring 1`."""
     observation_colors: tuple[Color, ...]
     """By observed value."""
     observation_matrix: NDArray[np.float64]
@@ -64,7 +64,7 @@ class Description:
             raise invalid(cls.__name__.lower(), expected, error) from None
 
     def with_radius(self, radius: int) -> Self:
-        """The same with a sensor that sees so many rows and columns beyond each cell of a path."""
+        """Returns a copy whose sensor sees `radius` rows and columns beyond each cell of a path."""
         radius = as_count(radius, "radius", 0, _native.MAX_RADIUS)
         if radius == self.airspace.radius:
             return self
@@ -139,6 +139,8 @@ class Model(Description):
     """``b``, added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
     """Distribution of a cell at the start of the burn-in, shape (S,)."""
+    edge: int | None
+    """The state of the cells outside the grid; None: they add no weight (``edge`` in the file)."""
     zone_names: tuple[str, ...]
     """Of the zones of land; empty where all cells are alike."""
     zone_colors: tuple[Color, ...]
@@ -186,7 +188,7 @@ class Model(Description):
 
     @property
     def kernel(self) -> NDArray[np.float64]:
-        """The first: that of all cells, unless there are zones or it `sees_own_state`."""
+        """The first kernel: the only one, unless the model has zones or `sees_own_state`."""
         return self.kernels[0]
 
     @property

@@ -1,0 +1,74 @@
+//! Transition weights, and the kernels that a prediction reads: positive weights only, grouped by neighbours.
+
+use emberwatch_model::{Grid, Model};
+use ndarray::Array4;
+
+/// Transition weights of eq. 2, of a model or learned.
+#[derive(Debug, Clone, Copy)]
+pub struct Weights<'a> {
+    /// Kernels `w[m, n, a, c]`, shape `[S, S, KH, KW]`. Each zone has one kernel, or one per own state of the cell.
+    pub kernels: &'a [Array4<f64>],
+    /// Bias `b[m]` of each next state.
+    pub bias: &'a [f64],
+    /// The zone of each cell, shape `[H, W]`, and the number of zones.
+    pub zones: (Option<&'a Grid<u8>>, usize),
+    /// The state of all cells outside the grid. With `None`, they add no weight.
+    pub edge: Option<usize>,
+}
+
+impl<'a> From<&'a Model> for Weights<'a> {
+    fn from(model: &'a Model) -> Self {
+        Self {
+            kernels: model.kernels(),
+            bias: model.bias().as_slice().expect("invariant: row-major"),
+            zones: (model.zone_map().map(|map| &**map), model.n_zones()),
+            edge: model.edge(),
+        }
+    }
+}
+
+/// The weights of one own state that depend on the neighbours' states.
+///
+/// Weights are stored in *slots*, because zones can differ in them: see `Layout::slots`.
+#[derive(Debug, Clone)]
+pub struct OwnKernel {
+    /// The own state. `None`: the kernel applies to all own states.
+    pub own_state: Option<usize>,
+    /// The possible next states.
+    pub next_states: Vec<usize>,
+    /// The slot of each next state's weight without neighbours. It includes the centre of an own-state kernel.
+    pub bias_slots: Vec<usize>,
+    pub groups: Vec<Group>,
+    /// The slots of the distinct totals `d` that a neighbour's weights can have.
+    pub total_slots: Vec<usize>,
+    /// Whether the total `d` of some neighbour depends on its state.
+    pub totals_differ: bool,
+    /// Sum over neighbours of how much their state can change each weight, as a share of the mean total `D`.
+    pub influence: f64,
+}
+
+/// Neighbours with equal weights.
+#[derive(Debug, Clone)]
+pub struct Group {
+    /// Indices in `Layout::taps`.
+    pub neighbours: Vec<usize>,
+    pub sources: Vec<Source>,
+}
+
+/// A state of a group's neighbours with a positive weight.
+#[derive(Debug, Clone)]
+pub struct Source {
+    pub state: usize,
+    /// The total `d` of its weights, as an index in [`OwnKernel::total_slots`].
+    pub total: usize,
+    /// For each positive weight, the index in [`OwnKernel::next_states`] and the slot.
+    pub terms: Vec<(usize, usize)>,
+}
+
+/// The transition of an own state that no neighbour influences.
+#[derive(Debug, Clone)]
+pub struct FixedTransition {
+    pub own_state: usize,
+    /// The slot of each next state's probability, for all S states.
+    pub probability_slots: Vec<usize>,
+}

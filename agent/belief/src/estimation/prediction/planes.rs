@@ -1,0 +1,58 @@
+//! Planes with margins around a grid, so that every neighbour of a cell can be read.
+
+use super::lanes::LANES;
+use emberwatch_model::Shape;
+
+/// The position of a grid's cells in a plane: rows with a margin on each side, row-major.
+#[derive(Debug, Clone, Copy)]
+pub struct Planes {
+    shape: Shape,
+    /// Rows above and below the grid, columns to the left and right of it.
+    margin: [usize; 2],
+    stride: usize,
+    /// Number of cells of a plane, with margins.
+    pub length: usize,
+}
+
+impl Planes {
+    /// Lays out planes with margins of half a kernel.
+    pub fn new(shape: Shape, kernel: [usize; 2]) -> Self {
+        let margin = kernel.map(|side| side / 2);
+        let stride = shape.width().next_multiple_of(LANES) + 2 * margin[1];
+        Self {
+            shape,
+            margin,
+            stride,
+            length: (shape.height() + 2 * margin[0]) * stride,
+        }
+    }
+
+    /// Returns the index of a cell in its plane.
+    pub fn place(&self, [row, col]: [usize; 2]) -> usize {
+        (row + self.margin[0]) * self.stride + col + self.margin[1]
+    }
+
+    /// Returns the distance from a cell to its neighbour at a tap of the kernel.
+    pub fn offset(&self, [row, col]: [usize; 2]) -> isize {
+        (row * self.stride + col) as isize - self.place([0, 0]) as isize
+    }
+
+    /// Copies a belief, shape `[S, H, W]`, into the planes of its S states. Margins keep their values.
+    pub fn put(&self, belief: &[f32], planes: &mut [f32]) {
+        let width = self.shape.width();
+        let states = belief.chunks_exact(self.shape.n_cells());
+        for (cells, plane) in states.zip(planes.chunks_exact_mut(self.length)) {
+            for (row, cells) in cells.chunks_exact(width).enumerate() {
+                plane[self.place([row, 0])..][..width].copy_from_slice(cells);
+            }
+        }
+    }
+
+    /// Returns the grid's rows of a plane, without margins.
+    pub fn rows<'a>(&self, plane: &'a [f32]) -> impl Iterator<Item = &'a [f32]> + use<'a> {
+        let Self { shape, .. } = *self;
+        let rows = plane[self.place([0, 0])..].chunks(self.stride);
+        rows.take(shape.height())
+            .map(move |row| &row[..shape.width()])
+    }
+}

@@ -1,0 +1,112 @@
+use super::*;
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_network::{Device, Lesson};
+
+fn estimator() -> NeuralEstimator {
+    let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+    NeuralEstimator::new(&network, None, shape()).expect("a belief")
+}
+
+fn shape() -> Shape {
+    Shape::new(2, 3).expect("test shape")
+}
+
+fn frame(values: &[u8]) -> Frame {
+    Frame::from_bytes(shape(), 3, values).expect("test frame")
+}
+
+#[test]
+fn visited_cells_are_certain_until_the_next_step() {
+    let mut estimator = estimator();
+    let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
+    assert!(
+        value(&estimator, 1)
+            .iter()
+            .all(|p| (p - 1.0 / 3.0).abs() < 1e-6)
+    );
+    let seen = frame(&[255, 2, 255, 255, 255, 255]);
+    estimator.correct(&seen).expect("possible");
+    assert_eq!(value(&estimator, 1), [0.0, 0.0, 1.0]);
+    assert!((value(&estimator, 0)[2] - 1.0 / 3.0).abs() < 1e-6);
+    estimator.predict();
+    assert!(
+        (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
+        "nothing is learned"
+    );
+}
+
+#[test]
+fn with_a_sensor_an_unlearned_network_is_the_filter() {
+    let model = emberwatch_model::Model::wildfire();
+    let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
+    let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
+    let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
+        .expect("a belief")
+        .with_sensor(model.likelihood().clone())
+        .expect("an inverse");
+    let mut expected = filter();
+    for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
+        own.correct(&frame(&values)).expect("possible");
+        expected.correct(&frame(&values)).expect("possible");
+        let off = (&own.belief().view() - &expected.belief().view()).mapv(f32::abs);
+        assert!(off.iter().all(|off| *off < 1e-4), "{off}");
+        own.predict();
+        expected.predict();
+    }
+}
+
+#[test]
+fn many_of_several_networks_predict_together_as_each_alone() {
+    let networks = [1, 2].map(|seed| {
+        let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
+        let lesson = Lesson {
+            before: Sightings::new(shape()),
+            frame: vec![(0, 1), (4, 2)],
+            base: Vec::new(),
+        };
+        let updates = (0..3).map(|_| network.update(0.05, std::slice::from_ref(&lesson)));
+        assert!(updates.into_iter().all(|loss| loss.is_ok()));
+        network
+    });
+    let estimators = || -> Vec<Box<dyn Estimator>> {
+        let filter = || {
+            let model = emberwatch_model::Model::wildfire();
+            BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter")
+        };
+        let mut all: Vec<Box<dyn Estimator>> = vec![Box::new(filter())];
+        // Networks in turn, with a filter below and without.
+        for index in 0..8 {
+            let below = (index % 4 > 1).then(|| Box::new(filter()) as Box<dyn Estimator>);
+            let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
+            let mut estimator = estimator.expect("a belief");
+            let seen = [255, 255, index as u8 % 3, 255, 1, 255];
+            estimator.correct(&frame(&seen)).expect("possible");
+            all.push(Box::new(estimator));
+        }
+        all
+    };
+    let (mut together, mut alone) = (estimators(), estimators());
+    predict_together(together.iter_mut().map(|it| &mut **it).collect());
+    for (index, (together, alone)) in together.iter().zip(&mut alone).enumerate() {
+        let before = alone.belief().clone();
+        alone.predict();
+        assert!(together.belief() == alone.belief(), "{index}");
+        assert!(*alone.belief() != before, "{index}");
+    }
+}
+
+#[test]
+fn restored_bytes_are_the_same_belief() {
+    let (mut first, mut second) = (estimator(), estimator());
+    for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
+        first.correct(&frame(&values)).expect("possible");
+        first.predict();
+    }
+    let bytes = first.to_bytes();
+    assert!(!second.restore(&bytes[1..]) && second.sightings == Sightings::new(shape()));
+    assert!(second.restore(&bytes));
+    assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
+    let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
+    let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
+    assert_ne!(other.kind(), first.kind());
+}

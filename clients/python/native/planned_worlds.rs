@@ -1,0 +1,300 @@
+//! Worlds of one robot each with their beliefs and plans: updates them with frames, plans, and publishes beliefs.
+
+use crate::answer::RESULT_BYTES;
+use crate::threads::{Pool, Threads};
+use crate::wire::{Feed, View};
+use anyhow::{Context, Result, ensure};
+use emberwatch_belief::Belief;
+use emberwatch_belief::planning::OPTIONS;
+use emberwatch_belief::planning::options::N_FEATURES;
+use emberwatch_learning::beliefs::NEURAL;
+use emberwatch_learning::options::{Crew, Planned, Shown};
+use emberwatch_messages::agent_belief::Intent;
+use emberwatch_messages::instance::Instance;
+use emberwatch_messages::message::{RobotResult, WorldResult};
+use emberwatch_messages::payload::WORLD_BYTES;
+use emberwatch_model::Frame;
+use emberwatch_model::path::path_to_bytes;
+use numpy::ndarray::{Array3, ArrayView1, s};
+
+/// Beliefs and plans of many worlds.
+pub struct PlannedWorlds {
+    pub crew: Crew,
+    /// `None` before a world's first episode.
+    worlds: Vec<Option<Planned>>,
+    threads: Pool,
+    watched: Option<Watched>,
+}
+
+/// The channel on which beliefs are published to observers.
+pub struct Watched {
+    pub instance: Instance,
+    /// The number, in the instance, of the first world here.
+    pub first_world: u32,
+    /// Opened with the first frame.
+    pub feed: Option<Feed>,
+}
+
+/// What has been observed in some worlds, one row per world.
+#[derive(Clone, Copy)]
+pub struct Observed<'a> {
+    pub worlds: &'a [usize],
+    /// Bytes of `wire.RESULT_DTYPE`.
+    pub results: &'a [u8],
+    /// `[n, H, W]`; `None` if the beliefs include these frames already.
+    pub frames: Option<&'a [u8]>,
+    /// The option that brought each robot to its cell.
+    pub flown: Option<&'a [usize]>,
+}
+
+/// A row of [`Observed`].
+struct Row<'a> {
+    world: WorldResult,
+    robot: RobotResult,
+    frame: Option<&'a [u8]>,
+    flown: Option<usize>,
+}
+
+/// The observation of one world, and what to do with it.
+struct WorldWork<'a> {
+    index: usize,
+    planned: &'a mut Planned,
+    observed: Row<'a>,
+    plans: bool,
+    is_shown: bool,
+}
+
+/// The published state of a world: the belief after its frame.
+struct Outlook {
+    index: usize,
+    world: WorldResult,
+    belief: Belief,
+    intent: Intent,
+}
+
+impl PlannedWorlds {
+    pub fn new(crew: Crew, n_worlds: usize, watched: Option<Watched>) -> Self {
+        Self {
+            crew,
+            worlds: (0..n_worlds).map(|_| None).collect(),
+            threads: Pool::default(),
+            watched,
+        }
+    }
+
+    /// The world with this number, if an episode has begun there.
+    pub fn world(&mut self, world: usize) -> Option<&mut Planned> {
+        self.worlds.get_mut(world)?.as_mut()
+    }
+
+    /// Begins episodes, given as world and seed, with a first belief.
+    ///
+    /// # Errors
+    /// If a number is not of a world here, or a belief cannot be built.
+    pub fn begin(
+        &mut self,
+        seeds: impl Iterator<Item = (usize, u64)>,
+        prior: &Belief,
+    ) -> Result<()> {
+        let seeds: Vec<(usize, u64)> = seeds.collect();
+        let Self { crew, threads, .. } = self;
+        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
+        let n_worlds = seeds.len();
+        let begun = threads.work(is_short(crew, n_worlds), |threads| {
+            threads.each(seeds, begin)
+        });
+        for begun in begun {
+            let (world, planned) = begun?;
+            let n_worlds = self.worlds.len();
+            let place = self.worlds.get_mut(world);
+            *place.with_context(|| no_such_world(n_worlds, world))? = Some(planned);
+        }
+        Ok(())
+    }
+
+    /// Updates beliefs with frames, and plans all options if `plans`.
+    ///
+    /// # Errors
+    /// If the arrays differ in length, a number is not of a world here, or a belief refuses its frame.
+    pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
+        let n_cells = self.crew.shape().n_cells();
+        observed.check(n_cells)?;
+        let is_new = plans && observed.frames.is_some();
+        let shown = self.shown(observed.worlds.len() * usize::from(is_new));
+        let rows = self.rows(observed.worlds)?;
+        let Self {
+            crew,
+            threads,
+            worlds,
+            ..
+        } = self;
+        let tasks = worlds.iter_mut().zip(rows).enumerate();
+        let tasks = tasks.filter_map(|(index, (planned, row))| {
+            let (planned, row) = (planned.as_mut()?, row?);
+            Some(WorldWork {
+                index,
+                planned,
+                observed: observed.row(row, n_cells),
+                plans,
+                is_shown: shown.contains(&row),
+            })
+        });
+        let tasks: Vec<WorldWork<'_>> = tasks.collect();
+        let done = threads.work(is_short(crew, tasks.len()), |threads| {
+            work_on(crew, tasks, threads)
+        });
+        let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
+        self.show(outlooks.into_iter().flatten());
+        Ok(())
+    }
+
+    /// Returns each world's row among `worlds`, if it has one.
+    fn rows(&self, worlds: &[usize]) -> Result<Vec<Option<usize>>> {
+        let mut rows = vec![None; self.worlds.len()];
+        for (row, &world) in worlds.iter().enumerate() {
+            let place = rows.get_mut(world);
+            *place.with_context(|| no_such_world(self.worlds.len(), world))? = Some(row);
+        }
+        Ok(rows)
+    }
+
+    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of the last plans of all
+    /// worlds.
+    pub fn plans(&self) -> (Array3<f32>, Array3<u8>) {
+        let dim = (self.worlds.len(), OPTIONS.len());
+        let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
+        let mut paths = Array3::zeros((dim.0, dim.1, self.crew.n_moves()));
+        for (world, planned) in self.worlds.iter().enumerate() {
+            let proposals = planned.iter().flat_map(Planned::proposals);
+            for (option, proposal) in proposals.enumerate() {
+                let of_option = s![world, option, ..];
+                features
+                    .slice_mut(of_option)
+                    .assign(&ArrayView1::from(&proposal.features));
+                let moves = path_to_bytes(&proposal.plan.moves);
+                paths.slice_mut(of_option).assign(&ArrayView1::from(&moves));
+            }
+        }
+        (features, paths)
+    }
+
+    /// Selects the rows to publish now, among `n_worlds`. Opens the channel the first time.
+    fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
+        let begun = self.worlds.iter().flatten().next();
+        let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
+            return Vec::new();
+        };
+        let belief = || begun.agent().belief().probabilities();
+        let feed = watched
+            .feed
+            .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
+        if n_worlds == 0 {
+            Vec::new()
+        } else {
+            feed.due(n_worlds)
+        }
+    }
+
+    fn show(&mut self, outlooks: impl Iterator<Item = Outlook>) {
+        let Some(watched) = &mut self.watched else {
+            return;
+        };
+        for outlook in outlooks {
+            let world = watched.first_world + outlook.index as u32;
+            let view = View {
+                world,
+                robots: world..world + 1,
+                result: &outlook.world,
+                belief: outlook.belief.probabilities(),
+                intent: outlook.intent,
+            };
+            if let Some(feed) = &mut watched.feed {
+                feed.show(&view);
+            }
+        }
+    }
+}
+
+impl<'a> Observed<'a> {
+    fn check(&self, n_cells: usize) -> Result<()> {
+        let n_worlds = self.worlds.len();
+        ensure!(
+            self.results.len() == n_worlds * RESULT_BYTES
+                && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells)
+                && self.flown.is_none_or(|it| it.len() == n_worlds),
+            "options: expected a result, a frame and an option for each of {n_worlds} worlds, got others"
+        );
+        Ok(())
+    }
+
+    fn row(&self, row: usize, n_cells: usize) -> Row<'a> {
+        let result = &self.results[row * RESULT_BYTES..][..RESULT_BYTES];
+        let (world, robot) = result.split_at(WORLD_BYTES);
+        Row {
+            world: bytemuck::pod_read_unaligned(world),
+            robot: bytemuck::pod_read_unaligned(robot),
+            frame: self.frames.map(|it| &it[row * n_cells..][..n_cells]),
+            flown: self.flown.map(|it| it[row]),
+        }
+    }
+}
+
+/// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
+fn work_on(
+    crew: &Crew,
+    mut tasks: Vec<WorldWork<'_>>,
+    threads: Threads,
+) -> Vec<Result<Option<Outlook>>> {
+    let seen = threads.each(&mut tasks, |task| task.see(crew));
+    let fits = tasks
+        .into_iter()
+        .zip(&seen)
+        .filter(|(_, seen)| seen.is_ok());
+    let mut tasks: Vec<_> = fits.map(|(task, _)| task).collect();
+    let new = tasks
+        .iter_mut()
+        .filter(|task| task.observed.frame.is_some());
+    let new = new.map(|task| &mut *task.planned);
+    match threads {
+        Threads::Several => Planned::predict_all(new),
+        Threads::One => new.for_each(|planned| Planned::predict_all([planned])),
+    }
+    let planning = tasks.into_iter().filter(|task| task.plans);
+    threads.each(planning, |task| {
+        task.planned.plan(task.observed.robot.cell())
+    });
+    seen
+}
+
+impl WorldWork<'_> {
+    /// Corrects the belief with the frame, if there is one.
+    fn see(&mut self, crew: &Crew) -> Result<Option<Outlook>> {
+        let Some(frame) = self.observed.frame else {
+            return Ok(None);
+        };
+        let intent = self
+            .is_shown
+            .then(|| self.planned.intent(self.observed.flown));
+        let n_observations = crew.model().n_observations();
+        self.planned.see(&Shown {
+            frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
+            reward: (self.observed.world.step > 0).then_some(self.observed.robot.reward),
+        })?;
+        Ok(intent.map(|intent| Outlook {
+            index: self.index,
+            world: self.observed.world,
+            belief: self.planned.agent().belief().clone(),
+            intent,
+        }))
+    }
+}
+
+/// Whether the work is too short to share between threads: that on a single world. Networks start threads themselves,
+/// which must be the pool's.
+fn is_short(crew: &Crew, n_worlds: usize) -> bool {
+    n_worlds == 1 && *crew.estimator() != NEURAL
+}
+
+fn no_such_world(n_worlds: usize, got: usize) -> String {
+    format!("options: expected a world below {n_worlds}, got {got}")
+}

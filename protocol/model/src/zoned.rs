@@ -1,0 +1,90 @@
+//! Numbers that differ between the zones of a land, laid out for loops over [`LANES`] cells of a row at once.
+
+use super::grid::Grid;
+use super::vectors::LANES;
+use std::collections::HashMap;
+
+/// Numbers that each cell has by its zone, such as the weights of its kernel.
+///
+/// A *chunk* is [`LANES`] consecutive cells of a row. Chunks are counted row by row; the last one of a row may be
+/// shorter. Chunks with the same zones share their numbers.
+#[derive(Debug, Clone)]
+pub struct ZonedNumbers<T> {
+    /// Count of numbers per cell.
+    n_numbers: usize,
+    /// For each chunk, the index of its pattern of zones. Empty if all chunks have the same pattern.
+    patterns: Vec<u32>,
+    /// For each pattern, each number of its cells.
+    lanes: Vec<[T; LANES]>,
+}
+
+impl<T: Copy> ZonedNumbers<T> {
+    /// Lays out `numbers`, each with one value per zone, for the cells of a grid.
+    ///
+    /// `zones` has the zone of each cell, shape `[H, W]`. Without it, all cells are in zone 0.
+    pub fn new(numbers: &[Vec<T>], zones: Option<&Grid<u8>>) -> Self {
+        let (mut patterns, mut distinct) = (Vec::new(), Vec::new());
+        let mut indices = HashMap::new();
+        let zones = zones.filter(|_| !numbers.is_empty());
+        for row in zones.iter().flat_map(|zones| zones.rows()) {
+            for cells in row.to_vec().chunks(LANES) {
+                let mut pattern = [0; LANES];
+                pattern[..cells.len()].copy_from_slice(cells);
+                let index = indices.entry(pattern).or_insert_with(|| {
+                    distinct.push(pattern);
+                    distinct.len() as u32 - 1
+                });
+                patterns.push(*index);
+            }
+        }
+        if distinct.is_empty() {
+            distinct.push([0; LANES]);
+        }
+        let lanes = distinct.iter().flat_map(|pattern| {
+            let lanes = |by_zone: &Vec<T>| pattern.map(|zone| by_zone[usize::from(zone)]);
+            numbers.iter().map(lanes)
+        });
+        Self {
+            n_numbers: numbers.len(),
+            lanes: lanes.collect(),
+            patterns,
+        }
+    }
+
+    /// Returns the numbers of a chunk's cells.
+    #[inline(always)]
+    pub fn of_chunk(&self, chunk: usize) -> &[[T; LANES]] {
+        let pattern = self
+            .patterns
+            .get(chunk)
+            .map_or(0, |&pattern| pattern as usize);
+        &self.lanes[pattern * self.n_numbers..][..self.n_numbers]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_have_the_numbers_of_their_cells_zones() {
+        let numbers = [vec![1, 2, 3], vec![4, 5, 6]];
+        let width = LANES + 2;
+        let zone = |(row, col): (usize, usize)| ((row + usize::from(col > LANES)) % 3) as u8;
+        let zoned = ZonedNumbers::new(&numbers, Some(&Grid::from_shape_fn((4, width), zone)));
+        for row in 0..4 {
+            for col in 0..width {
+                let chunk = zoned.of_chunk(2 * row + col / LANES);
+                let got: Vec<i32> = chunk.iter().map(|lanes| lanes[col % LANES]).collect();
+                let zone = usize::from(zone((row, col)));
+                assert_eq!(got, [numbers[0][zone], numbers[1][zone]], "({row}, {col})");
+            }
+        }
+        assert_eq!(zoned.of_chunk(0), zoned.of_chunk(6), "rows 0 and 3");
+        assert_eq!(zoned.lanes.len(), 2 * 6, "patterns are shared");
+        let alike = ZonedNumbers::new(&numbers, None);
+        assert_eq!(alike.of_chunk(5), [[1; LANES], [4; LANES]]);
+        let none = ZonedNumbers::<f32>::new(&[], Some(&Grid::zeros((2, 2))));
+        assert!(none.of_chunk(1).is_empty());
+    }
+}
