@@ -5,7 +5,6 @@ import signal
 import threading
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from processes import LONG, asleep, eventually, script, server
 from emberwatch import _native, errors
 from emberwatch.belief import Transition, initial_prior
 from emberwatch.belief.prior import simulated_prior
-from emberwatch.client import recording
 from emberwatch.model import Model
 from emberwatch.planning import beam_search
 
@@ -67,13 +65,6 @@ def test_a_grid_that_is_too_large_is_refused() -> None:
 def test_ctrl_c_ends_the_search_in_one_world() -> None:
     code, _, error = script(WIDE).end()
     assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
-
-
-def test_what_is_no_regular_file_is_no_recording(tmp_path: Path) -> None:
-    os.mkfifo(fifo := tmp_path / "fifo")
-    for path in (fifo, tmp_path):
-        with fails("recording", match=f"expected a regular file, got {path}"):
-            next(recording.read(path))
 
 
 def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
