@@ -219,21 +219,6 @@ def test_a_radius_may_be_given_beside_a_model() -> None:
     assert embedded.info.airspace == Airspace(radius=3) and embedded.info.zones is None
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"sensor_radius": 9}, "sensor_radius: .* got 9"),
-        ({"sensor_radius": -1}, "sensor_radius: .* got -1"),
-        ({"sensor_radius": 1.5}, "sensor_radius: .* got 1.5"),
-        ({"sensor_radius": "1"}, "sensor_radius: .* got '1'"),
-    ],
-    ids=str,
-)
-def test_a_wrong_radius_is_named(wrong: dict[str, Any], message: str) -> None:
-    with refuses(message):
-        make(**wrong)
-
-
 def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
     with refuses("sensor_radius"):
         gymnasium.make(WILDFIRE, task="small", sensor_radius=1)

@@ -48,14 +48,6 @@ def env() -> Any:
     return make()
 
 
-@pytest.fixture(params=[make, make_vec])
-def any_env(request: pytest.FixtureRequest) -> Any:
-    """One of one world, and one of many."""
-    made = request.param()
-    made.reset(seed=1000)
-    return made
-
-
 def interrupted(*_: object) -> None:
     raise KeyboardInterrupt
 
@@ -367,13 +359,6 @@ def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> 
             for one in ({}, {"reveal_model": False})
         ]
         assert_same(*seen)
-
-
-@pytest.mark.parametrize("action", [8, [0, 1, 8], "fire"])
-def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: object) -> None:
-    with refuses("action: expected"):
-        any_env.step(action)
-    assert np.all(decide(any_env) == 1)
 
 
 @pytest.mark.parametrize(
