@@ -335,10 +335,8 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     *(({"name": MOVES, "observation": it}, "observation: expected") for it in (None, 3, ["a", 0])),
     ({"name": MOVES, "observation": ["move", "move"]}, "observation"),
     ({"name": MOVES, "n_moves": 0}, "^n_moves: expected 1 to 4096, got 0$"),
-    *(
-        ({"name": MOVES, "window": it}, "window: expected an odd number, 3 to 255")
-        for it in (0, 4, -3, 2.5, "5")
-    ),
+    *(({"name": MOVES, "window": it}, "window: expected an odd number, 3 to 255") for it in (0, 4,
+        -3, 2.5, "5")),
 ]  # fmt: skip
 
 #: The same of `make_vec`.
