@@ -56,21 +56,6 @@ def score(path: Path | None = None, name: str = "mine", **changes: Any) -> list[
     return evaluate(walk(0), name=name, csv=path, **keywords)
 
 
-def test_random_moves_score_as_a_random_walk(tmp_path: Path) -> None:
-    rows = score(tmp_path / "mine.csv", seeds=range(1000, 1040), steps=60)
-    flags = ["--policies=random_walk", f"--csv={tmp_path / 'theirs.csv'}"]
-    done = compare(*flags, *private(), seeds="1000..1040", steps=60)
-    assert done.returncode == 0, done.stderr
-    theirs = read(tmp_path / "theirs.csv")
-    assert [row.mean_fire_cells for row in rows] == [row.mean_fire_cells for row in theirs]
-    for value in ("mean_reward", "mean_distinct_cells", "hit_rate"):
-        difference = np.array(
-            [getattr(a, value) - getattr(b, value) for a, b in zip(rows, theirs, strict=True)]
-        )
-        error = difference.std(ddof=1) / len(difference) ** 0.5
-        assert error > 0 and abs(difference.mean()) < 4 * error, value
-
-
 @pytest.fixture
 def states(tmp_path: Path) -> Path:
     """Recorded worlds of 12 and 15 steps, in which the second of three states pays most."""

@@ -1,6 +1,6 @@
 """Models of Stable-Baselines3 score in `evaluate` what they score in their own evaluation."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +34,6 @@ N_MOVES, N_STEPS, N_WORLDS, FIRST = 4, 10, 4, 1000
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 1, "learning_rate": 3e-3, "device": "cpu"}
 
 Wrap = Callable[[Any], Any]
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """More would wait for each other in networks as small as these."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """All robots of a world through PettingZoo, and each of them in an environment of its own."""
 
-import hashlib
-import json
 import sys
 import threading
 import warnings
@@ -22,11 +20,10 @@ from environments import (
 )
 from failures import refuses
 from pettingzoo.utils.conversions import parallel_to_aec
-from processes import at_once, script
+from processes import at_once
 
 import emberwatch
 from emberwatch.envs.parallel import WildfireParallelEnv
-from emberwatch.errors import EmberwatchError
 
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
@@ -216,57 +213,6 @@ def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], rew
                 assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
 
 
-FLY = """
-import hashlib, json, sys
-import gymnasium, emberwatch
-robot, paths = int(sys.argv[2]), json.loads(sys.argv[3])
-env = gymnasium.make("emberwatch/Wildfire-v0", instance=sys.argv[1], robot=robot, timeout=20.0)
-env.reset()
-print("holds its robot", flush=True)
-input()
-for path in paths:
-    seen, reward, *_ , info = env.step(path)
-    told = [seen["frame"].tobytes(), seen["robot"].tolist(), reward, info]
-    print(hashlib.sha256(repr(told).encode()).hexdigest(), flush=True)
-env.close()
-"""
-
-
-def test_four_processes_are_the_team() -> None:
-    paths = random_actions(20, 4, (4,))
-    with serving(robots=4) as instance:
-        env = team(instance=instance, action="path", observation=("frame", "robot"))
-        expected = rollout(env, paths, 5)[1:]
-        env.reset(seed=5)
-        env.close()
-        given = [[path[agent].tolist() for path in paths] for agent in AGENTS]
-        flyers = [script(FLY, instance, robot, json.dumps(given[robot])) for robot in (2, 0, 3, 1)]
-        for flyer in flyers:
-            assert flyer.line() == "holds its robot"
-        for flyer in flyers:
-            flyer.say()
-        for robot, flyer in zip((2, 0, 3, 1), flyers, strict=True):
-            for seen, rewards, _, _, infos in expected:
-                agent = AGENTS[robot]
-                frame, cell = seen[agent]["frame"].tobytes(), seen[agent]["robot"].tolist()
-                told = [frame, cell, rewards[agent], infos[agent] | {"n_missed": 0}]
-                assert flyer.line() == hashlib.sha256(repr(told).encode()).hexdigest()
-
-
-def test_robots_that_nobody_holds_hover() -> None:
-    with serving(robots=3) as instance:
-        one = alone(instance, 1, observation=("frame", "robot", "others", "team"))
-        seen, _ = one.reset(seed=3)
-        before = seen["others"].copy()
-        for _ in range(3):
-            seen, _, _, _, info = one.step([1, 1, 3, 3])
-            assert info["n_missed"] == 0
-            assert (seen["others"] == before).all() and before.sum() == 2 * 255
-            assert (seen["team"] == seen["frame"]).all()
-        other = alone(instance, 2)
-        assert other.reset()[1] == info | {"n_visited": 0}
-
-
 def test_a_late_path_is_not_flown_and_told() -> None:
     with serving(robots=2, deadline_ms=50) as instance:
         quick, slow = alone(instance, 0), alone(instance, 1, observation=PARTS)
@@ -312,21 +258,6 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCapt
         assert first[4]["n_missed"] == second[4]["n_missed"] == 0
         assert first[4]["n_visited"] > 0 and second[4]["n_visited"] > 0
         assert "world 0 waits for the paths of other robots that are held" in caplog.text
-
-
-def test_a_robot_is_taken_over_where_it_stands() -> None:
-    with serving(robots=2) as instance:
-        first = alone(instance, 1)
-        first.reset()
-        seen = first.step([0, 0, 2, 2])[0]
-        with pytest.raises(EmberwatchError, match="busy"):
-            alone(instance, 1).reset()
-        second = alone(instance, 1, takeover=True)
-        again, info = second.reset()
-        assert info["step"] == 1
-        assert_same(again["robot"], seen["robot"])
-        with pytest.raises(emberwatch.errors.LeaseLostError):
-            first.step([0, 0, 0, 0])
 
 
 @pytest.mark.parametrize(
