@@ -254,16 +254,6 @@ def stopped(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def connects(server: Server) -> bool:
-    """Opens one more connection, if there is a place for it."""
-    try:
-        server.connect()
-    except EmberwatchError as error:
-        assert error.code == "channel"
-        return False
-    return True
-
-
 def is_running(pid: int) -> bool:
     """Whether any thread of a process runs; one that nobody has waited for yet has ended."""
     try:

@@ -361,9 +361,8 @@ def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> 
         assert_same(*seen)
 
 
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
+def test_a_wrong_keyword_is_refused() -> None:
+    for keywords, words in (
         ({"estimator": "truth"}, 'estimator: expected one of known_model, .*, got "truth"'),
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
         ({"estimator": 3}, "estimator: expected the name of one, got 3"),
@@ -371,12 +370,10 @@ def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> 
         ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
         ({"estimator": "neural_belief"}, "checkpoint.*of `train --learner neural`"),
-    ],
-)
-@pytest.mark.parametrize("maker", [make, make_vec])
-def test_a_wrong_keyword_is_refused(maker: Any, keywords: dict[str, Any], words: str) -> None:
-    with refuses(words):
-        maker(**keywords)
+    ):
+        for maker in (make, make_vec):
+            with refuses(words):
+                maker(**keywords)
 
 
 def test_beliefs_start_from_the_programs_prior() -> None:

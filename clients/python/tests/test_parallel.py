@@ -3,6 +3,7 @@
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -152,9 +153,8 @@ def test_a_team_is_drawn_as_a_whole() -> None:
     assert (env.render() != before).any()
 
 
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
+def test_impossible_teams_are_named() -> None:
+    rows: list[tuple[dict[str, Any], str]] = [
         ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
         ({"robots": 0}, "robots: expected at least 1, got 0"),
         ({"robots": 65}, "robots: expected 1 to 64, got 65"),
@@ -162,11 +162,10 @@ def test_a_team_is_drawn_as_a_whole() -> None:
         ({"reward": "all"}, "reward: expected one of 'share', 'team', 'marginal', 'move'"),
         ({"action": "path", "reward": "move"}, "reward: expected one of 'share', 'team', 'marg"),
         ({"observation": "age of fire"}, "observation: expected one or several of"),
-    ],
-)
-def test_impossible_teams_are_named(keywords: dict[str, Any], words: str) -> None:
-    with refuses(words):
-        team(**keywords)
+    ]
+    for keywords, words in rows:
+        with refuses(words):
+            team(**keywords)
 
 
 def test_actions_of_other_agents_are_refused() -> None:
@@ -191,8 +190,7 @@ def alone(instance: str, robot: int, **keywords: Any) -> Any:
     return make(instance=instance, robot=robot, **keywords)
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
-@pytest.mark.parametrize("reward", ["share", "team", "marginal"])
+@pytest.mark.parametrize(("order", "reward"), [((0, 1, 2, 3), "share"), ((3, 1, 0, 2), "marginal")])
 def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], reward: str) -> None:
     paths = random_actions(6, 4, (4,))
     with serving(robots=4) as instance:
@@ -260,40 +258,27 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCapt
         assert "world 0 waits for the paths of other robots that are held" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
-        ({}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
-        ({"robot": 3}, "robot: expected 0 to 2, got 3"),
-        ({"robot": -1}, "robot: expected 0 to 2, got -1"),
-        ({"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
-        ({"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
-    ],
-)
-def test_a_robot_that_is_not_there_is_named(keywords: dict[str, Any], words: str) -> None:
-    with serving(robots=3) as instance, refuses(words):
-        make(instance=instance, **keywords)
-
-
-def test_own_worlds_and_vectors_have_no_single_robot() -> None:
-    with refuses("robots: expected one robot in a world, got 2"):
-        make(robots=2)
+def test_keywords_that_fit_no_team_of_a_server_are_named() -> None:
+    of_one = "expected worlds of one robot, as options are planned for one"
+    with serving(robots=3) as instance:
+        rows: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+            (make, {}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
+            (make, {"robot": 3}, "robot: expected 0 to 2, got 3"),
+            (make, {"robot": -1}, "robot: expected 0 to 2, got -1"),
+            (make, {"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
+            (make, {"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
+            (partial(make_vec, 3), {"robot": 0}, "robot: expected None, as a vector"),
+            (partial(make, OBJECTIVE), {"robot": 0}, of_one),
+            (partial(make_vec, 3, OBJECTIVE), {}, of_one),
+        ]
+        for maker, keywords, words in rows:
+            with refuses(words):
+                maker(instance=instance, **keywords)
+    for maker in (make, partial(make, OBJECTIVE)):
+        with refuses("robots: expected one robot in a world, got 2"):
+            maker(robots=2)
     with refuses("a multiple of 2, got 3"):
         make_vec(3, robots=2)
-    with serving(robots=2) as instance:
-        with refuses("robot: expected None, as a vector"):
-            make_vec(2, instance=instance, robot=0)
-
-
-def test_options_are_for_worlds_of_one_robot() -> None:
-    words = "expected worlds of one robot, as options are planned for one"
-    with refuses("robots: expected one robot in a world, got 2"):
-        make(OBJECTIVE, robots=2)
-    with serving(robots=2) as instance:
-        with refuses(words):
-            make(OBJECTIVE, instance=instance, robot=0)
-        with refuses(words):
-            make_vec(2, OBJECTIVE, instance=instance)
 
 
 def test_rows_of_a_world_are_reset_together() -> None:

@@ -19,7 +19,7 @@ from environments import (
     no_warnings,
     serving,
 )
-from failures import fails, refuses
+from failures import refuses
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import emberwatch
@@ -280,18 +280,6 @@ def _spoil(value: Any) -> None:
 # Keywords and the registry
 
 
-def test_worlds_that_a_server_does_not_have_are_named() -> None:
-    with serving(worlds=3) as instance:
-        with refuses("expected worlds within 0 to 2, got 1 to 3"):
-            make_vec(3, instance=instance, world=1)
-        one, other = make_vec(2, instance=instance), make_vec(2, instance=instance, world=1)
-        one.reset(seed=1)
-        with fails("busy", match=f"pid {os.getpid()}"):
-            other.reset(seed=1)
-        one.close()
-        other.reset(seed=1)
-
-
 def test_the_registry_sets_spec_and_metadata() -> None:
     with no_warnings():
         env = make_vec(3)
@@ -324,24 +312,6 @@ def test_gymnasiums_own_vectorizers_work(mode: str) -> None:
     ours = make_vec(2)
     theirs = make_vec(2, vectorization_mode=mode)
     assert_same_flight(ours, theirs, 3, seed=2)
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_statistics_are_those_of_single_environments(mode: AutoresetMode) -> None:
-    ours, theirs = pair(2, mode, max_episode_steps=4)
-    with no_warnings():
-        ours = gymnasium.wrappers.vector.RecordEpisodeStatistics(ours)
-        theirs = gymnasium.wrappers.vector.RecordEpisodeStatistics(theirs)
-    ours.reset(seed=1)
-    theirs.reset(seed=1)
-    n_ends = 0
-    for action in actions(theirs, 11):
-        left, right = ours.step(action)[4], theirs.step(action)[4]
-        if "episode" in right:
-            n_ends += 1
-            for key in ("r", "l"):
-                assert_same(left["episode"][key], right["episode"][key])
-    assert n_ends == 2
 
 
 def test_vector_wrappers_work() -> None:
