@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import os
-import pickle
 import re
 import subprocess
 import warnings
@@ -258,14 +257,6 @@ def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
     assert_same(found, seen)
 
 
-def test_a_copy_plans_by_itself() -> None:
-    env = make()
-    expected = rollout(env, 3, seed=1000)
-    env.close()
-    copied = pickle.loads(pickle.dumps(env))
-    assert_same(rollout(closed_later(copied), 3, seed=1000), expected)
-
-
 def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
     keywords = believing("neural_belief", checkpoints)
     envs = make_vec(2, **keywords)
@@ -314,12 +305,6 @@ def test_exploiting_makes_the_steps_of_a_policy_that_does(belief: str, estimator
         answers = [client.recall(step) for step in range(6)]
         found.append([(answer.results.tolist(), answer.frames.tolist()) for answer in answers])
     assert_same(*found)
-
-
-def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:
-    first, again, other = (rollout(one, 6, seed=1003) for one in (env, env, make()))
-    assert_same(first, again)
-    assert_same(first, other)
 
 
 def test_the_world_is_that_of_wildfire_with_the_same_seed() -> None:

@@ -112,7 +112,7 @@ def test_a_belief_needs_a_model() -> None:
                 make(MOVES, instance=instance, observation=part)
 
 
-@pytest.mark.parametrize("cells", [12, 16, 23, 32])
+@pytest.mark.parametrize("cells", [12, 32])
 def test_fires_live_on_in_small_worlds(cells: int) -> None:
     keywords = {**SMALL, "height": cells, "width": cells, "n_moves": 1, "burn_in": 1000}
     worlds = gymnasium.make_vec(WILDFIRE, num_envs=50, max_episode_steps=-1, truth=True, **keywords)

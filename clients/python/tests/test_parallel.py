@@ -39,8 +39,9 @@ def team(**keywords: Any) -> WildfireParallelEnv:
     return emberwatch.parallel_env(**{**SMALL, "robots": 4, **keywords})
 
 
-@pytest.mark.parametrize("observation", ["local", "image", "team", "others"])
-@pytest.mark.parametrize("robots", [2, 3])
+@pytest.mark.parametrize(
+    ("robots", "observation"), [(2, "local"), (3, "image"), (2, "team"), (3, "others")]
+)
 def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
     with no_warnings():
         parallel_api_test(team(robots=robots, observation=observation), num_cycles=100)

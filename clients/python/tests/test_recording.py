@@ -78,6 +78,7 @@ def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
     assert (late.result.start, flew.result.cell) == ((1, 1), (2, 4))
     assert hidden.sample.step == 7 and not hidden.sample.states.any()
     flew.frame[:] = 1  # your own to write to
+    assert list(recording.read(path, world=1)) == []
 
 
 def test_a_cut_recording_is_read_to_its_last_whole_record(path: Path) -> None:
