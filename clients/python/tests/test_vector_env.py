@@ -157,17 +157,14 @@ def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: s
         assert holders == [(None,), (None,), (pid,), (pid,), (pid,)]
 
 
-@pytest.mark.parametrize(
-    "seed", [0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)], ids=lambda seed: repr(seed)
-)
-def test_seeds_are_those_of_single_environments(seed: Any) -> None:
+def test_seeds_are_those_of_single_environments() -> None:
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, truth=True)
-    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
-    plain = int(seed) if isinstance(seed, np.integer) else seed
-    assert_same(ours.reset(seed=seed), theirs.reset(seed=plain))
-    # The generators go on alike.
-    for _ in range(2):
-        assert_same(ours.reset(), theirs.reset())
+    for seed in (0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)):
+        plain = int(seed) if isinstance(seed, np.integer) else seed
+        assert_same(ours.reset(seed=seed), theirs.reset(seed=plain), repr(seed))
+        # The generators go on alike.
+        for _ in range(2):
+            assert_same(ours.reset(), theirs.reset(), repr(seed))
 
 
 # reset
@@ -307,10 +304,9 @@ def test_the_registrys_time_limit_holds_unless_another_is_given() -> None:
     assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_gymnasiums_own_vectorizers_work(mode: str) -> None:
+def test_gymnasiums_own_vectorizer_works() -> None:
     ours = make_vec(2)
-    theirs = make_vec(2, vectorization_mode=mode)
+    theirs = make_vec(2, vectorization_mode="async")
     assert_same_flight(ours, theirs, 3, seed=2)
 
 
