@@ -254,7 +254,7 @@ def test_what_cannot_be_evaluated_is_named() -> None:
 
 
 @pytest.mark.parametrize("flags", [{}, {"publish_truth": True, "reveal_model": False}], ids=str)
-def test_without_hidden_states_or_their_names_the_other_figures_are_there(
+def test_without_hidden_states_the_other_figures_are_there(
     tmp_path: Path, flags: dict[str, bool]
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}

@@ -90,7 +90,7 @@ def test_rows_of_the_agent_and_of_python_share_a_folder(tmp_path: Path) -> None:
     assert {row.policy for row in read(file)} == {*theirs, "mine"}
 
 
-def test_another_policy_of_the_same_name_is_refused_while_it_is_written(tmp_path: Path) -> None:
+def test_rows_of_another_policy_of_the_name_are_refused_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     first, second = opened(path), opened(path, mark=MARK._replace(policy_fingerprint="ef" * 8))
     first.add([row("mine", 0)])
@@ -130,7 +130,7 @@ def test_a_file_that_another_process_holds_is_named(
     opened(path)
 
 
-def test_a_file_that_was_replaced_while_its_lock_was_awaited_is_read_again(tmp_path: Path) -> None:
+def test_a_file_that_was_replaced_meanwhile_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     mine = opened(path)
     path.touch()

@@ -141,7 +141,7 @@ def test_own_rows_of_an_older_release_are_refused(file: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [{"burn_in": 61}, {"width": 8}], ids=str)
-def test_other_rows_of_an_older_release_stay_if_their_worlds_burn_alike(
+def test_rows_of_an_older_release_stay_if_worlds_burn_alike(
     file: Path, change: dict[str, Any]
 ) -> None:
     go(file)

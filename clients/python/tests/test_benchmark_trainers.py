@@ -195,7 +195,7 @@ def test_vec_normalize_without_statistics_is_refused(
         ours(model, world, observation=parts, wrap=VecMonitor)
 
 
-def test_normalized_and_stacked_frames_score_as_in_their_own_evaluation(
+def test_normalized_stacked_frames_score_as_in_their_evaluation(
     world: dict[str, Any], tmp_path: Path
 ) -> None:
     model = trained(

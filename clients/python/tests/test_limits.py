@@ -207,7 +207,7 @@ tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
 
 
 @on_x86
-def test_a_process_to_end_with_that_cannot_be_watched_is_not_called_ended() -> None:
+def test_a_process_that_cannot_be_watched_is_not_called_ended() -> None:
     code = "refuse(434, 1); os.execv(sys.argv[1], sys.argv[1:])"
     flags = [f"--instance={unused_instance()}", f"--exit-with={os.getpid()}"]
     ended = run(sys.executable, "-c", HEAD + code, find("emberwatch-server"), *flags)

@@ -210,7 +210,7 @@ def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Pat
         make(checkpoint=checkpoints / "damaged")
 
 
-def test_a_sensor_of_several_matrices_is_learned_for_without_its_model(tmp_path: Path) -> None:
+def test_a_sensor_of_several_matrices_is_learned_without_its_model(tmp_path: Path) -> None:
     world = {"model": ringed(tmp_path), "height": 7, "width": 5, "moves": 4, "burn_in": 50}
     checkpoint = trained(tmp_path, **world)
     shown = [server(reveal_model=reveals, **world) for reveals in (True, False)]
@@ -237,7 +237,7 @@ def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("maker", [make, make_vec])
-def test_after_a_step_that_did_not_finish_a_resume_has_the_belief_of_all_frames(
+def test_a_resume_after_an_unfinished_step_knows_all_frames(
     maker: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, other = (maker() for _ in range(2))

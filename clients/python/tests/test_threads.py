@@ -205,7 +205,7 @@ def test_a_forked_child_does_not_wait_for_a_thread_that_steps() -> None:
     thread.join()
 
 
-def test_ctrl_c_ends_the_wait_for_another_thread_and_leaves_the_environment_usable() -> None:
+def test_ctrl_c_ends_the_wait_for_another_thread() -> None:
     env, alone = make(), make()
     expected = rollout(alone, 3, seed=1000)
     env.reset(seed=1000)
