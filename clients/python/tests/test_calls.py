@@ -6,7 +6,7 @@ import threading
 
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, asleep, eventually, script, server
+from processes import LONG, PATIENCE, asleep, ctrl_c, eventually, script, server
 
 from emberwatch import errors
 from emberwatch.client.client import connect
@@ -144,17 +144,9 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
-
-    def interrupt() -> None:
-        asleep()
-        os.kill(US, signal.SIGINT)
-
     started.stop()
-    thread = threading.Thread(target=interrupt)
-    with pytest.raises(KeyboardInterrupt) as raised:
-        thread.start()
+    with ctrl_c() as raised:
         lease.step([3] * 6, timeout=LONG)
-    thread.join()
     started.wake_up()
     # `raised` still holds the traceback, as an `except` block does.
     before = client.observe().result().world.step

@@ -3,7 +3,6 @@
 import gc
 import os
 import subprocess
-import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from failures import fails, refuses
 from numpy.typing import NDArray
-from processes import find, server
+from processes import at_once, find, server
 
 import emberwatch
 from emberwatch.client.client import Client, connect
@@ -136,11 +135,7 @@ def test_threads_take_turns() -> None:
         for _ in range(50):
             steps.append(lease.step([3] * 6).result().world.step)
 
-    threads = [threading.Thread(target=fly) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(fly, fly, fly)
     assert sorted(steps) == list(range(1, 151))
 
 

@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
@@ -24,7 +23,7 @@ from environments import (
     small_server,
 )
 from failures import fails
-from processes import isolated, script
+from processes import asleep, isolated, script
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, LeaseLostError, ServerGoneError
@@ -241,7 +240,7 @@ def test_settings_of_a_pipe_are_not_waited_for_without_end(tmp_path: Path) -> No
         f"import emberwatch; print(1, flush=True); emberwatch.embed(model={str(fifo)!r})"
     )
     assert started.line() == "1"
-    threading.Event().wait(0.3)
+    asleep(started.pid)
     started.signal(signal.SIGINT)
     _, _, err = started.end()
     assert "KeyboardInterrupt" in err
@@ -295,7 +294,7 @@ print("closed", flush=True)
 def test_ctrl_c_ends_a_burn_in() -> None:
     started = script(INTERRUPTED)
     assert started.line() == "ready"
-    threading.Event().wait(0.3)
+    asleep(started.pid)
     started.signal(signal.SIGINT)
     code, out, err = started.end()
     assert (code, out.split()) == (0, ["interrupted", "closed", "closed"]), err

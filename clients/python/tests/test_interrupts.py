@@ -1,10 +1,7 @@
 """Ctrl-C, and signal handlers that raise, at every moment of a call of an environment."""
 
 import gc
-import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Generator
 from types import FrameType
 from typing import Any
@@ -25,7 +22,7 @@ from environments import (
     small_server,
 )
 from failures import fails
-from processes import at_once, eventually, server
+from processes import at_once, ctrl_c, eventually, server
 
 import emberwatch
 from emberwatch.wrappers import BeliefObservation
@@ -231,16 +228,8 @@ def test_a_reset_waits_for_the_one_that_was_interrupted(name: str, seed: int | N
     env = make(name, instance=started.instance)
     env.reset(seed=1)
     env.step(first := np.zeros(env.action_space.shape, int))
-
-    def interrupt() -> None:
-        assert eventually(lambda: started.status().worlds[0].resetting)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        thread.start()
+    with ctrl_c(lambda: eventually(lambda: started.status().worlds[0].resetting)):
         env.reset(seed=7)
-    thread.join()
     with impatient(env, 0.3):
         env.reset(seed=seed, options={"resume": True} if seed is None else None)
     assert started.status().worlds[0].seed == (seed or 7)
@@ -252,16 +241,8 @@ def test_a_path_that_waits_for_others_is_taken_back_by_ctrl_c() -> None:
     env = closed_later(emberwatch.WildfireEnv(instance=started.instance, robot=0))
     env.reset()
     mate = started.connect().acquire(1)
-
-    def interrupt() -> None:
-        assert eventually(lambda: started.status().worlds[0].n_paths == 1)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=interrupt)
-    with pytest.raises(KeyboardInterrupt) as kept:
-        thread.start()
+    with ctrl_c(lambda: eventually(lambda: started.status().worlds[0].n_paths == 1)) as kept:
         env.step([1] * 6)
-    thread.join()
     with fails("interrupted"):
         env.step([3] * 6)
     env.reset()

@@ -2,15 +2,13 @@
 
 import fcntl
 import os
-import signal
 import subprocess
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from failures import fails, refuses
-from processes import CHANNELS, PATIENCE, eventually, server, unused_instance
+from processes import CHANNELS, PATIENCE, ctrl_c, eventually, server, unused_instance
 
 from emberwatch import errors
 from emberwatch.client.client import connect
@@ -49,8 +47,7 @@ def test_a_wait_for_the_lock_ends_with_its_limit_or_ctrl_c() -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with fails("channel", match=f"the lock within .*, got it held by pid {US}"):
             connect(started.instance, timeout=0.01)
-        threading.Timer(0.2, lambda: os.kill(US, signal.SIGINT)).start()
-        with pytest.raises(KeyboardInterrupt):
+        with ctrl_c():
             connect(started.instance)
     started.connect().status()
 
