@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import WORLDS
 from environments import LIVELY
 from failures import refuses
 from processes import find, script
 
 from emberwatch.benchmark import Row, evaluate, read, row_file
 from emberwatch.benchmark.row_file import Kind, Mark, RowFile
-
-WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
 
 WRITER = """
 import sys, numpy as np

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import WORLDS
 from environments import LIVELY, MOVES, WILDFIRE
 from failures import refuses
 from numpy.typing import NDArray
 from processes import server
 
 from emberwatch.benchmark import Row, evaluate, read, suite
-
-WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
 
 TASK = """
 name = "lab"

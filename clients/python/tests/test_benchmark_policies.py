@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, WILDFIRE
+from benchmarks import WORLDS, wall
+from environments import MOVES, WILDFIRE
 from failures import refuses
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.benchmark import Row, evaluate
-from emberwatch.model import Model
 
-WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
 N_MOVES = 4
 
 
@@ -162,12 +161,7 @@ def test_what_is_no_action_is_named() -> None:
 
 @pytest.fixture
 def walled(tmp_path: Path) -> Path:
-    """A model with a wall in which there is one gap."""
-    wall = np.zeros((7, 9), int)
-    wall[:, 4], wall[3, 4] = 1, 0
-    path = tmp_path / "wall.toml"
-    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
-    return path
+    return wall(tmp_path)
 
 
 class Masked:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES
+from benchmarks import WORLDS, wall
+from environments import MOVES
 from failures import refuses
 
 pytest.importorskip("stable_baselines3")
@@ -25,7 +26,6 @@ from stable_baselines3.common.vec_env import (
 )
 
 from emberwatch.benchmark import evaluate
-from emberwatch.model import Model
 from emberwatch.sb3 import make_vec_env
 
 N_MOVES, N_STEPS, N_WORLDS, FIRST = 4, 10, 4, 1000
@@ -38,11 +38,7 @@ Wrap = Callable[[Any], Any]
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Worlds with a wall, so that masks matter."""
-    wall = np.zeros((7, 9), int)
-    wall[:, 4], wall[3, 4] = 1, 0
-    path = tmp_path_factory.mktemp("model") / "wall.toml"
-    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
-    return {"model": path, "height": 7, "width": 9, "n_moves": N_MOVES, "burn_in": 60}
+    return {**WORLDS, "model": wall(tmp_path_factory.mktemp("model"))}
 
 
 def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes: Any) -> Any:

@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import CRS
-from rasters import ARRIVAL, UTM, ascii_grid, geotiff, netcdf
+from rasters import ARRIVAL, EASTWARD, UTM, ascii_grid, geotiff, made, netcdf
 from test_landscape_netcdf import Variable, written
 
 from emberwatch.errors import InvalidArgumentError
@@ -114,12 +113,6 @@ def raster(path: Path, place: Map, direction: tuple[float, float]) -> Path:
     return file
 
 
-def made(folder: Path, *flags: object) -> dict[str, Any]:
-    out = folder / "out" / "land.toml"
-    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
-    return tomllib.loads(out.read_text("utf-8"))
-
-
 @pytest.mark.parametrize("direction", [(1, 0), (0.6, 0.8)])
 @pytest.mark.parametrize("case", SLOPES)
 def test_a_slope_of_10_degrees_is_one_in_every_unit_and_projection(
@@ -132,9 +125,6 @@ def test_a_slope_of_10_degrees_is_one_in_every_unit_and_projection(
     assert names
     for name in names:
         assert float(name.split()[0]) == pytest.approx(10, abs=0.2), name
-
-
-EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
 
 
 def notes(capsys: pytest.CaptureFixture[str]) -> str:
@@ -150,7 +140,7 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, *flags: object) ->
 
 def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assumed = "heights taken as metres, as nothing says their unit; --height-unit ft changes that"
-    model, dem = tmp_path / "out" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
+    model, dem = tmp_path / "new" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
     made(tmp_path, dem)
     assert assumed in notes(capsys) and f"# {assumed}" in model.read_text()
     for unit, words in (("ft", "international feet"), ("US survey foot", "US survey feet")):
