@@ -31,7 +31,8 @@ def test_a_server_that_is_started_later_is_waited_for(caplog: pytest.LogCaptureF
         started = server(instance)
         with waiting.result(2 * PATIENCE) as client:
             assert client.info.pid == started.program.pid
-    assert caplog.text.count("waiting up to 20 s") == 2  # this test and `server`
+    # Once in this test, and once in `server` if its program was slow.
+    assert caplog.text.count("waiting up to 20 s") in (1, 2)
     assert f"no server on instance {instance!r}" in caplog.text
 
 
