@@ -44,6 +44,18 @@ def test_a_recorded_world_passes_the_checker(states: Path) -> None:
         check_env(env.unwrapped, skip_render_check=True)
 
 
+def test_symmetries_and_offsets_are_those_asked_for(states: Path, sequences: list[States]) -> None:
+    def first_states(**keywords: Any) -> set[bytes]:
+        env: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3, truth=True, **keywords)
+        return {env.reset(seed=seed)[1]["truth"].tobytes() for seed in range(1, 33, 2)}
+
+    recorded = [it.tobytes() for it in sequences[1]]  # of odd seeds
+    assert first_states() == {recorded[0]}
+    assert first_states(states_offset=2) == {*recorded[:3]}
+    turned = first_states(states_symmetries=True)
+    assert len(turned) == 8 and recorded[0] in turned
+
+
 def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -> None:
     envs: Any = gymnasium.make_vec(WILDFIRE, num_envs=2, states=states, n_moves=3)
     envs.reset(seed=0)
