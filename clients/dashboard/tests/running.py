@@ -117,10 +117,15 @@ class Programs:
         settings = cheap | pace | settings
         return self._keep(Program(self._path("agent"), ["run", *flags(settings)]))
 
-    def record(self, instance: str, out: Path, *, steps: int) -> Program:
-        """A recorder of hidden states too, of so many steps."""
-        settings = {"instance": instance, "out": out, "steps": steps}
-        return self._keep(Program(self._path("server"), ["record", "--truth", *flags(settings)]))
+    def record(self, out: Path, *, steps: int, **settings: object) -> None:
+        """Records so many steps of a server, hidden states too if it publishes them."""
+        server = self.server(**settings)
+        eventually(lambda: self.is_serving(server.instance), "a server")
+        what = flags({"instance": server.instance, "out": out, "steps": steps})
+        recorder = self._keep(Program(self._path("server"), ["record", "--truth", *what]))
+        agent = self.agent(server.instance, steps_per_second=FAST)
+        assert recorder.wait() == 0
+        agent.interrupt()
 
     def dashboard(
         self,

@@ -44,32 +44,16 @@ def test_other_sites_are_refused(programs):
     def page(host: str) -> int:
         return answer(connect(dashboard), "/", Host=host).status
 
-    assert [page(own), page(f"localhost:{dashboard.port}"), page("fire.example")] == [200] * 3
-    assert [page("evil.example"), page(f"evil.example:{dashboard.port}")] == [403] * 2
+    assert [page(own), page("fire.example"), page("evil.example")] == [200, 200, 403]
 
     def socket(host: str, **origin: str) -> int:
         return handshake(connect(dashboard), "/socket", Host=host, **origin)
 
-    assert socket(own) == 101
-    for host, origin in [
-        (own, f"http://{own}"),
-        (own, f"https://{own}"),
-        ("fire.example", "https://fire.example"),
-        ("fire.example:443", "https://fire.example"),
-        ("FIRE.example", "https://fire.example"),
-        ("[::1]:443", "https://[::1]"),
-    ]:
-        assert socket(host, Origin=origin) == 101, (host, origin)
-    for host, origin in [
-        (own, "http://evil.example"),
-        (own, "null"),
-        (own, f"http://127.0.0.1:{dashboard.port + 1}"),
-        (own, f"https://127.0.0.1:{dashboard.port + 1}"),
-        ("fire.example", "https://evil.example"),
-        ("evil.example", "http://evil.example"),
-        ("evil.example", "https://evil.example"),
-    ]:
-        assert socket(host, Origin=origin) == 403, (host, origin)
+    assert [socket(own), socket(own, Origin=f"http://{own}")] == [101, 101]
+    assert socket("fire.example", Origin="https://fire.example") == 101
+    assert [socket(host, Origin="http://evil.example") for host in (own, "evil.example")] == [
+        403
+    ] * 2
 
 
 def test_the_page_says_what_it_may_load(programs):
@@ -92,8 +76,7 @@ def serious(look) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
+@pytest.mark.parametrize(("theme", "screen"), [("light", DESK), ("dark", PHONE)], ids=str)
 def test_axe_finds_nothing_serious(programs, open_page, theme, screen):
     server = programs.server(publish_truth=True)
     dashboard = programs.dashboard(server.instance)

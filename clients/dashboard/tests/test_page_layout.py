@@ -2,7 +2,7 @@
 
 import pytest
 
-from running import FAST, eventually
+from models import model_file
 from teams import write_recording
 
 SIZES = [
@@ -177,13 +177,8 @@ def test_with_an_agent(programs, open_page):
 
 
 def test_with_a_recording(programs, open_page, tmp_path):
-    server = programs.server(publish_truth=True)
-    eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "with-a-rather-long-name.recording"
-    recorder = programs.record(server.instance, file, steps=300)
-    agent = programs.agent(server.instance, steps_per_second=FAST)
-    assert recorder.wait() == 0
-    agent.interrupt()
+    programs.record(file, steps=300, publish_truth=True)
     look = open_page(programs.dashboard(recording=file))
     begin(look)
     look.at("speed").select_option("0")
@@ -219,22 +214,9 @@ def test_with_few_and_many_states(programs, open_page, tmp_path, n_states):
 
 def model_of(n_states: int) -> str:
     """A model file: states that stay what they are, each seen as it is."""
-    parts = ['name = "many"\nkernel_size = [1, 1]\n']
-    for state in range(n_states):
-        seen = [float(other == state) for other in range(n_states)]
-        parts.append(f"""
-            [[states]]
-            name = "state-{state}"
-            color = "#8080{16 * state:02x}"
-            initial = {1 / n_states}
-            reward = {float(state == 0)}
-            observed_as = {seen}
-            [[observations]]
-            name = "state-{state}"
-            color = "#8080{16 * state:02x}"
-            [[kernel]]
-            from = "state-{state}"
-            to = "state-{state}"
-            scale = 1.0
-            weights = [[1.0]]""")
-    return "\n".join(parts)
+    names = [f"state-{state}" for state in range(n_states)]
+    seen = [[float(other == state) for other in range(n_states)] for state in range(n_states)]
+    states = {
+        name: (1 / n_states, float(state == 0), seen[state]) for state, name in enumerate(names)
+    }
+    return model_file(states, names, [[1.0]], {(name, name): 1.0 for name in names})

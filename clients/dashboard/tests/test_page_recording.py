@@ -1,23 +1,11 @@
 """A recording: it plays, waits, goes fast, ends, and begins again."""
 
-import struct
-import zlib
-
-from running import FAST, eventually
-
-# Of a recording, and of each of its records (PROTOCOL.md).
-FILE_HEADER = struct.Struct("=8sII")
-RECORD_HEADER = struct.Struct("=QIIII")
+from teams import FILE_HEADER, RECORD_HEADER, sealed
 
 
 def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
-    server = programs.server(publish_truth=True)
-    eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "short.recording"
-    recorder = programs.record(server.instance, file, steps=500)
-    agent = programs.agent(server.instance, steps_per_second=FAST)
-    assert recorder.wait() == 0
-    agent.interrupt()
+    programs.record(file, steps=500, publish_truth=True)
     look = open_page(programs.dashboard(recording=file))
     look.eventually(lambda: look.picture(".source") == "recording", "a recording")
     look.at("speed").select_option("0")
@@ -59,13 +47,8 @@ def scrub_at_rest(look) -> None:
 
 
 def test_a_recording_that_begins_with_nothing_can_be_played_faster(programs, open_page, tmp_path):
-    server = programs.server()
-    eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "late.recording"
-    recorder = programs.record(server.instance, file, steps=20)
-    agent = programs.agent(server.instance, steps_per_second=FAST)
-    assert recorder.wait() == 0
-    agent.interrupt()
+    programs.record(file, steps=20)
     file.write_bytes(delayed(file.read_bytes(), nanos=3600 * 10**9))
     look = open_page(programs.dashboard(recording=file))
     look.eventually(lambda: look.picture(".player.playing") is True, "it plays")
@@ -81,9 +64,6 @@ def delayed(recording: bytes, *, nanos: int) -> bytes:
     while rest:
         time, kind, length, n_lost, _ = RECORD_HEADER.unpack_from(rest)
         body = rest[RECORD_HEADER.size : RECORD_HEADER.size + length]
-        time += nanos if len(parts) > 1 else 0
-        head = RECORD_HEADER.pack(time, kind, length, n_lost, 0)[:-4]
-        checksum = zlib.crc32(body, zlib.crc32(head))
-        parts.append(head + checksum.to_bytes(4, "little") + body)
+        parts.append(sealed(kind, body, time + nanos * (len(parts) > 1), n_lost))
         rest = rest[RECORD_HEADER.size + length :]
     return b"".join(parts)

@@ -42,7 +42,7 @@ def test_pause_scrub_and_live(watched, programs):
     look.wait_for_steps()
 
 
-def test_a_picture_drawn_late_does_not_hide_that_the_dashboard_is_gone(watched):
+def test_a_late_picture_does_not_hide_that_the_dashboard_is_gone(watched):
     look = watched.look
     look.allowed.append("WebSocket connection to .* failed")
     look.page.evaluate("""() => {

@@ -25,6 +25,9 @@ os.environ["PATH"] += os.pathsep + str(Path(sys.executable).parent)
 # Not the user's; here nothing can be kept.
 os.environ["XDG_CACHE_HOME"] = "/dev/null"
 
+# More threads would wait for each other in PyTorch's networks as small as those here.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 #: A whole test, seconds.
 DEADLINE = 300
 

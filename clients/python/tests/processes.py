@@ -254,16 +254,6 @@ def stopped(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def connects(server: Server) -> bool:
-    """Opens one more connection, if there is a place for it."""
-    try:
-        server.connect()
-    except EmberwatchError as error:
-        assert error.code == "channel"
-        return False
-    return True
-
-
 def is_running(pid: int) -> bool:
     """Whether any thread of a process runs; one that nobody has waited for yet has ended."""
     try:
@@ -282,10 +272,15 @@ def _state(pid: int) -> str:
         return ""
 
 
-def asleep(thread: threading.Thread | None = None) -> None:
-    """Waits until a thread, else the main one, sleeps as on the answer of a stopped server."""
+def asleep(thread: threading.Thread | int | None = None) -> None:
+    """Waits until a thread sleeps as on the answer of a stopped server.
+
+    Args:
+        thread: A thread of this process, the id of another process, or None: the main thread.
+    """
     thread = thread or threading.main_thread()
-    place = Path(f"/proc/{os.getpid()}/task/{thread.native_id}/stat")
+    number = thread if isinstance(thread, int) else thread.native_id
+    place = Path(f"/proc/{number}/task/{number}/stat")
     looks = 0
 
     def is_asleep() -> bool:
@@ -295,6 +290,21 @@ def asleep(thread: threading.Thread | None = None) -> None:
         return looks > 20
 
     assert eventually(is_asleep)
+
+
+@contextmanager
+def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo[BaseException]]:
+    """Interrupts what the main thread does in this context, once `wait` has returned."""
+
+    def interrupt() -> None:
+        wait()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    with pytest.raises(KeyboardInterrupt) as raised:
+        thread.start()
+        yield raised
+    thread.join()
 
 
 def services(instance: str) -> list[Path]:

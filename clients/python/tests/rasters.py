@@ -1,5 +1,7 @@
 """Small rasters of fires for the tests of the importer, in each format it reads."""
 
+import math
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,21 @@ import numpy as np
 import rasterio
 from numpy.typing import ArrayLike, NDArray
 
+from emberwatch.landscape.__main__ import main
+
 NEVER = -9999.0
 #: Minutes until each cell of a 3 x 4 grid begins to burn.
 ARRIVAL = np.array([[0, 10, 20, NEVER], [10, 20, 35, NEVER], [NEVER, 30, 40, 50]])
 UTM = "EPSG:32610"
+#: Metres: on cells of 30 m, 10 degrees up to the east.
+EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
+
+
+def made(folder: Path, *flags: object) -> dict[str, Any]:
+    """The model file that the command writes."""
+    out = folder / "new" / "land.toml"
+    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
+    return tomllib.loads(out.read_text("utf-8"))
 
 
 def geotiff(

@@ -8,7 +8,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, SMALL, WILDFIRE, assert_same, closed_later, make, make_vec
+from environments import (
+    LIVELY,
+    MOVES,
+    OBJECTIVE,
+    SMALL,
+    WILDFIRE,
+    assert_same,
+    closed_later,
+    make,
+    make_vec,
+)
 from environments import rollout as rolled
 from failures import refuses
 from gymnasium.envs.registration import EnvSpec
@@ -52,7 +62,52 @@ ENVIRONMENTS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Any]] = {
         lambda path: {"robot_0": path, "robot_1": path},
         PATH,
     ),
+    "option": (lambda: make(OBJECTIVE), lambda option: option, PATH[0]),
+    "options": (lambda: make_vec(2, OBJECTIVE), lambda option: [option, option], PATH[0]),
 }
+
+#: Actions of these, and words of their refusals.
+WRONG: dict[str, list[tuple[Any, str]]] = {
+    "path": [
+        ([0, 1, 2], r"expected shape \(1, 4\) or \(4,\), got \(3,\)"),
+        ([0, 1, 2, 4], r"expected moves 0 to 3, got 4 at \(3,\)"),
+        ([0.0, 1.0, 2.0, 3.0], "expected integers, got float64"),
+    ],
+    "move": [
+        (4, "expected one integer, 0 to 3, got 4"),
+        *((it, f"got {it!r}") for it in (-1, 1.0, True, None, "0")),
+        ([0, 1], r"got \[0, 1\]"),
+        ([[0], [1, 2]], "got list: "),
+    ],
+    "paths": [
+        (np.full((2, 4), 4), r"expected moves 0 to 3, got 4 at \(0, 0\)"),
+        (np.zeros((2, 3), int), r"expected shape \(2, 4\), got \(2, 3\)"),
+        (np.zeros((3, 4), int), r"expected shape \(2, 4\), got \(3, 4\)"),
+        (np.zeros((2, 4)), "expected integers, got float64"),
+    ],
+    "moves": [
+        ([0], r"integers of shape \(2,\), got int64 \(1,\)"),
+        ([0.5, 1.0], r"integers of shape \(2,\), got float64"),
+        ([0, 4], "expected 0 to 3, got 4 for world 1"),
+        ([-1, 0], "expected 0 to 3, got -1 for world 0"),
+        ([[0], [1, 2]], "action: expected an array"),
+        ("up", "integers of shape"),
+    ],
+    "option": [(it, "action: expected") for it in (8, [0, 1, 8], "fire")],
+    "options": [(it, "action: expected") for it in (8, [0, 1, 8], "fire")],
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_wrong_action_is_named_and_not_flown(kind: str) -> None:
+    maker, action, given = ENVIRONMENTS[kind]
+    env = maker().unwrapped
+    env.reset(seed=1)
+    for wrong, words in WRONG[kind]:
+        with refuses(words):
+            env.step(wrong)
+    seen, _, _, _, info = env.step(action(given))
+    assert np.all((seen["move"] if "move" in kind else info["step"]) == 1)
 
 
 @pytest.mark.parametrize("kind", ENVIRONMENTS)
@@ -101,16 +156,42 @@ def test_seeds_of_a_lease_are_one_for_each_world() -> None:
     assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
 
 
-@pytest.mark.parametrize(
-    "options",
-    ["resume", ["resume"], 5, {"resume"}, Elsewhere(ELSEWHERE[0])],
-    ids=lambda it: type(it).__name__,
-)
-def test_options_are_a_dictionary(options: Any) -> None:
+def mask_of(*values: Any) -> dict[str, Any]:
+    return {"options": {"reset_mask": np.array(values)}}
+
+
+#: Arguments of a reset, and words of their refusals: of any environment, and of a vector.
+WRONG_RESETS: list[tuple[dict[str, Any], str]] = [
+    *(({"seed": it}, rf"seed: expected an integer.*, got {it}") for it in (-1, 2**64)),
+    *(
+        (
+            {"options": it},
+            r"options: expected a dictionary such as \{'resume': True\}, or None, got",
+        )
+        for it in ("resume", ["resume"], 5, {"resume"}, Elsewhere(ELSEWHERE[0]))
+    ),
+]
+WRONG_SINGLE: list[tuple[dict[str, Any], str]] = [
+    ({"options": {"rewind": True}}, "options: expected 'resume', got 'rewind'"),
+    ({"seed": 3, "options": {"resume": True}}, "expected no seed with resume=True"),
+]
+WRONG_VECTOR: list[tuple[dict[str, Any], str]] = [
+    *(({"seed": [1] * n}, "seed: expected an integer, None or 2 of them, got") for n in (0, 1, 3)),
+    ({"options": {"mask": np.ones(2, bool)}}, "options: expected 'resume', got 'mask'"),
+    ({"options": {"reset_mask": [True, False]}}, r"an array \(2,\) of bool .* got <class 'list'>"),
+    (mask_of(1, 0), r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
+    (mask_of(True), r"expected an array \(2,\) of bool .* got bool \(1,\)"),
+    (mask_of(False, False), "with at least one True"),
+]  # fmt: skip
+
+
+def test_wrong_arguments_of_a_reset_are_named() -> None:
     team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
-    for env in (make(), make_vec(2), team):
-        with refuses(r"options: expected a dictionary such as \{'resume': True\}, or None, got"):
-            env.reset(options=options)
+    for env, more in ((make(), WRONG_SINGLE), (make_vec(2), WRONG_VECTOR), (team, [])):
+        env.reset(seed=1)
+        for arguments, words in (*WRONG_RESETS, *more):
+            with refuses(words):
+                env.reset(**arguments)
 
 
 def test_what_does_not_show_itself_is_refused_in_its_own_words() -> None:
@@ -126,6 +207,7 @@ def test_what_does_not_show_itself_is_refused_in_its_own_words() -> None:
             team.step({"robot_0": Elsewhere(error)})
 
 
+#: Keywords of a specification, as callers write them.
 KEYWORDS: list[dict[str, Any]] = [
     {"model": Path(LIVELY)},
     {"height": np.int64(7), "width": np.uint8(5), "burn_in": np.array(50)[()]},
@@ -135,15 +217,11 @@ KEYWORDS: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.parametrize("keywords", KEYWORDS, ids=str)
-def test_a_specification_is_json_that_makes_the_same_environment(keywords: Any) -> None:
-    env = make(**keywords)
-    text = env.spec.to_json()
-    again = closed_later(gymnasium.make(EnvSpec.from_json(text)))
-    assert_same(rolled(again, 2, seed=5), rolled(env, 2, seed=5))
-
-
-def test_that_of_a_vector_is_json_too() -> None:
+def test_a_specification_is_json_that_makes_the_same_environment() -> None:
+    for keywords in KEYWORDS:
+        env = make(**keywords)
+        again = closed_later(gymnasium.make(EnvSpec.from_json(env.spec.to_json())))
+        assert_same(rolled(again, 2, seed=5), rolled(env, 2, seed=5), repr(keywords))
     mode = AutoresetMode.SAME_STEP
     keywords = {"model": Path(LIVELY), "autoreset_mode": mode, "max_episode_steps": np.int64(3)}
     text = make_vec(np.int64(2), MOVES, **keywords).spec.to_json()

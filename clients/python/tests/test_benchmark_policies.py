@@ -1,21 +1,19 @@
 """What `evaluate` gives to a policy, and takes from it."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, WILDFIRE
+from benchmarks import WORLDS, wall
+from environments import MOVES, WILDFIRE
 from failures import refuses
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.benchmark import Row, evaluate
-from emberwatch.model import Model
 
-WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
 N_MOVES = 4
 
 
@@ -122,19 +120,15 @@ def test_functions_may_have_a_memory() -> None:
     assert counts == list(range(3 * N_MOVES))
 
 
-@pytest.mark.parametrize(
-    "predict",
-    [
+def test_a_model_may_return_actions_alone() -> None:
+    expected = [row.mean_reward for row in go(lambda frames: np.ones(len(frames), int))]
+    for predict in (
         lambda self, seen: np.ones(len(seen), int),
         lambda self, seen: (np.ones(len(seen), int), None),
         lambda self, seen, state: np.ones(len(seen), int),
-    ],
-)
-def test_a_model_may_return_actions_alone(predict: Callable[..., Any]) -> None:
-    model = type("Plain", (), {"predict": predict})()
-    assert [row.mean_reward for row in go(model)] == [
-        row.mean_reward for row in go(lambda frames: np.ones(len(frames), int))
-    ]
+    ):
+        model = type("Plain", (), {"predict": predict})()
+        assert [row.mean_reward for row in go(model)] == expected
 
 
 @pytest.mark.parametrize("n_worlds", [1, 2, 3])
@@ -153,30 +147,21 @@ def test_a_pair_of_actions_and_no_state_is_taken(env: str, n_worlds: int) -> Non
         assert [row.mean_reward for row in rows] == [row.mean_reward for row in whole]
 
 
-@pytest.mark.parametrize(
-    ("outcome", "problem"),
-    [
+def test_what_is_no_action_is_named() -> None:
+    for outcome, problem in (
         ((np.ones(3, int), np.zeros(3)), "policy: it returns a state with its actions, but has"),
         (([1, 2], [1, 2, 3]), "policy: expected actions, got tuple: "),
         (np.ones(4, int), r"action: expected integers of shape \(3,\), got int64 \(4,\)"),
         (np.ones(3), r"action: expected integers of shape \(3,\), got float64 \(3,\)"),
         (None, r"action: expected integers of shape \(3,\), got object \(\)"),
-    ],
-    ids=str,
-)
-def test_what_is_no_action_is_named(outcome: Any, problem: str) -> None:
-    with refuses(problem):
-        go(lambda _: outcome)
+    ):
+        with refuses(problem):
+            go(lambda _, outcome=outcome: outcome)
 
 
 @pytest.fixture
 def walled(tmp_path: Path) -> Path:
-    """A model with a wall in which there is one gap."""
-    wall = np.zeros((7, 9), int)
-    wall[:, 4], wall[3, 4] = 1, 0
-    path = tmp_path / "wall.toml"
-    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
-    return path
+    return wall(tmp_path)
 
 
 class Masked:

@@ -1,12 +1,13 @@
 """Models of Stable-Baselines3 score in `evaluate` what they score in their own evaluation."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES
+from benchmarks import WORLDS, wall
+from environments import MOVES
 from failures import refuses
 
 pytest.importorskip("stable_baselines3")
@@ -16,7 +17,6 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
-from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import (
     VecFrameStack,
@@ -25,8 +25,7 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from emberwatch.benchmark import evaluate, read
-from emberwatch.model import Model
+from emberwatch.benchmark import evaluate
 from emberwatch.sb3 import make_vec_env
 
 N_MOVES, N_STEPS, N_WORLDS, FIRST = 4, 10, 4, 1000
@@ -36,23 +35,10 @@ SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 1, "learning_rate": 3e-3, 
 Wrap = Callable[[Any], Any]
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """More would wait for each other in networks as small as these."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Worlds with a wall, so that masks matter."""
-    wall = np.zeros((7, 9), int)
-    wall[:, 4], wall[3, 4] = 1, 0
-    path = tmp_path_factory.mktemp("model") / "wall.toml"
-    path.write_text(f"no_fly = {wall.tolist()}\n" + Model.named(LIVELY).toml)
-    return {"model": path, "height": 7, "width": 9, "n_moves": N_MOVES, "burn_in": 60}
+    return {**WORLDS, "model": wall(tmp_path_factory.mktemp("model"))}
 
 
 def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes: Any) -> Any:
@@ -121,14 +107,6 @@ def test_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any], deterministi
     check(model, expected, world, deterministic=deterministic)
 
 
-def test_dqn_scores_as_in_its_own_evaluation(world: dict[str, Any], tmp_path: Path) -> None:
-    worlds = vector(world, 5000, reward="move")
-    kind = stable_baselines3.DQN
-    model = kind("MlpPolicy", worlds, seed=3, learning_starts=64, buffer_size=512, device="cpu")
-    model.learn(256)
-    check(model, own(model, vector(world, FIRST), deterministic=True), world)
-
-
 def test_recurrent_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
     model = remembering(world)
     expected = own(model, vector(world, FIRST), deterministic=True)
@@ -149,24 +127,6 @@ def test_maskable_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> 
     expected = own(model, worlds, deterministic=True, evaluation=evaluate_masked)
     check(model, expected, world)
     assert ours(lambda seen: model.predict(seen, deterministic=True)[0], world) != expected
-
-
-def test_masks_are_those_that_its_own_evaluation_gives(world: dict[str, Any]) -> None:
-    worlds = vector(world, FIRST)
-    worlds.reset()
-    theirs = []
-    for _ in range(N_MOVES):
-        theirs.append(get_action_masks(worlds).astype(bool))
-        worlds.step(np.argmax(theirs[-1], axis=1))
-    worlds.close()
-    masks = []
-
-    def act(seen: Any, action_masks: Any) -> Any:
-        masks.append(action_masks)
-        return np.argmax(action_masks, axis=1)
-
-    ours(act, world)
-    assert np.array_equal(masks[:N_MOVES], theirs)
 
 
 def normalized(worlds: Any) -> Any:
@@ -231,17 +191,7 @@ def test_vec_normalize_without_statistics_is_refused(
         ours(model, world, observation=parts, wrap=VecMonitor)
 
 
-def test_a_model_of_stacked_frames_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
-    def stack(worlds: Any) -> Any:
-        return VecFrameStack(worlds, 3)
-
-    model = trained(stable_baselines3.PPO, "MlpPolicy", world, stack)
-    with refuses(r"policy: expected observations .*, wrap=, such as lambda worlds: VecFrameStack"):
-        ours(model, world)
-    check(model, own(model, vector(world, FIRST, stack), deterministic=True), world, wrap=stack)
-
-
-def test_normalized_and_stacked_frames_score_as_in_their_own_evaluation(
+def test_normalized_stacked_frames_score_as_in_their_evaluation(
     world: dict[str, Any], tmp_path: Path
 ) -> None:
     model = trained(
@@ -288,37 +238,3 @@ def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
 
     ours(act, world, wrap=lambda worlds: VecFrameStack(worlds, 2))
     assert shapes == {(N_WORLDS, 15, 15, 10)}
-
-
-def test_a_retrained_model_runs_again(world: dict[str, Any], tmp_path: Path) -> None:
-    file = tmp_path / "rows.csv"
-    model = trained(stable_baselines3.PPO, "MlpPolicy", world)
-    ours(model, world, csv=file)
-    rows = read(file)
-    model.save(tmp_path / "model.zip")
-    loaded = stable_baselines3.PPO.load(tmp_path / "model.zip", device="cpu")
-    ours(loaded, world, csv=file)
-    assert read(file) == rows, "the same weights"
-    model.learn(128)
-    ours(model, world, csv=file)
-    assert read(file)[0].policy_fingerprint != rows[0].policy_fingerprint
-    # So it does where a function hides the model.
-    ours(lambda seen: loaded.predict(seen)[0], world, csv=file)
-    rows = read(file)
-    loaded.set_env(vector(world, 5000))
-    loaded.learn(128)
-    ours(lambda seen: loaded.predict(seen)[0], world, csv=file)
-    assert len(read(file)) == N_WORLDS and read(file)[0] != rows[0]
-
-
-def test_more_or_other_statistics_run_again(
-    world: dict[str, Any], behind_statistics: Any, tmp_path: Path
-) -> None:
-    model, _, _, parts = behind_statistics
-    file = tmp_path / "rows.csv"
-    ours(model, world, observation=parts, csv=file)
-    rows = read(file)
-    statistics = model.get_vec_normalize_env().obs_rms
-    (statistics if parts == "local" else statistics["frame"]).mean += 1.0
-    ours(model, world, observation=parts, csv=file)
-    assert read(file)[0].policy_fingerprint != rows[0].policy_fingerprint

@@ -245,27 +245,28 @@ def test_a_frame_that_is_published_again_counts_once(studio: Studio) -> None:
     assert len(studio.millis()) == 3
 
 
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--world", 7], "--world: expected one of those recorded, [0, 1], got 7"),
-        (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
-        (["--from", 5], "expected some of the recorded steps 0 to 1, 4 to 4, got 5 to inf"),
-        (["--from", 5, "--to", 4], "--to: expected 5 to inf, got 4"),
-        (["--every", 0], "--every: expected 1 to inf, got 0"),
-        (["--fps", 0], "--fps: expected 0.1 to 50, got 0.0"),
-        (["--fps", "fast"], "invalid float value: 'fast'"),
-        (["--scale", 101], "--scale: expected 1 to 100, got 101"),
-        (["--step", 1, "--every", 2], "--step: expected none of --from, --to and --every"),
-        (["--out", "lab.mp4"], "--out: expected a .gif, or with --step a .png, got lab.mp4"),
-        (["--step", 1, "--out", "a.gif"], "--out: expected a .gif, or with --step a .png"),
-        (["--prior", "none"], "invalid choice: 'none'"),
-        (["--out", "/dev/null/a.gif"], "/dev/null"),
-    ],
-)
-def test_wrong_flags_are_named(studio: Studio, flags: list[object], words: str) -> None:
+#: Flags, and words about them.
+WRONG: list[tuple[list[object], str]] = [
+    (["--world", 7], "--world: expected one of those recorded, [0, 1], got 7"),
+    (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
+    (["--from", 5], "expected some of the recorded steps 0 to 1, 4 to 4, got 5 to inf"),
+    (["--from", 5, "--to", 4], "--to: expected 5 to inf, got 4"),
+    (["--every", 0], "--every: expected 1 to inf, got 0"),
+    (["--fps", 0], "--fps: expected 0.1 to 50, got 0.0"),
+    (["--fps", "fast"], "invalid float value: 'fast'"),
+    (["--scale", 101], "--scale: expected 1 to 100, got 101"),
+    (["--step", 1, "--every", 2], "--step: expected none of --from, --to and --every"),
+    (["--out", "lab.mp4"], "--out: expected a .gif, or with --step a .png, got lab.mp4"),
+    (["--step", 1, "--out", "a.gif"], "--out: expected a .gif, or with --step a .png"),
+    (["--prior", "none"], "invalid choice: 'none'"),
+    (["--out", "/dev/null/a.gif"], "/dev/null"),
+]
+
+
+def test_wrong_flags_are_named(studio: Studio) -> None:
     records = [server(), frame(0), frame(1), frame(1, world=1), frame(4)]
-    assert words in studio.fails(records, *flags)
+    for flags, words in WRONG:
+        assert words in studio.fails(records, *flags)
     assert not studio.gif.exists() and not studio.png.exists()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rasters import ascii_grid, geotiff, netcdf
+from rasters import EASTWARD, ascii_grid, geotiff, made, netcdf
 
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.landscape.__main__ import main
@@ -21,17 +21,8 @@ CONFIG = Path(__file__).parents[3] / "config"
 BURNOUT = tomllib.loads((CONFIG / "models/wildfire-burnout.toml").read_text("utf-8"))
 #: Of the base's burning neighbours: beside the cell, and at its corners.
 SIDE, CORNER = (0.04 + 0.10 + 0.02 + 0.04) / 4, (0.06 + 0.02 + 0.06 + 0.02) / 4
-#: Metres: on cells of 30 m, 10 degrees up to the east.
-EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
 SLOPE = "10 degrees up to the east, aspect W"
 WIND = ("--wind-speed", 5, "--wind-towards", 20)
-
-
-def made(folder: Path, *flags: object) -> dict[str, Any]:
-    """The model file that the command writes."""
-    out = folder / "new" / "land.toml"
-    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
-    return tomllib.loads(out.read_text("utf-8"))
 
 
 def array(path: Path, values: Any) -> Path:

@@ -137,150 +137,79 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "range as packed": (packed(valid_range=np.array([0, 2400], "i2")), WITHOUT_LAST),
     "range as unpacked": (packed(valid_range=[60.0, 300.0]), WITHOUT_FIRST),
     "limits beyond an offset": (
-        grid(
-            ONE._replace(values=ARRIVAL // 60).told(
-                scale_factor=60.0, add_offset=600.0, valid_min=600.0, valid_max=840.0
-            )
-        ),
-        WITHOUT_LAST,
-    ),
+        grid(ONE._replace(values=ARRIVAL // 60).told(scale_factor=60.0, add_offset=600.0,
+        valid_min=600.0, valid_max=840.0)), WITHOUT_LAST),
     "limit of plain integers": (grid(ONE.told(valid_min=np.int16(60))), WITHOUT_FIRST),
     "limit of plain numbers of 32 bits": (
         grid(ONE._replace(values=ARRIVAL / 3600, kind="f4").told(units="h", valid_max=240 / 3600)),
-        WITHOUT_LAST,
-    ),
-    "two limits": (
-        grid(ONE.told(valid_min=np.int16(60), valid_max=np.int16(300))),
-        WITHOUT_FIRST,
-    ),
+        WITHOUT_LAST),
+    "two limits": (grid(ONE.told(valid_min=np.int16(60), valid_max=np.int16(300))), WITHOUT_FIRST),
     "missing and fill value": (
-        grid(
-            ONE._replace(
-                values=np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL))
-            ).told(missing_value=np.int16(-1), _FillValue=-2)
-        ),
-        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60)),
-    ),
+        grid(ONE._replace(values=np.where(ARRIVAL == 300, -1,
+        np.where(ARRIVAL == 0, -2, ARRIVAL))).told(missing_value=np.int16(-1), _FillValue=-2)),
+        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60))),
     "several missing values": (
-        grid(
-            ONE._replace(
-                values=np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL))
-            ).told(missing_value=np.array([-1, -2], "i2"))
-        ),
-        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60)),
-    ),
-    "never written": (
-        grid(ONE._replace(values=np.where(ARRIVAL == 300, -32767, ARRIVAL))),
-        WITHOUT_LAST,
-    ),
+        grid(ONE._replace(values=np.where(ARRIVAL == 300, -1,
+        np.where(ARRIVAL == 0, -2, ARRIVAL))).told(missing_value=np.array([-1, -2], "i2"))),
+        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60))),
+    "never written": (grid(ONE._replace(values=np.where(ARRIVAL == 300, -32767, ARRIVAL))),
+        WITHOUT_LAST),
     "unsigned": (
-        grid(
-            Variable((ARRIVAL // 2 + 100).astype("u1").view("i1"), "i1", ("y", "x")).told(
-                units="s",
-                _Unsigned="true",
-                scale_factor=2.0,
-                valid_max=np.int8(-36),
-            )
-        ),
-        WITHOUT_LAST,
-    ),
+        grid(Variable((ARRIVAL // 2 + 100).astype("u1").view("i1"), "i1",
+        ("y", "x")).told(units="s", _Unsigned="true", scale_factor=2.0, valid_max=np.int8(-36))),
+        WITHOUT_LAST),
     # Time.
     "time": (timed("f8", [0, 1, 2, 3]), FIRE[:4]),
     "scale of time": (timed("i2", [0, 2, 4, 6], scale_factor=0.5), FIRE[:4]),
     "offset of time": (timed("i2", [-9, -8, -7, -6], add_offset=9.0), FIRE[:4]),
-    "both of time": (
-        timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
-        FIRE[:4],
-    ),
-    "milliseconds": (
-        timed("i4", [0, 60_000, 180_000, 240_000], units="msec"),
-        FIRE[[0, 1, 1, 2, 3]],
-    ),
+    "both of time": (timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
+        FIRE[:4]),
+    "milliseconds": (timed("i4", [0, 60_000, 180_000, 240_000], units="msec"),
+        FIRE[[0, 1, 1, 2, 3]]),
     "nanoseconds": (
         timed("i8", np.array([0, 1, 3, 4]) * 60 * 10**9, units="nanoseconds since 2020-08-01"),
-        FIRE[[0, 1, 1, 2, 3]],
-    ),
+        FIRE[[0, 1, 1, 2, 3]]),
     "time beside its dimension": (
-        grid(
-            TIMES._replace(over=("n", "y", "x")).told(coordinates="when"),
-            when=TIME._replace(values=[0, 1, 3, 4], over=("n",)),
-        ),
-        FIRE[[0, 1, 1, 2, 3]],
-    ),
+        grid(TIMES._replace(over=("n", "y", "x")).told(coordinates="when"),
+        when=TIME._replace(values=[0, 1, 3, 4], over=("n",))), FIRE[[0, 1, 1, 2, 3]]),
     # Axes.
     "columns before rows": (grid(ONE._replace(values=ARRIVAL.T, over=("x", "y"))), FIRE),
     "columns before rows by standard names": (
-        {
-            "a": Variable(X.values, "f8", ("a",), {"standard_name": "projection_x_coordinate"}),
-            "b": Variable(Y.values, "f8", ("b",), {"standard_name": "projection_y_coordinate"}),
-            "v": ONE._replace(values=ARRIVAL.T, over=("a", "b")),
-        },
-        FIRE,
-    ),
+        {"a": Variable(X.values, "f8", ("a",), {"standard_name": "projection_x_coordinate"}),
+        "b": Variable(Y.values, "f8", ("b",), {"standard_name": "projection_y_coordinate"}),
+        "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "columns before rows by units": (
-        {
-            "a": LON._replace(over=("a",)),
-            "b": LAT._replace(over=("b",)),
-            "v": ONE._replace(values=ARRIVAL.T, over=("a", "b")),
-        },
-        FIRE,
-    ),
+        {"a": LON._replace(over=("a",)), "b": LAT._replace(over=("b",)),
+        "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "columns before rows by names": (
-        {"v": ONE._replace(values=ARRIVAL.T[:, ::-1], over=("lon", "lat"))},
-        FIRE,
-    ),
+        {"v": ONE._replace(values=ARRIVAL.T[:, ::-1], over=("lon", "lat"))}, FIRE),
     "rows by an axis alone": (
-        {"b": Y._replace(over=("b",)), "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))},
-        FIRE,
-    ),
+        {"b": Y._replace(over=("b",)), "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "time last": (
         grid(TIMES._replace(values=np.moveaxis(MASKS, 0, 2), over=("y", "x", "time")), time=TIME),
-        FIRE[:4],
-    ),
+        FIRE[:4]),
     "other names": ({"v": ONE._replace(values=ARRIVAL[::-1], over=("south", "west"))}, FIRE),
     "rising rows": (
         grid(ONE._replace(values=ARRIVAL[::-1]), y=Y._replace(values=np.asarray(Y.values)[::-1])),
-        FIRE,
-    ),
+        FIRE),
     "falling columns": (
-        grid(
-            ONE._replace(values=ARRIVAL[:, ::-1]), x=X._replace(values=np.asarray(X.values)[::-1])
-        ),
-        FIRE,
-    ),
+        grid(ONE._replace(values=ARRIVAL[:, ::-1]),
+        x=X._replace(values=np.asarray(X.values)[::-1])), FIRE),
     "packed coordinates": (
-        grid(ONE, x=Variable([0, 1, 2, 3], "i2", ("x",), {**X.given, "scale_factor": 30.0})),
-        FIRE,
-    ),
+        grid(ONE, x=Variable([0, 1, 2, 3], "i2", ("x",), {**X.given, "scale_factor": 30.0})), FIRE),
     "coordinates of 32 bits": (
-        grid(ONE, x=X._replace(kind="f4", values=8_000_015 + 30.3 * np.arange(4))),
-        FIRE,
-    ),
-    "kilometres": (
-        grid(ONE, x=X._replace(values=np.asarray(X.values) / 1000).told(units="km")),
-        FIRE,
-    ),
+        grid(ONE, x=X._replace(kind="f4", values=8_000_015 + 30.3 * np.arange(4))), FIRE),
+    "kilometres": (grid(ONE, x=X._replace(values=np.asarray(X.values) / 1000).told(units="km")),
+        FIRE),
     "longitudes across 360": (
-        {
-            "lat": LAT,
-            "lon": LON._replace(values=np.asarray(LON.values) % 360),
-            "v": ONE._replace(over=("lat", "lon")),
-        },
-        FIRE,
-    ),
+        {"lat": LAT, "lon": LON._replace(values=np.asarray(LON.values) % 360),
+        "v": ONE._replace(over=("lat", "lon"))}, FIRE),
     "bounds across 360": (
-        {
-            "lat": LAT,
-            "lon": LON._replace(values=np.asarray(LON.values) % 360).told(bounds="edges"),
-            "edges": Variable(
-                [[359.85, 359.95], [359.95, 0.05], [0.05, 0.15], [0.15, 0.25]], "f8", ("lon", "2")
-            ),
-            "v": ONE._replace(over=("lat", "lon")),
-        },
-        FIRE,
-    ),
+        {"lat": LAT, "lon": LON._replace(values=np.asarray(LON.values) % 360).told(bounds="edges"),
+        "edges": Variable([[359.85, 359.95], [359.95, 0.05], [0.05, 0.15], [0.15, 0.25]], "f8",
+        ("lon", "2")), "v": ONE._replace(over=("lat", "lon"))}, FIRE),
     "bounds": ({**bounded(X, "x"), "y": Y, "v": ONE}, FIRE),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", APPLIED)
@@ -382,125 +311,63 @@ CURVED = Variable(np.zeros((3, 4)), "f8", ("y", "x"), {"units": "degrees_north"}
 
 #: What a file says, flags, and words of the refusal.
 REFUSED: dict[str, tuple[Variables, tuple[str, ...], str]] = {
-    "uneven columns": (
-        grid(ONE, x=X._replace(values=[15, 45, 75, 165])),
-        (),
-        "a.nc, x: expected cells of one size side by side, got some of 30 and some of 90",
-    ),
-    "uneven bounds": (
-        {**bounded(X, "x", half=10.0), "y": Y, "v": ONE},
-        (),
-        "a.nc, x: expected cells of one size side by side, got some of 20 and some of 30",
-    ),
-    "coordinates that stand still": (
-        grid(ONE, x=X._replace(values=[15, 15, 15, 15])),
-        (),
-        "a.nc, x: expected cells of one size side by side, got some of 0 and some of 0",
-    ),
+    "uneven columns": (grid(ONE, x=X._replace(values=[15, 45, 75, 165])), (),
+        "a.nc, x: expected cells of one size side by side, got some of 30 and some of 90"),
+    "uneven bounds": ({**bounded(X, "x", half=10.0), "y": Y, "v": ONE}, (),
+        "a.nc, x: expected cells of one size side by side, got some of 20 and some of 30"),
+    "coordinates that stand still": (grid(ONE, x=X._replace(values=[15, 15, 15, 15])), (),
+        "a.nc, x: expected cells of one size side by side, got some of 0 and some of 0"),
     "missing coordinate": (
-        grid(ONE, x=X._replace(values=[15, 45, -1, 105]).told(missing_value=-1.0)),
-        (),
-        "a.nc, x: expected cells of one size side by side, got some of nan",
-    ),
-    "endless coordinate": (
-        grid(ONE, x=X._replace(values=[-np.inf, 45, 75, np.inf])),
-        (),
-        "a.nc, x: expected cells of one size side by side, got some of 30 and some of inf",
-    ),
-    "bounds of nothing": (
-        grid(ONE, x=X.told(bounds="edges")),
-        (),
-        "a.nc, x, bounds: expected two for each cell, got 'edges'",
-    ),
-    "coordinates of words": (
-        grid(ONE, x=X.told(units="furlongs")),
-        (),
-        "a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'",
-    ),
+        grid(ONE, x=X._replace(values=[15, 45, -1, 105]).told(missing_value=-1.0)), (),
+        "a.nc, x: expected cells of one size side by side, got some of nan"),
+    "endless coordinate": (grid(ONE, x=X._replace(values=[-np.inf, 45, 75, np.inf])), (),
+        "a.nc, x: expected cells of one size side by side, got some of 30 and some of inf"),
+    "bounds of nothing": (grid(ONE, x=X.told(bounds="edges")), (),
+        "a.nc, x, bounds: expected two for each cell, got 'edges'"),
+    "coordinates of words": (grid(ONE, x=X.told(units="furlongs")), (),
+        "a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'"),
     "latitudes without a unit": (
-        {
-            "Lat": Variable(LAT.values, "f8", ("Lat",)),
-            "lon": LON,
-            "v": ONE._replace(over=("Lat", "lon")),
-        },
-        (),
-        "a.nc, Lat, units: expected degrees, m, km or feet, got ''",
-    ),
-    "degrees and metres": (
-        grid(ONE, x=X.told(units="degrees_east")),
-        (),
-        "a.nc: expected rows and columns in one unit, got degrees and metres",
-    ),
-    "two columns": (
-        grid(ONE, y=Y.told(axis="X")),
-        (),
-        "a.nc: expected a variable of time, rows and columns, got it over y, x",
-    ),
-    "an axis with two names": (
-        grid(ONE, y=Y.told(standard_name="longitude")),
-        (),
-        "a.nc, y: expected one axis, got X and Y",
-    ),
+        {"Lat": Variable(LAT.values, "f8", ("Lat",)), "lon": LON,
+        "v": ONE._replace(over=("Lat", "lon"))}, (),
+        "a.nc, Lat, units: expected degrees, m, km or feet, got ''"),
+    "degrees and metres": (grid(ONE, x=X.told(units="degrees_east")), (),
+        "a.nc: expected rows and columns in one unit, got degrees and metres"),
+    "two columns": (grid(ONE, y=Y.told(axis="X")), (),
+        "a.nc: expected a variable of time, rows and columns, got it over y, x"),
+    "an axis with two names": (grid(ONE, y=Y.told(standard_name="longitude")), (),
+        "a.nc, y: expected one axis, got X and Y"),
     "heights": (
-        grid(
-            TIMES._replace(over=("z", "y", "x")),
-            z=Variable(np.arange(4), "f8", ("z",), {"axis": "Z"}),
-        ),
-        (),
-        "a.nc: expected a variable of time, rows and columns, got it over z",
-    ),
-    "curved rows": (
-        {"lat": CURVED, "v": ONE.told(coordinates="lat lon")},
-        (),
-        "a.nc: expected coordinates of one dimension, got lat over y, x; reproject it",
-    ),
-    "no cells": (
-        {"v": Variable(np.zeros((0, 3, 4)), "u1", ("time", "y", "x"))},
-        (),
-        "a.nc: expected cells, got 0 x 3 x 4",
-    ),
-    "scale in words": (
-        grid(ONE.told(scale_factor="0.1")),
-        (),
-        "a.nc, scale_factor: expected a number, got 0.1",
-    ),
-    "range of one number": (
-        grid(ONE.told(valid_range=np.int16(3))),
-        (),
-        "a.nc, valid_range: expected two numbers, got 3",
-    ),
+        grid(TIMES._replace(over=("z", "y", "x")),
+        z=Variable(np.arange(4), "f8", ("z",), {"axis": "Z"})), (),
+        "a.nc: expected a variable of time, rows and columns, got it over z"),
+    "curved rows": ({"lat": CURVED, "v": ONE.told(coordinates="lat lon")}, (),
+        "a.nc: expected coordinates of one dimension, got lat over y, x; reproject it"),
+    "no cells": ({"v": Variable(np.zeros((0, 3, 4)), "u1", ("time", "y", "x"))}, (),
+        "a.nc: expected cells, got 0 x 3 x 4"),
+    "scale in words": (grid(ONE.told(scale_factor="0.1")), (),
+        "a.nc, scale_factor: expected a number, got 0.1"),
+    "range of one number": (grid(ONE.told(valid_range=np.int16(3))), (),
+        "a.nc, valid_range: expected two numbers, got 3"),
     "limit of another type": (
         packed(valid_max=np.float32(1500)),
         (),
         "a.nc, valid_max: expected the type of the numbers, int16, or of scale_factor, float64, "
         "got float32",
     ),
-    "months": (
-        timed("f8", [0, 1, 2, 3], units="months since 2020-08-01"),
-        (),
-        "expected times in days or smaller units, got 'months since 2020-08-01'; --unit says",
-    ),
-    "a time that is missing": (
-        timed("f8", [0, 1, -1, 3], missing_value=-1.0),
-        (),
-        "a.nc, band 3: expected a time, got nan",
-    ),
-    "years put together": (
-        timed("f8", [0, 1, 2, 3], climatology="edges"),
-        (),
-        "a.nc, time: expected no climatology, got 'edges'",
-    ),
+    "months": (timed("f8", [0, 1, 2, 3], units="months since 2020-08-01"), (),
+        "expected times in days or smaller units, got 'months since 2020-08-01'; --unit says"),
+    "a time that is missing": (timed("f8", [0, 1, -1, 3], missing_value=-1.0), (),
+        "a.nc, band 3: expected a time, got nan"),
+    "years put together": (timed("f8", [0, 1, 2, 3], climatology="edges"), (),
+        "a.nc, time: expected no climatology, got 'edges'"),
     "codes that mean something else": (
         grid(TIMES.told(flag_values=np.array([0, 1, 2], "u1"), flag_meanings="burnt fire unburnt")),
         ("--kind=states",),
-        "flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes say",
-    ),
+        "flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes say"),
     "a mask of what has not burnt": (
-        grid(TIMES.told(flag_values=np.array([0, 1], "u1"), flag_meanings="burned unburned")),
-        (),
-        "flag_meanings: expected 0 to mean unburnt, got 'burned'; --kind and --codes say",
-    ),
-}
+        grid(TIMES.told(flag_values=np.array([0, 1], "u1"), flag_meanings="burned unburned")), (),
+        "flag_meanings: expected 0 to mean unburnt, got 'burned'; --kind and --codes say"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)

@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import CRS
-from rasters import ARRIVAL, UTM, ascii_grid, geotiff, netcdf
+from rasters import ARRIVAL, EASTWARD, UTM, ascii_grid, geotiff, made, netcdf
 from test_landscape_netcdf import Variable, written
 
 from emberwatch.errors import InvalidArgumentError
@@ -52,59 +51,43 @@ MERCATOR_60 = (1.6e6, 8.4e6 - 2e4)
 SLOPES: dict[str, Map] = {
     "metres": Map(UTM, 30, (5e5, 4e6), M30),
     "metres of no projection": Map(None, 30, (5e5, 4e6), M30),
-    "US survey feet by projection": Map(
-        "EPSG:2263", 100, NEW_YORK, (30.48, 30.48), "--height-unit us-ft", SURVEY_FOOT
-    ),
-    "US survey feet by projection, heights in metres": Map(
-        "EPSG:2263", 100, NEW_YORK, (30.48, 30.48), "--height-unit m"
-    ),
-    "US survey feet, heights too, by projection": Map(
-        "EPSG:2263+6360", 100, NEW_YORK, (30.48, 30.48), "", SURVEY_FOOT
-    ),
-    "US survey feet by flags": Map(
-        None, 100, NEW_YORK, (30.48, 30.48), "--cell 100us-ft --height-unit us-ft", SURVEY_FOOT
-    ),
-    "international feet by projection": Map(
-        "EPSG:2992", 100, OREGON, (30.48, 30.48), "--height-unit ft", FOOT
-    ),
-    "international feet by flags": Map(
-        None, 100, OREGON, (30.48, 30.48), "--cell 100ft --height-unit ft", FOOT
-    ),
-    "international feet, in a file beside an ASCII grid": Map(
-        "EPSG:2992", 100, OREGON, (30.48, 30.48), "--height-unit ft", FOOT, ending=".asc"
-    ),
+    "US survey feet by projection": Map("EPSG:2263", 100, NEW_YORK, (30.48, 30.48),
+        "--height-unit us-ft", SURVEY_FOOT),
+    "US survey feet by projection, heights in metres": Map("EPSG:2263", 100, NEW_YORK,
+        (30.48, 30.48), "--height-unit m"),
+    "US survey feet, heights too, by projection": Map("EPSG:2263+6360", 100, NEW_YORK,
+        (30.48, 30.48), "", SURVEY_FOOT),
+    "US survey feet by flags": Map(None, 100, NEW_YORK, (30.48, 30.48),
+        "--cell 100us-ft --height-unit us-ft", SURVEY_FOOT),
+    "international feet by projection": Map("EPSG:2992", 100, OREGON, (30.48, 30.48),
+        "--height-unit ft", FOOT),
+    "international feet by flags": Map(None, 100, OREGON, (30.48, 30.48),
+        "--cell 100ft --height-unit ft", FOOT),
+    "international feet, in a file beside an ASCII grid": Map("EPSG:2992", 100, OREGON,
+        (30.48, 30.48), "--height-unit ft", FOOT, ending=".asc"),
     "metres, heights in feet by band": Map(UTM, 30, (5e5, 4e6), M30, "", FOOT, "ft"),
-    "metres, heights in feet by projection": Map(
-        "EPSG:32610+8228", 30, (5e5, 4e6), M30, "", FOOT, ending=".asc"
-    ),
-    "metres, heights in feet by flag against the band": Map(
-        UTM, 30, (5e5, 4e6), M30, "--height-unit ft", FOOT, "metre"
-    ),
+    "metres, heights in feet by projection": Map("EPSG:32610+8228", 30, (5e5, 4e6), M30, "", FOOT,
+        ending=".asc"),
+    "metres, heights in feet by flag against the band": Map(UTM, 30, (5e5, 4e6), M30,
+        "--height-unit ft", FOOT, "metre"),
     "metres, heights in decimetres by flag": Map(UTM, 30, (5e5, 4e6), M30, "--height-unit dm", 0.1),
     "metres, heights in centimetres by band": Map(UTM, 30, (5e5, 4e6), M30, "", 0.01, "cm"),
     "degrees at the equator": Map("EPSG:4326", SECOND, (-70, 0), ARC),
     "degrees at 60 N": Map("EPSG:4326", SECOND, (10, 60), SECONDS_60, "--oblong"),
     "degrees of no projection": Map(None, SECOND, (-120, 38), M30, "--cell 30"),
-    "degrees of no projection, in an ASCII grid": Map(
-        None, SECOND, (-120, 38), M30, "--cell 30", ending=".asc"
-    ),
-    "grads at 54 degrees": Map(
-        "EPSG:4807",
-        1e-3,
-        (2, 60),
-        (DEGREE * 9e-4 * math.cos(math.radians(54)), DEGREE * 9e-4),
-        "--oblong",
-    ),
+    "degrees of no projection, in an ASCII grid": Map(None, SECOND, (-120, 38), M30, "--cell 30",
+        ending=".asc"),
+    "grads at 54 degrees": Map("EPSG:4807", 1e-3, (2, 60),
+        (DEGREE * 9e-4 * math.cos(math.radians(54)), DEGREE * 9e-4), "--oblong"),
     "Web Mercator at 60 N": Map("EPSG:3857", 60, MERCATOR_60, M30),
     "Mercator of an ellipsoid at 60 N": Map("EPSG:3395", 60, (1.6e6, 8.3625e6), M30),
     "Mercator of Esri at 60 N": Map("ESRI:54004", 60, (1.6e6, 8.3625e6), M30),
     "equal areas at 30 N": Map("EPSG:6933", 30, (1e6, 3.66e6), M30),
     # Widths shrink by cos(60) / cos(30) and heights grow as much.
-    "equal areas at 60 N": Map(
-        "EPSG:6933", 30, (1e6, 6.33e6), (30 / 3**-0.5 * 3**-1.0, 30 * 3**0.5), "--oblong"
-    ),
+    "equal areas at 60 N": Map("EPSG:6933", 30, (1e6, 6.33e6),
+        (30 / 3**-0.5 * 3**-1.0, 30 * 3**0.5), "--oblong"),
     "sinusoidal on its meridian": Map(SINUSOIDAL, 30, (0, 4e6), M30),
-}
+}  # fmt: skip
 
 
 def raster(path: Path, place: Map, direction: tuple[float, float]) -> Path:
@@ -130,13 +113,7 @@ def raster(path: Path, place: Map, direction: tuple[float, float]) -> Path:
     return file
 
 
-def made(folder: Path, *flags: object) -> dict[str, Any]:
-    out = folder / "out" / "land.toml"
-    main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
-    return tomllib.loads(out.read_text("utf-8"))
-
-
-@pytest.mark.parametrize("direction", [(1, 0), (0, -1), (0.6, 0.8)])
+@pytest.mark.parametrize("direction", [(1, 0), (0.6, 0.8)])
 @pytest.mark.parametrize("case", SLOPES)
 def test_a_slope_of_10_degrees_is_one_in_every_unit_and_projection(
     case: str, direction: tuple[float, float], tmp_path: Path
@@ -148,9 +125,6 @@ def test_a_slope_of_10_degrees_is_one_in_every_unit_and_projection(
     assert names
     for name in names:
         assert float(name.split()[0]) == pytest.approx(10, abs=0.2), name
-
-
-EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
 
 
 def notes(capsys: pytest.CaptureFixture[str]) -> str:
@@ -166,7 +140,7 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, *flags: object) ->
 
 def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assumed = "heights taken as metres, as nothing says their unit; --height-unit ft changes that"
-    model, dem = tmp_path / "out" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
+    model, dem = tmp_path / "new" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
     made(tmp_path, dem)
     assert assumed in notes(capsys) and f"# {assumed}" in model.read_text()
     for unit, words in (("ft", "international feet"), ("US survey foot", "US survey feet")):

@@ -8,13 +8,14 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
 from failures import fails
-from processes import find, server, stopped, unused_instance
+from processes import eventually, find, server, stopped, unused_instance
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, NotEnoughMemoryError
@@ -60,62 +61,41 @@ def python(code: str, *arguments: object, limit: str = "true") -> str:
     return ended.stdout
 
 
-class Group:
-    """A cgroup, and one in it, which a shell enters."""
+@contextmanager
+def cgroup(kind: str, names: list[str], value: str) -> Iterator[tuple[Path, str]]:
+    """A cgroup with a limit, by one of the names that versions of cgroups have for it.
 
-    def __init__(self, kind: str) -> None:
-        versions = [Path("/sys/fs/cgroup", kind), Path("/sys/fs/cgroup")]
-        base = next((it for it in versions if (it / "cgroup.procs").exists()), None)
-        if os.getuid() != 0 or base is None:
-            pytest.skip("needs root, and cgroups")
-        self.outer = base / f"emberwatch-test-{os.getpid()}"
-        self.inner = self.outer / "inner"
-        self.enter = f"echo $$ > {self.inner}/cgroup.procs"
-
-    def make(self, names: list[str], value: str) -> None:
-        """Makes it with a limit under one of the names, which versions of cgroups differ in."""
+    Yields it, and what a shell runs to enter another group within it.
+    """
+    versions = [Path("/sys/fs/cgroup", kind), Path("/sys/fs/cgroup")]
+    base = next((it for it in versions if (it / "cgroup.procs").exists()), None)
+    if os.getuid() != 0 or base is None:
+        pytest.skip("needs root, and cgroups")
+    outer = base / f"emberwatch-test-{os.getpid()}"
+    inner = outer / "inner"
+    try:
         try:
-            self.inner.mkdir(parents=True)
+            inner.mkdir(parents=True)
         except OSError as error:
             pytest.skip(f"no cgroup can be made: {error}")
-        for name in names:
-            if (self.outer / name).exists():
-                (self.outer / name).write_text(value)
-                return
-        pytest.skip(f"the cgroup has none of {names}")
-
-    def remove(self) -> None:
-        for folder in (self.inner, self.outer):
-            for _ in range(100):  # its processes are just ending
-                try:
-                    folder.rmdir()
-                    break
-                except FileNotFoundError:
-                    break
-                except OSError:
-                    time.sleep(0.05)
-
-
-@pytest.fixture
-def memory() -> Iterator[Group]:
-    """A cgroup around another one that may have 400 MB of memory."""
-    group = Group("memory")
-    try:
-        group.make(["memory.limit_in_bytes", "memory.max"], "400M")
-        yield group
+        limit = next((outer / name for name in names if (outer / name).exists()), None)
+        if limit is None:
+            pytest.skip(f"the cgroup has none of {names}")
+        limit.write_text(value)
+        yield outer, f"echo $$ > {inner}/cgroup.procs"
     finally:
-        group.remove()
+        for folder in (inner, outer):  # once their processes have ended
+            assert eventually(partial(removed, folder))
 
 
-@pytest.fixture
-def pids() -> Iterator[Group]:
-    """The same with six processes and threads."""
-    group = Group("pids")
-    try:
-        group.make(["pids.max"], "6")
-        yield group
-    finally:
-        group.remove()
+def removed(folder: Path) -> bool:
+    with suppress(OSError):
+        folder.rmdir()
+    return not folder.exists()
+
+
+#: 400 MB of memory.
+MEMORY = "memory", ["memory.limit_in_bytes", "memory.max"], "400M"
 
 
 @pytest.mark.parametrize(
@@ -129,30 +109,21 @@ def test_worlds_beyond_a_ulimit_are_refused_with_numbers(limit: str, name: str) 
     assert f"the limit {name}; raise it (`ulimit " in said, said
 
 
-def test_a_server_beyond_a_ulimit_says_so() -> None:
-    place = f"--instance={unused_instance()}"
-    ended = run(find("emberwatch-server"), place, *LARGE, limit="ulimit -v 800000")
-    assert ended.returncode == 1, ended
-    assert "memory: expected " in ended.stderr and "RLIMIT_AS" in ended.stderr, ended
-
-
-def test_worlds_beyond_a_cgroup_are_refused_with_its_limit(memory: Group) -> None:
-    said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=memory.enter)
-    assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
-    assert f"the limit of a cgroup ({memory.outer}/memory." in said, said
-    place = f"--instance={unused_instance()}"
-    ended = run(find("emberwatch-server"), place, *LARGE, limit=memory.enter)
-    assert ended.returncode == 1 and f"cgroup ({memory.outer}/memory." in ended.stderr, ended
-
-
-def test_worlds_within_a_limit_are_made_and_fly(memory: Group) -> None:
-    code = """
+def test_a_cgroup_limits_worlds_by_its_memory() -> None:
+    few = """
 client = emberwatch.embed(worlds=32, height=512, width=512, moves=4, burn_in=0)
 lease = client.acquire(0, 32)
 for _ in range(5): lease.step([[1] * 4] * 32)
 print(len(lease.reset(range(32))))
 """
-    assert python(code, limit=memory.enter) == "32\n"
+    with cgroup(*MEMORY) as (outer, enter):
+        said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=enter)
+        assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
+        assert f"the limit of a cgroup ({outer}/memory." in said, said
+        place = f"--instance={unused_instance()}"
+        ended = run(find("emberwatch-server"), place, *LARGE, limit=enter)
+        assert ended.returncode == 1 and f"cgroup ({outer}/memory." in ended.stderr, ended
+        assert python(few, limit=enter) == "32\n"
 
 
 @pytest.mark.parametrize(
@@ -203,16 +174,16 @@ tell(make)
     assert said.count("Resource temporarily unavailable") == 1, said
 
 
-def test_a_cgroup_without_threads_is_named(pids: Group) -> None:
-    place = f"--instance={unused_instance()}"
-    flags = [place, "--threads=16", "--burn-in=0"]
-    ended = run(find("emberwatch-server"), *flags, limit=pids.enter)
+def test_a_cgroup_without_threads_is_named() -> None:
+    flags = [f"--instance={unused_instance()}", "--threads=16", "--burn-in=0"]
+    with cgroup("pids", ["pids.max"], "6") as (outer, enter):
+        ended = run(find("emberwatch-server"), *flags, limit=enter)
+        said = python("tell(lambda: emberwatch.embed(threads=16, worlds=16))", limit=enter)
     assert ended.returncode == 1, ended
     assert "threads: expected to start 16, got: Resource temporarily" in ended.stderr, ended
     assert ended.stderr.count("Resource temporarily unavailable") == 1, ended
-    assert f"({pids.outer}/pids.max)" in ended.stderr and "--pids-limit" in ended.stderr, ended
-    said = python("tell(lambda: emberwatch.embed(threads=16, worlds=16))", limit=pids.enter)
-    assert f"({pids.outer}/pids.max)" in said, said
+    assert f"({outer}/pids.max)" in ended.stderr and "--pids-limit" in ended.stderr, ended
+    assert f"({outer}/pids.max)" in said, said
 
 
 @on_x86
@@ -220,8 +191,8 @@ def test_a_cgroup_without_threads_is_named(pids: Group) -> None:
     ("call", "number"),
     [
         ("pidfd_open", errno.EPERM),
-        ("pidfd_open", errno.ENOSYS),
-        ("pidfd_open", errno.EACCES),
+        pytest.param("pidfd_open", errno.ENOSYS, marks=pytest.mark.slow),
+        pytest.param("pidfd_open", errno.EACCES, marks=pytest.mark.slow),
         ("flock", errno.EPERM),
         ("fallocate", errno.EPERM),
         ("socket", errno.EAFNOSUPPORT),
@@ -262,7 +233,7 @@ tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
 
 
 @on_x86
-def test_a_process_to_end_with_that_cannot_be_watched_is_not_called_ended() -> None:
+def test_a_process_that_cannot_be_watched_is_not_called_ended() -> None:
     code = "refuse(434, 1); os.execv(sys.argv[1], sys.argv[1:])"
     flags = [f"--instance={unused_instance()}", f"--exit-with={os.getpid()}"]
     ended = run(sys.executable, "-c", HEAD + code, find("emberwatch-server"), *flags)
@@ -293,12 +264,12 @@ print(free, needed, count() - before)
 """
 
 
-@pytest.mark.parametrize(("kind", "within"), [("connect", 1), ("observe", 1)])
-def test_a_connection_takes_as_many_descriptors_as_it_says(kind: str, within: int) -> None:
+@pytest.mark.parametrize("kind", ["connect", "observe"])
+def test_a_connection_takes_as_many_descriptors_as_it_says(kind: str) -> None:
     said = python(DESCRIPTORS, server().instance, kind)
     free, needed, left = map(int, said.split())
     assert left == 0
-    assert needed <= free <= needed + within, said
+    assert needed <= free <= needed + 1, said
 
 
 def test_attempts_that_time_out_leave_no_descriptor_and_no_place() -> None:

@@ -1,10 +1,9 @@
 """All robots of a world through PettingZoo, and each of them in an environment of its own."""
 
-import hashlib
-import json
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -22,11 +21,10 @@ from environments import (
 )
 from failures import refuses
 from pettingzoo.utils.conversions import parallel_to_aec
-from processes import at_once, script
+from processes import at_once
 
 import emberwatch
 from emberwatch.envs.parallel import WildfireParallelEnv
-from emberwatch.errors import EmberwatchError
 
 with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
     from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
@@ -41,8 +39,9 @@ def team(**keywords: Any) -> WildfireParallelEnv:
     return emberwatch.parallel_env(**{**SMALL, "robots": 4, **keywords})
 
 
-@pytest.mark.parametrize("observation", ["local", "image", "team", "others"])
-@pytest.mark.parametrize("robots", [2, 3])
+@pytest.mark.parametrize(
+    ("robots", "observation"), [(2, "local"), (3, "image"), (2, "team"), (3, "others")]
+)
 def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
     with no_warnings():
         parallel_api_test(team(robots=robots, observation=observation), num_cycles=100)
@@ -155,9 +154,8 @@ def test_a_team_is_drawn_as_a_whole() -> None:
     assert (env.render() != before).any()
 
 
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
+def test_impossible_teams_are_named() -> None:
+    rows: list[tuple[dict[str, Any], str]] = [
         ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
         ({"robots": 0}, "robots: expected at least 1, got 0"),
         ({"robots": 65}, "robots: expected 1 to 64, got 65"),
@@ -165,11 +163,10 @@ def test_a_team_is_drawn_as_a_whole() -> None:
         ({"reward": "all"}, "reward: expected one of 'share', 'team', 'marginal', 'move'"),
         ({"action": "path", "reward": "move"}, "reward: expected one of 'share', 'team', 'marg"),
         ({"observation": "age of fire"}, "observation: expected one or several of"),
-    ],
-)
-def test_impossible_teams_are_named(keywords: dict[str, Any], words: str) -> None:
-    with refuses(words):
-        team(**keywords)
+    ]
+    for keywords, words in rows:
+        with refuses(words):
+            team(**keywords)
 
 
 def test_actions_of_other_agents_are_refused() -> None:
@@ -194,8 +191,7 @@ def alone(instance: str, robot: int, **keywords: Any) -> Any:
     return make(instance=instance, robot=robot, **keywords)
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
-@pytest.mark.parametrize("reward", ["share", "team", "marginal"])
+@pytest.mark.parametrize(("order", "reward"), [((0, 1, 2, 3), "share"), ((3, 1, 0, 2), "marginal")])
 def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], reward: str) -> None:
     paths = random_actions(6, 4, (4,))
     with serving(robots=4) as instance:
@@ -214,57 +210,6 @@ def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], rew
             for robot, flown in zip(order, at_once(*calls), strict=True):
                 assert flown[4].pop("n_missed") == 0
                 assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
-
-
-FLY = """
-import hashlib, json, sys
-import gymnasium, emberwatch
-robot, paths = int(sys.argv[2]), json.loads(sys.argv[3])
-env = gymnasium.make("emberwatch/Wildfire-v0", instance=sys.argv[1], robot=robot, timeout=20.0)
-env.reset()
-print("holds its robot", flush=True)
-input()
-for path in paths:
-    seen, reward, *_ , info = env.step(path)
-    told = [seen["frame"].tobytes(), seen["robot"].tolist(), reward, info]
-    print(hashlib.sha256(repr(told).encode()).hexdigest(), flush=True)
-env.close()
-"""
-
-
-def test_four_processes_are_the_team() -> None:
-    paths = random_actions(20, 4, (4,))
-    with serving(robots=4) as instance:
-        env = team(instance=instance, action="path", observation=("frame", "robot"))
-        expected = rollout(env, paths, 5)[1:]
-        env.reset(seed=5)
-        env.close()
-        given = [[path[agent].tolist() for path in paths] for agent in AGENTS]
-        flyers = [script(FLY, instance, robot, json.dumps(given[robot])) for robot in (2, 0, 3, 1)]
-        for flyer in flyers:
-            assert flyer.line() == "holds its robot"
-        for flyer in flyers:
-            flyer.say()
-        for robot, flyer in zip((2, 0, 3, 1), flyers, strict=True):
-            for seen, rewards, _, _, infos in expected:
-                agent = AGENTS[robot]
-                frame, cell = seen[agent]["frame"].tobytes(), seen[agent]["robot"].tolist()
-                told = [frame, cell, rewards[agent], infos[agent] | {"n_missed": 0}]
-                assert flyer.line() == hashlib.sha256(repr(told).encode()).hexdigest()
-
-
-def test_robots_that_nobody_holds_hover() -> None:
-    with serving(robots=3) as instance:
-        one = alone(instance, 1, observation=("frame", "robot", "others", "team"))
-        seen, _ = one.reset(seed=3)
-        before = seen["others"].copy()
-        for _ in range(3):
-            seen, _, _, _, info = one.step([1, 1, 3, 3])
-            assert info["n_missed"] == 0
-            assert (seen["others"] == before).all() and before.sum() == 2 * 255
-            assert (seen["team"] == seen["frame"]).all()
-        other = alone(instance, 2)
-        assert other.reset()[1] == info | {"n_visited": 0}
 
 
 def test_a_late_path_is_not_flown_and_told() -> None:
@@ -314,55 +259,27 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCapt
         assert "world 0 waits for the paths of other robots that are held" in caplog.text
 
 
-def test_a_robot_is_taken_over_where_it_stands() -> None:
-    with serving(robots=2) as instance:
-        first = alone(instance, 1)
-        first.reset()
-        seen = first.step([0, 0, 2, 2])[0]
-        with pytest.raises(EmberwatchError, match="busy"):
-            alone(instance, 1).reset()
-        second = alone(instance, 1, takeover=True)
-        again, info = second.reset()
-        assert info["step"] == 1
-        assert_same(again["robot"], seen["robot"])
-        with pytest.raises(emberwatch.errors.LeaseLostError):
-            first.step([0, 0, 0, 0])
-
-
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
-        ({}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
-        ({"robot": 3}, "robot: expected 0 to 2, got 3"),
-        ({"robot": -1}, "robot: expected 0 to 2, got -1"),
-        ({"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
-        ({"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
-    ],
-)
-def test_a_robot_that_is_not_there_is_named(keywords: dict[str, Any], words: str) -> None:
-    with serving(robots=3) as instance, refuses(words):
-        make(instance=instance, **keywords)
-
-
-def test_own_worlds_and_vectors_have_no_single_robot() -> None:
-    with refuses("robots: expected one robot in a world, got 2"):
-        make(robots=2)
+def test_keywords_that_fit_no_team_of_a_server_are_named() -> None:
+    of_one = "expected worlds of one robot, as options are planned for one"
+    with serving(robots=3) as instance:
+        rows: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+            (make, {}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
+            (make, {"robot": 3}, "robot: expected 0 to 2, got 3"),
+            (make, {"robot": -1}, "robot: expected 0 to 2, got -1"),
+            (make, {"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
+            (make, {"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
+            (partial(make_vec, 3), {"robot": 0}, "robot: expected None, as a vector"),
+            (partial(make, OBJECTIVE), {"robot": 0}, of_one),
+            (partial(make_vec, 3, OBJECTIVE), {}, of_one),
+        ]
+        for maker, keywords, words in rows:
+            with refuses(words):
+                maker(instance=instance, **keywords)
+    for maker in (make, partial(make, OBJECTIVE)):
+        with refuses("robots: expected one robot in a world, got 2"):
+            maker(robots=2)
     with refuses("a multiple of 2, got 3"):
         make_vec(3, robots=2)
-    with serving(robots=2) as instance:
-        with refuses("robot: expected None, as a vector"):
-            make_vec(2, instance=instance, robot=0)
-
-
-def test_options_are_for_worlds_of_one_robot() -> None:
-    words = "expected worlds of one robot, as options are planned for one"
-    with refuses("robots: expected one robot in a world, got 2"):
-        make(OBJECTIVE, robots=2)
-    with serving(robots=2) as instance:
-        with refuses(words):
-            make(OBJECTIVE, instance=instance, robot=0)
-        with refuses(words):
-            make_vec(2, OBJECTIVE, instance=instance)
 
 
 def test_rows_of_a_world_are_reset_together() -> None:

@@ -42,18 +42,6 @@ def test_it_is_simulated_once() -> None:
         first[:] = 0
 
 
-def test_later_processes_read_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    simulated_prior.cache_clear()
-    first = simulated_prior(MODEL, **WORLD)
-    (file,) = (tmp_path / "emberwatch/beliefs").iterdir()
-    written = file.stat()
-    simulated_prior.cache_clear()
-    assert np.array_equal(simulated_prior(MODEL, **WORLD), first)
-    assert file.stat().st_mtime_ns == written.st_mtime_ns
-    assert written.st_mode & 0o777 == 0o600
-
-
 def test_control_c_ends_it() -> None:
     process = script(ENDLESS)
     assert process.line() == "begun"

@@ -44,7 +44,7 @@ def test_what_was_not_seen_has_the_muted_colour_of_its_zone() -> None:
 
 
 @pytest.mark.parametrize("truth", [False, True])
-def test_no_fly_cells_are_hatched_in_what_stands_out_from_their_colour(truth: bool) -> None:
+def test_no_fly_cells_are_hatched_in_a_colour_that_stands_out(truth: bool) -> None:
     left = (3 * SCALE + GAP) * truth
     plain, image = draw(truth=True), draw(truth=True, no_fly=NO_FLY)
     for row, col in np.ndindex(FRAME.shape):

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,18 @@ CONFIG = Path(__file__).parents[3] / "config"
 
 TASKS = built_in_tasks()
 
-#: Those that one robot flies in.
-ALONE = [name for name, task in TASKS.items() if task.robots == 1]
+#: Flags of servers that a task decides.
+OF_TASKS = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
+
+
+def each(names: Iterable[str]) -> pytest.MarkDecorator:
+    """A test for each of these tasks; burn-ins of some take seconds."""
+    marks = {"sparse": pytest.mark.slow, "latent": pytest.mark.slow}
+    kept = [pytest.param(name, marks=marks.get(name, ())) for name in names]
+    return pytest.mark.parametrize("name", kept)
+
+
+each_alone = each(name for name, task in TASKS.items() if task.robots == 1)
 
 
 def warns_of_tests(name: str) -> Any:
@@ -59,16 +70,15 @@ def test_the_package_has_the_files_of_the_programs() -> None:
         Task.named("ash")
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_ids_end_episodes_with_the_task(name: str) -> None:
-    task = TASKS[name]
-    for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
-        spec = gymnasium.spec(f"emberwatch/{TASKS[name].ids}{kind}")
-        assert spec.max_episode_steps == n_moves * task.max_steps
-        assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
+def test_ids_end_episodes_with_the_task() -> None:
+    for name, task in TASKS.items():
+        for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
+            spec = gymnasium.spec(f"emberwatch/{task.ids}{kind}")
+            assert spec.max_episode_steps == n_moves * task.max_steps
+            assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
 
 
-@pytest.mark.parametrize("name", ALONE)
+@each_alone
 def test_a_task_is_its_settings_by_hand(name: str) -> None:
     file = CONFIG / f"tasks/{name}.toml"
     for kind, steps, other in (
@@ -85,7 +95,7 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
             env.close()
 
 
-@pytest.mark.parametrize("name", TASKS)
+@each(TASKS)
 def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
     task = TASKS[name]
     n_rows = 2 * task.robots
@@ -100,7 +110,7 @@ def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
             envs.close()
 
 
-@pytest.mark.parametrize("name", ALONE)
+@each_alone
 def test_gymnasium_finds_no_fault(name: str) -> None:
     # The filter's first belief takes seconds on larger grids.
     kinds = ["-v0", "Moves-v0"] + (["Objective-v1"] if name == "small" else [])
@@ -124,9 +134,7 @@ def test_pettingzoo_finds_no_fault_in_the_team() -> None:
 def test_one_robot_flies_the_team_s_world_only_beside_others() -> None:
     with refuses("robots: expected one robot in a world, got 4: fly one of them with robot="):
         gymnasium.make("emberwatch/WildfireTeam-v0")
-    with serving(
-        task="team", **dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
-    ) as lab:
+    with serving(task="team", **OF_TASKS) as lab:
         env = gymnasium.make("emberwatch/WildfireTeam-v0", instance=lab, robot=2)
         env.reset()
         env.close()
@@ -139,29 +147,19 @@ def test_a_task_ends_episodes_in_any_environment() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("keyword", "value", "setting"),
-    [
-        ("model", "wildfire", "model"),
-        ("states", "jacksboro", "states"),
-        ("states_symmetries", True, "states_symmetries"),
-        ("states_offset", 3, "states_offset"),
-        ("height", 16, "height"),
-        ("width", 16, "width"),
-        ("n_moves", 16, "moves"),
-        ("robots", 1, "robots"),
-        ("burn_in", 3000, "burn_in"),
-        ("start", "corner", "start"),
-    ],
-)
-def test_what_a_task_decides_is_refused_by_name(keyword: str, value: Any, setting: str) -> None:
-    with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
-        gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
+def test_what_a_task_decides_is_refused_by_name() -> None:
+    decided: dict[str, Any] = {"model": "wildfire", "states": "jacksboro", "sensor_radius": 1}
+    decided |= {"states_symmetries": True, "states_offset": 3, "height": 16, "width": 16}
+    decided |= {"n_moves": 16, "robots": 1, "burn_in": 3000, "start": "corner"}
+    for keyword, value in decided.items():
+        with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
+            gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
+    with refuses('task : expected a name or a file, got ""'):
+        gymnasium.make("emberwatch/Wildfire-v0", task="")
 
 
 def test_a_running_server_must_have_the_task() -> None:
-    plain = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
-    with serving(task="small", **plain) as lab, emberwatch.connect(lab) as client:
+    with serving(task="small", **OF_TASKS) as lab, emberwatch.connect(lab) as client:
         assert client.info.task == "small"
         env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
         env.reset()
@@ -177,36 +175,33 @@ def test_a_running_server_must_have_the_task() -> None:
             gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task="ash")
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new", "words"),
-    [
-        ("small", "moves = 16", "moves = 15", "moves of task 'own': expected 16, as the server"),
-        ("small", "burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected 3000, as"),
-        ("small", "max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected 300"),
-        ("small", "wildfire-small", "wildfire", "states of task 'own': expected those that the"),
-        ("team", "robots = 4", "robots = 3", "robots of task 'own': expected 4, as the server"),
+#: Changes of a task, and words about a server of the task before.
+CHANGED = {
+    "small": [
+        ("moves = 16", "moves = 15", "moves of task 'own': expected 16, as the server"),
+        ("burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected 3000, as"),
+        ("max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected 300"),
+        ("wildfire-small", "wildfire", "states of task 'own': expected those that the"),
     ],
-)
-def test_a_running_server_must_run_what_the_task_says(
-    tmp_path: Path, name: str, old: str, new: str, words: str
-) -> None:
+    "team": [("robots = 4", "robots = 3", "robots of task 'own': expected 4, as the server")],
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_running_server_must_run_what_the_task_says(tmp_path: Path, name: str) -> None:
     file = tmp_path / "own.toml"
     text = (CONFIG / f"tasks/{name}.toml").read_text("utf-8").replace(f'"{name}"', '"own"')
     file.write_text(text, "utf-8")
-    plain = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
-    with serving(task=file, **plain) as lab:
-        env = gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task=file, robot=0)
+    with serving(task=file, **OF_TASKS) as lab:
+        keywords = {"instance": lab, "task": file, "robot": 0}
+        env = gymnasium.make("emberwatch/Wildfire-v0", **keywords)
         env.reset()
         env.close()
-        assert old in text
-        file.write_text(text.replace(old, new), "utf-8")
-        with refuses(words):
-            gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task=file, robot=0)
-
-
-def test_a_task_needs_a_name() -> None:
-    with refuses('task : expected a name or a file, got ""'):
-        gymnasium.make("emberwatch/Wildfire-v0", task="")
+        for old, new, words in CHANGED[name]:
+            assert old in text
+            file.write_text(text.replace(old, new), "utf-8")
+            with refuses(words):
+                gymnasium.make("emberwatch/Wildfire-v0", **keywords)
 
 
 def test_an_evaluation_takes_seeds_and_steps_of_its_task(tmp_path: Path) -> None:
@@ -299,12 +294,6 @@ def test_seeds_of_a_vector_are_those_of_its_worlds(own: Path) -> None:
     for seed in (2, [None, None, None, 5]):
         with warns_of_tests("own"):
             envs.reset(seed=seed)
-
-
-def test_only_tasks_have_test_worlds() -> None:
-    with no_warnings():
-        env = closed_later(gymnasium.make("emberwatch/Wildfire-v0", burn_in=0))
-        env.reset(seed=0)
 
 
 def test_evaluations_are_on_test_worlds_without_a_warning(own: Path, tmp_path: Path) -> None:

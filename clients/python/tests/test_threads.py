@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from environments import MOVES, SMALL, assert_same, closed_later, make, make_vec, rollout
 from failures import fails
-from processes import script, server
+from processes import at_once, script, server
 
 import emberwatch
 
@@ -139,11 +139,7 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
         for _ in range(20):
             steps.append(env.step(action))
 
-    threads = [threading.Thread(target=step) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(step, step, step, step)
 
     # They may be appended in another order.
     def moment(outcome: Any) -> str:
@@ -205,7 +201,7 @@ def test_a_forked_child_does_not_wait_for_a_thread_that_steps() -> None:
     thread.join()
 
 
-def test_ctrl_c_ends_the_wait_for_another_thread_and_leaves_the_environment_usable() -> None:
+def test_ctrl_c_ends_the_wait_for_another_thread() -> None:
     env, alone = make(), make()
     expected = rollout(alone, 3, seed=1000)
     env.reset(seed=1000)

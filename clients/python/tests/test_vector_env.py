@@ -1,10 +1,8 @@
 """The vector environments against Gymnasium's `SyncVectorEnv` of single ones."""
 
 import copy
-import gc
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -21,11 +19,11 @@ from environments import (
     no_warnings,
     serving,
 )
-from failures import fails, refuses
+from failures import refuses
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import emberwatch
-from emberwatch.errors import InvalidArgumentError, LeaseLostError
+from emberwatch.errors import LeaseLostError
 
 PARTS = ("frame", "robot", "age")
 
@@ -159,48 +157,17 @@ def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: s
         assert holders == [(None,), (None,), (pid,), (pid,), (pid,)]
 
 
-@pytest.mark.parametrize(
-    "seed", [0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)], ids=lambda seed: repr(seed)
-)
-def test_seeds_are_those_of_single_environments(seed: Any) -> None:
+def test_seeds_are_those_of_single_environments() -> None:
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, truth=True)
-    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
-    plain = int(seed) if isinstance(seed, np.integer) else seed
-    assert_same(ours.reset(seed=seed), theirs.reset(seed=plain))
-    # The generators go on alike.
-    for _ in range(2):
-        assert_same(ours.reset(), theirs.reset())
-
-
-def test_many_worlds_take_staggered_ends() -> None:
-    ours, theirs = pair(9, AutoresetMode.NEXT_STEP, max_episode_steps=4)
-    assert_same(ours.reset(seed=2), theirs.reset(seed=2))
-    masks = np.random.default_rng(3)
-    for _ in range(3):
-        assert_same_steps(ours, theirs, 1)
-        assert_same_resets(ours, theirs, masks.random(9) < 0.5)
-    assert assert_same_steps(ours, theirs, 15) > 20
+    for seed in (0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)):
+        plain = int(seed) if isinstance(seed, np.integer) else seed
+        assert_same(ours.reset(seed=seed), theirs.reset(seed=plain), repr(seed))
+        # The generators go on alike.
+        for _ in range(2):
+            assert_same(ours.reset(), theirs.reset(), repr(seed))
 
 
 # reset
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"reset_mask": [True, False]}, r"expected an array \(2,\) of bool .* got <class 'list'>"),
-        ({"reset_mask": np.array([1, 0])}, r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
-        ({"reset_mask": np.array([True])}, r"expected an array \(2,\) of bool .* got bool \(1,\)"),
-        ({"reset_mask": np.zeros(2, bool)}, "with at least one True"),
-        ({"mask": np.ones(2, bool)}, "options: expected 'resume', got 'mask'"),
-    ],
-    ids=str,
-)
-def test_a_wrong_reset_mask_is_named(options: dict[str, Any], message: str) -> None:
-    env = make_vec(2)
-    env.reset(seed=1)
-    with refuses(message):
-        env.reset(options=options)
 
 
 def test_a_reset_mask_is_left_as_it_was() -> None:
@@ -219,19 +186,12 @@ def test_the_first_reset_is_of_all_worlds() -> None:
         env.reset(options={"reset_mask": np.array([True, False])})
 
 
-@pytest.mark.parametrize("seed", [[1], [1, 2, 3], []], ids=str)
-def test_a_wrong_number_of_seeds_is_named(seed: list[int]) -> None:
-    env = make_vec(2)
-    with refuses("seed: expected an integer, None or 2 of them, got"):
-        env.reset(seed=seed)
-
-
-@pytest.mark.parametrize("seed", [-1, 2**64 - 1], ids=str)
-def test_an_impossible_seed_is_named_and_changes_nothing(seed: int) -> None:
+def test_an_impossible_seed_changes_nothing() -> None:
     ours, theirs = pair(2, AutoresetMode.NEXT_STEP, truth=True)
     assert_same(ours.reset(seed=1), theirs.reset(seed=1))
-    with refuses("seed: expected an integer within 0 to"):
-        ours.reset(seed=seed)
+    for seed in (-1, 2**64 - 1):
+        with refuses("seed: expected an integer within 0 to"):
+            ours.reset(seed=seed)
     assert_same(ours.reset(), theirs.reset())
 
 
@@ -274,24 +234,6 @@ def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
 # step
 
 
-@pytest.mark.parametrize(
-    ("paths", "message"),
-    [
-        (np.full((2, 4), 4), r"expected moves 0 to 3, got 4 at \(0, 0\)"),
-        (np.zeros((2, 3), int), r"expected shape \(2, 4\), got \(2, 3\)"),
-        (np.zeros((3, 4), int), r"expected shape \(2, 4\), got \(3, 4\)"),
-        (np.zeros((2, 4)), "expected integers, got float64"),
-    ],
-    ids=str,
-)
-def test_wrong_paths_are_named_and_not_flown(paths: Any, message: str) -> None:
-    env = make_vec(2)
-    env.reset(seed=1)
-    with pytest.raises(InvalidArgumentError, match=message):
-        env.step(paths)
-    assert env.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
-
-
 @by_name
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
 def test_what_was_returned_is_never_changed(mode: AutoresetMode, name: str) -> None:
@@ -332,70 +274,7 @@ def _spoil(value: Any) -> None:
             _spoil(part)
 
 
-@pytest.mark.parametrize("mode", AutoresetMode, ids=str)
-def test_moves_that_pay_are_those_of_single_environments(mode: AutoresetMode) -> None:
-    keywords = {"name": MOVES, "reward": "move", "max_episode_steps": 40}
-    ours, theirs = pair(3, mode, **keywords)
-    left, right = ours.reset(seed=6), theirs.reset(seed=6)
-    paid = 0.0
-    for action in actions(theirs, 40):
-        left, right = ours.step(action), theirs.step(action)
-        assert_same(left, right)
-        paid += left[1].sum()
-    assert paid > 0
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        ([0], r"integers of shape \(2,\), got int64 \(1,\)"),
-        ([0.5, 1.0], r"integers of shape \(2,\), got float64"),
-        ([0, 4], "expected 0 to 3, got 4 for world 1"),
-        ([-1, 0], "expected 0 to 3, got -1 for world 0"),
-        ([[0], [1, 2]], "action: expected an array"),
-        ("up", "integers of shape"),
-    ],
-    ids=repr,
-)
-def test_wrong_moves_are_named_and_not_flown(action: Any, message: str) -> None:
-    env = make_vec(2, MOVES, observation="move")
-    env.reset(seed=1)
-    with refuses(message):
-        env.step(action)
-    assert env.step(np.zeros(2, int))[0].tolist() == [1, 1]
-
-
 # Keywords and the registry
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"max_episode_steps": 0}, "max_episode_steps: expected at least 1 or None, got 0"),
-        ({"autoreset_mode": "sometimes"}, "sometimes"),
-        ({"n_worlds": 0}, "num_envs: expected 1 to 1024, got 0"),
-        ({"n_worlds": 1025}, "num_envs: .* got 1025"),
-        ({"observation": "smoke"}, "observation: .* got 'smoke'"),
-        ({"world": 2}, "^world: applies only with instance="),
-    ],
-    ids=str,
-)
-def test_impossible_keywords_are_named(keywords: dict[str, Any], message: str) -> None:
-    with no_warnings(), pytest.raises(ValueError, match=message):
-        make_vec(**{"n_worlds": 2, **keywords})
-    gc.collect()
-
-
-def test_worlds_that_a_server_does_not_have_are_named() -> None:
-    with serving(worlds=3) as instance:
-        with refuses("expected worlds within 0 to 2, got 1 to 3"):
-            make_vec(3, instance=instance, world=1)
-        one, other = make_vec(2, instance=instance), make_vec(2, instance=instance, world=1)
-        one.reset(seed=1)
-        with fails("busy", match=f"pid {os.getpid()}"):
-            other.reset(seed=1)
-        one.close()
-        other.reset(seed=1)
 
 
 def test_the_registry_sets_spec_and_metadata() -> None:
@@ -425,29 +304,10 @@ def test_the_registrys_time_limit_holds_unless_another_is_given() -> None:
     assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_gymnasiums_own_vectorizers_work(mode: str) -> None:
+def test_gymnasiums_own_vectorizer_works() -> None:
     ours = make_vec(2)
-    theirs = make_vec(2, vectorization_mode=mode)
+    theirs = make_vec(2, vectorization_mode="async")
     assert_same_flight(ours, theirs, 3, seed=2)
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_statistics_are_those_of_single_environments(mode: AutoresetMode) -> None:
-    ours, theirs = pair(2, mode, max_episode_steps=4)
-    with no_warnings():
-        ours = gymnasium.wrappers.vector.RecordEpisodeStatistics(ours)
-        theirs = gymnasium.wrappers.vector.RecordEpisodeStatistics(theirs)
-    ours.reset(seed=1)
-    theirs.reset(seed=1)
-    n_ends = 0
-    for action in actions(theirs, 11):
-        left, right = ours.step(action)[4], theirs.step(action)[4]
-        if "episode" in right:
-            n_ends += 1
-            for key in ("r", "l"):
-                assert_same(left["episode"][key], right["episode"][key])
-    assert n_ends == 2
 
 
 def test_vector_wrappers_work() -> None:
@@ -477,22 +337,6 @@ def test_pictures_are_those_of_single_environments(name: str) -> None:
         assert_same(ours.render(), theirs.render(), f"step {step}")
 
 
-def test_videos_are_recorded(tmp_path: Path) -> None:
-    pytest.importorskip("moviepy")
-    folder = tmp_path / "videos"
-    env = gymnasium.wrappers.vector.RecordVideo(
-        make_vec(2, render_mode="rgb_array", max_episode_steps=4),
-        str(folder),
-        video_length=3,
-        disable_logger=True,
-    )
-    env.reset(seed=1)
-    for action in actions(env, 5):
-        env.step(action)
-    env.close()
-    assert {path.suffix for path in folder.iterdir()} == {".mp4"}
-
-
 def test_texts_and_windows_are_shown() -> None:
     with no_warnings():
         env = make_vec(2, render_mode="ansi")
@@ -507,12 +351,6 @@ def test_texts_and_windows_are_shown() -> None:
 
 
 # Life and death
-
-
-def test_an_unknown_keyword_is_named() -> None:
-    with pytest.raises(TypeError, match="argument 'burnin' .did you mean 'burn_in'"):
-        make_vec(2, burnin=3)
-    gc.collect()
 
 
 @by_name

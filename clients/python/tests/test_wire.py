@@ -278,34 +278,31 @@ def test_the_documented_land_is_read() -> None:
     assert info.zones.map.tolist() == LANDED["zones"]["map"]
 
 
-@pytest.mark.parametrize(
-    ("key", "change"),
-    [
-        ("airspace", []),
-        ("airspace", {"radius": 9}),
-        ("airspace", {"radius": None}),
-        ("airspace", {"radius": 1.0}),
-        ("airspace", {"n_rings": 4}),
-        ("airspace", {"n_rings": 0}),
-        ("airspace", {"pays": "sold"}),
-        ("airspace", {"no_fly": [[0, 0, 2], [0, 0, 0]]}),
-        ("airspace", {"no_fly": [[0, 0, 1]]}),
-        ("airspace", {"no_fly": [[0, 0, 1], [0, 0]]}),
-        ("airspace", {"no_fly": [[0, 0, 0.5], [0, 0, 0]]}),
-        ("airspace", {"no_fly": "beside.npy"}),
-        ("zones", {"names": ["land"]}),
-        ("zones", {"names": None}),
-        ("zones", {"colors": ["#b7a57a", "blue"]}),
-        ("zones", {"map": [[0, 0, 0], [0, 1, 2]]}),
-        ("zones", {"map": [[0, 0, 0], [0, 1, -1]]}),
-        ("zones", {"map": [0, 0, 0]}),
+#: Changes of the documented land that no grid has.
+NO_LAND: dict[str, list[Any]] = {
+    "airspace": [
+        [],
+        *({"radius": it} for it in (9, None, 1.0)),
+        *({"n_rings": it} for it in (4, 0)),
+        {"pays": "sold"},
+        *({"no_fly": [[0, 0, it], [0, 0, 0]]} for it in (2, 0.5)),
+        *({"no_fly": it} for it in ([[0, 0, 1]], [[0, 0, 1], [0, 0]], "beside.npy")),
     ],
-    ids=str,
-)
-def test_land_that_no_grid_has_is_a_bad_answer(key: str, change: Any) -> None:
-    told = {**LANDED[key], **change} if change else change
-    with fails("bad_answer", "'airspace' and 'zones' of the grid"):
-        record(ServerInfo, HELLO | LANDED | {key: told})
+    "zones": [
+        *({"names": it} for it in (["land"], None)),
+        {"colors": ["#b7a57a", "blue"]},
+        *({"map": [[0, 0, 0], [0, 1, it]]} for it in (2, -1)),
+        {"map": [0, 0, 0]},
+    ],
+}
+
+
+@pytest.mark.parametrize("key", NO_LAND)
+def test_land_that_no_grid_has_is_a_bad_answer(key: str) -> None:
+    for change in NO_LAND[key]:
+        told = {**LANDED[key], **change} if change else change
+        with fails("bad_answer", "'airspace' and 'zones' of the grid"):
+            record(ServerInfo, HELLO | LANDED | {key: told})
 
 
 @pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus, LeftBeliefInfo])
@@ -324,40 +321,20 @@ def garbled_control(reply: object) -> None:
         WIRED.client.acquire()
 
 
-@pytest.mark.parametrize(
-    "reply",
-    [
-        "",
-        "{",
-        "[" * 100_000,
-        "[]",
-        "null",
-        "7",
-        '"ok"',
-        {},
-        {"reply": "done"},
-        {"lease": "x", "ttl_millis": 1, "worlds": []},
-        {"lease": 1, "ttl_millis": None, "worlds": []},
-        {"lease": 1, "ttl_millis": 1},
-        {"lease": 1, "ttl_millis": 1, "worlds": {}},
-        {"lease": 1, "ttl_millis": 1, "worlds": [1]},
-        {"lease": 1, "ttl_millis": 1, "worlds": [{"world": 0}]},
-        {
-            "lease": 1,
-            "ttl_millis": 1,
-            "worlds": [{"world": 0, "step": 0, "seed": None, "episode": 0, "robots": [[0, 0]]}],
-        },
-    ],
-    ids=lambda reply: repr(reply)[:40],
-)
-def test_a_control_reply_that_makes_no_sense_is_refused(reply: object) -> None:
-    garbled_control(reply)
-
-
-@pytest.mark.parametrize("name", ["pid", "height", "observations", "model", "coverage"])
-def test_a_handshake_that_makes_no_sense_is_refused(name: str) -> None:
-    with fails("bad_answer", match=name):
-        Wired(**{name: {}})
+def test_replies_that_make_no_sense_are_refused() -> None:
+    world = {"world": 0, "step": 0, "seed": None, "episode": 0, "robots": [[0, 0]]}
+    granted = {"lease": 1, "ttl_millis": 1}
+    for reply in ("", "{", "[" * 100_000, "[]", "null", "7", '"ok"'):
+        garbled_control(reply)
+    for reply in ({}, {"reply": "done"}, granted):
+        garbled_control(reply)
+    for worlds in ({}, [1], [{"world": 0}], [world]):
+        garbled_control({**granted, "worlds": worlds})
+    for change in ({"lease": "x"}, {"ttl_millis": None}):
+        garbled_control({**granted, "worlds": [], **change})
+    for name in ("pid", "height", "observations", "model", "coverage"):
+        with fails("bad_answer", match=name):
+            Wired(**{name: {}})
 
 
 @given(st.text() | st.recursive(st.none() | st.integers(), st.lists).map(json.dumps))

@@ -1,0 +1,23 @@
+"""Model files of as many states and observations as a test wants."""
+
+
+def model_file(
+    states: dict[str, tuple[float, float, list[float]]],
+    observations: list[str],
+    weights: list[list[float]],
+    scales: dict[tuple[str, str], float],
+) -> str:
+    """The text of one: states have an initial probability, a reward and how they are observed.
+
+    A kernel from one state to another is the weights times its scale.
+    """
+    lines = ['name = "made"', f"kernel_size = {[len(weights), len(weights[0])]}"]
+    for number, (name, (initial, reward, observed_as)) in enumerate(states.items()):
+        lines += ["[[states]]", f'name = "{name}"', f'color = "#8080{16 * number:02x}"']
+        lines += [f"initial = {initial}", f"reward = {reward}", f"observed_as = {observed_as}"]
+    for number, name in enumerate(observations):
+        lines += ["[[observations]]", f'name = "{name}"', f'color = "#8080{16 * number:02x}"']
+    for (source, target), scale in scales.items():
+        lines += ["[[kernel]]", f'from = "{source}"', f'to = "{target}"']
+        lines += [f"scale = {scale}", f"weights = {weights}"]
+    return "\n".join(lines)

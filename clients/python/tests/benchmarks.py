@@ -1,0 +1,21 @@
+"""Worlds of the tests of `emberwatch.benchmark`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from environments import LIVELY
+
+from emberwatch.model import Model
+
+#: Keywords of small worlds.
+WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY, "burn_in": 60}
+
+
+def wall(folder: Path) -> Path:
+    """A model with a wall in which there is one gap, so that masks matter."""
+    closed = np.zeros((7, 9), int)
+    closed[:, 4], closed[3, 4] = 1, 0
+    path = folder / "wall.toml"
+    path.write_text(f"no_fly = {closed.tolist()}\n" + Model.named(LIVELY).toml)
+    return path
