@@ -57,12 +57,12 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     * `estimator`: what keeps the belief; by default what `checkpoint` holds, without one
       `"known_model"`. A learned one finds several times as many fires where these are rare.
         * `"known_model"`: the Bayes filter of the true model
-        * `"spatial_filter"`: known, where observations also correct the neighbours of visited cells
+        * `"spatial_filter"`: known, and observations also correct neighbouring cells
         * `"second_order_filter"`: known, predicting with the mean of the ratio in eq. 3
         * `"cavity_filter"`: known, predicting without a cell's own echo in its neighbours
         * `"spatial_cavity_filter"`: known+spatial, predicting as known+cavities does
         * `"learned_filter"`: a Bayes filter whose parameters were learned
-        * `"learned_spatial_filter"`: learned, where observations also correct the neighbours of visited cells
+        * `"learned_spatial_filter"`: learned, and observations also correct neighbouring cells
         * `"learned_cavity_filter"`: learned, predicting as known+cavities does
         * `"learned_spatial_cavity_filter"`: learned+spatial, predicting as known+cavities does
         * `"neural_belief"`: a learned network on the grid, from last observations to predicted ones
