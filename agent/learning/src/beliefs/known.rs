@@ -42,7 +42,7 @@ pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
     label: "spatial_filter",
-    about: "known, where observations also correct the neighbours of visited cells",
+    about: "known, and observations also correct neighbouring cells",
     handover: Some(|model| spatial_handover(model, PredictionKind::MeanField)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::MeanField)?)),
     ..KNOWN

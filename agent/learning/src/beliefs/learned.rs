@@ -35,7 +35,7 @@ pub const LEARNED: BeliefKind = BeliefKind {
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     label: "learned_spatial_filter",
-    about: "learned, where observations also correct the neighbours of visited cells",
+    about: "learned, and observations also correct neighbouring cells",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
     },

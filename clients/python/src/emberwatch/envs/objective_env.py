@@ -57,15 +57,15 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     * `estimator`: what keeps the belief; by default what `checkpoint` holds, without one
       `"known_model"`. A learned one finds several times as many fires where these are rare.
         * `"known_model"`: the Bayes filter of the true model
-        * `"spatial_filter"`: the same; what a cell shows corrects its neighbours, too
-        * `"second_order_filter"`: the filter with the mean of eq. 3's ratio, not the ratio of means
-        * `"cavity_filter"`: the same; and no cell is predicted from its own echo in its neighbours
-        * `"spatial_cavity_filter"`: cavities, and what a cell shows corrects its neighbours, too
+        * `"spatial_filter"`: known, and observations also correct neighbouring cells
+        * `"second_order_filter"`: known, predicting with the mean of the ratio in eq. 3
+        * `"cavity_filter"`: known, predicting without a cell's own echo in its neighbours
+        * `"spatial_cavity_filter"`: known+spatial, predicting as known+cavities does
         * `"learned_filter"`: a Bayes filter whose parameters were learned
-        * `"learned_spatial_filter"`: the same; what a cell shows corrects its neighbours, too
-        * `"learned_cavity_filter"`: the learned filter, predicting as known+cavities does
-        * `"learned_spatial_cavity_filter"`: both: cavities, and what a cell shows corrects others
-        * `"neural_belief"`: a network that keeps space, learned from what was seen
+        * `"learned_spatial_filter"`: learned, and observations also correct neighbouring cells
+        * `"learned_cavity_filter"`: learned, predicting as known+cavities does
+        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting as known+cavities does
+        * `"neural_belief"`: a learned network on the grid, from last observations to predicted ones
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
       second), `"initial"` or `"uniform"`.
