@@ -217,7 +217,11 @@ impl Prediction {
                 self.next.probabilities[to..][..n_lanes].copy_from_slice(&lanes[..n_lanes]);
             }
             let end = self.beliefs.start(cavity + 1);
-            correct_drift(&mut self.next.probabilities[at..end], length, &sums[..n_lanes]);
+            correct_drift(
+                &mut self.next.probabilities[at..end],
+                length,
+                &sums[..n_lanes],
+            );
         }
     }
 
