@@ -57,14 +57,14 @@ enum Change {
     Number(usize, Vec<u8>),
 }
 
-fn change(files: Vec<Vec<u8>>) -> impl Strategy<Value = Change> {
+fn change(files: Vec<Vec<u8>>) -> impl Strategy<Value = Change> + Clone {
     let words: Vec<&str> = WORDS.split_whitespace().collect();
     let word = move || select(words.clone()).prop_map(|word| word.as_bytes().to_vec());
     let part = (select(files), any::<usize>(), 1..64_usize).prop_map(|(file, at, length)| {
         let at = at % (file.len() + 1);
         file[at..file.len().min(at + length)].to_vec()
     });
-    let removed = prop_oneof![8 => 0..9_usize, 1 => 9..MAX_BYTES];
+    let removed = prop_oneof![4 => Just(0_usize), 8 => 0..9_usize, 1 => 9..MAX_BYTES];
     let inserted = prop_oneof![4 => vec(any::<u8>(), 0..9), 2 => word(), 1 => part];
     let integer = (select(&INTEGERS), 0..3_u64, 0..4_u32).prop_map(|(number, more, power)| {
         number.wrapping_add(more).to_ne_bytes()[..1 << power].to_vec()
@@ -147,8 +147,11 @@ fn attack(target: &Target) {
     outcome.unwrap_or_else(|failure| panic!("{name}: {failure}"));
     let growth = memory("VmHWM:", std::process::id()).saturating_sub(before);
     assert!(growth <= MAX_GROWTH, "{name}: memory grew by {growth} KiB");
-    let share = n_accepted.get() * 100 / n_inputs;
-    assert!((1..100).contains(&share), "{name}: {share} % accepted");
+    let n_accepted = n_accepted.get();
+    assert!(
+        (n_inputs / 500..n_inputs).contains(&n_accepted),
+        "{name}: {n_accepted} accepted"
+    );
 }
 
 #[test]
