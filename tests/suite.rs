@@ -412,16 +412,26 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let narrow = suite("--train --train-steps 64 --beam-width 3");
     narrow.check_says("runs/tiny/filter is kept, although it was trained with other settings");
     let untrained = suite("");
-    untrained.check_says("the trainings of neural_beam are unfinished: 64 of 48000 world steps");
+    untrained.check_says(
+        "neural_beam acts on an unfinished training: 64 of 48000 world steps (--learner neural)",
+    );
     let longer = suite("--train --train-steps 96");
     longer.check_says("task tiny: training neural for neural_beam, 64 of 96 world steps done");
     longer.check_says("3 rows of neural_beam are run again");
-    longer.check_says("tiny/decisions-learned_filter was learned on another belief than");
-    assert!(
-        !longer.stdout.contains("learned_policy"),
-        "{}",
-        longer.stdout
-    );
+    longer.check_says("tiny/decisions-learned_filter was learned on");
+    longer.check_says("remove it to train the belief further");
+    for policy in ["learned_beam", "learned_policy"] {
+        assert!(longer.stdout.contains(policy), "its rows are kept");
+    }
+    let other = folder
+        .path()
+        .join("runs/tiny/filter/checkpoint.safetensors");
+    let of_fires = folder
+        .path()
+        .join("runs/fires/filter/checkpoint.safetensors");
+    std::fs::copy(of_fires, other).expect("another belief");
+    let mixed = suite("");
+    mixed.check_says("tiny/decisions-learned_filter was learned on another belief than");
 }
 
 #[test]

@@ -111,7 +111,7 @@ impl TrainingLoop {
     ) -> Result<Self> {
         let stopwatch = Stopwatch::start(&spec.out, spec.resume)?;
         if let Some(contents) = &contents
-            && spec.has_other_settings(contents)?
+            && spec.has_other_settings(contents)
         {
             tracing::warn!("settings: they differ from the checkpoint's, and replace them");
         }

@@ -302,7 +302,7 @@ impl Plan {
     fn warn_of_unfinished(&self, policy: &Policy, lesson: &Lesson) {
         if let Some(steps) = lesson.unfinished(&self.comparison.config) {
             let (task, name) = (&self.task.name, &policy.name);
-            tracing::warn!("task {task}: the trainings of {name} are unfinished: {steps}");
+            tracing::warn!("task {task}: {name} acts on an unfinished training: {steps}");
         }
     }
 

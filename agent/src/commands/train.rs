@@ -77,7 +77,8 @@ pub struct TrainCommand {
     /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
     #[arg(long)]
     resume: bool,
-    /// Cells that the frames show to a filter that is learned [default: path, or the checkpoint's with --resume]
+    /// Cells that the frames show to a filter that is learned [default: from the settings, or the
+    /// checkpoint with --resume]
     #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
     full_frames: Option<bool>,
     /// Act on the checkpoint's parameters without learning

@@ -7,7 +7,7 @@
 use super::train::{N_WORLDS, learn, start_server};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
 use anyhow::{Context, Result, ensure};
-use emberwatch_learning::beliefs::WorldForm;
+use emberwatch_learning::beliefs::{BELIEFS, WorldForm};
 use emberwatch_learning::checkpoint;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
@@ -31,19 +31,16 @@ pub struct Lesson {
     pub seconds: Option<f64>,
     /// Whether `suite --train` leaves it alone: the policy needs no checkpoint, or the user ran `train`.
     pub is_final: bool,
-    /// The learner of each training and its world steps.
-    steps: Vec<(&'static LearnerKind, u64)>,
+    /// The learner of the last training and its world steps.
+    steps: Option<(&'static LearnerKind, u64)>,
 }
 
 impl Lesson {
-    /// Lists the trainings that are shorter than the settings say.
+    /// Describes the last training if it is shorter than the settings say.
     pub fn unfinished(&self, config: &AgentConfig) -> Option<String> {
-        let short = self.steps.iter().filter_map(|(kind, done)| {
-            let all = steps_of_settings(kind, config);
-            (*done < all).then(|| format!("{done} of {all} world steps of the {}", kind.name))
-        });
-        let short: Vec<String> = short.collect();
-        (!short.is_empty()).then(|| short.join(", "))
+        let (kind, done) = self.steps.filter(|_| !self.is_final)?;
+        let all = steps_of_settings(kind, config);
+        (done < all).then(|| format!("{done} of {all} world steps (--learner {})", kind.name))
     }
 }
 
@@ -70,10 +67,12 @@ pub fn find(
         let own: Vec<PathBuf> = trainings(&folder, policy).map(|(_, own)| own).collect();
         let has_checkpoint = |folder: &PathBuf| folder.join(CHECKPOINT).exists();
         if own.last().is_some_and(has_checkpoint) {
-            lesson = read(own.into_iter().filter(has_checkpoint))?;
+            check_decisions(&own)?;
+            lesson = read(&own)?;
         } else if has_checkpoint(&folder) {
             let by_hand = [folder.join("belief"), folder];
-            lesson = read(by_hand.into_iter().filter(has_checkpoint))?;
+            let with_belief = has_checkpoint(&by_hand[0]);
+            lesson = read(&by_hand[usize::from(!with_belief)..])?;
             lesson.is_final = true;
         }
     }
@@ -92,36 +91,57 @@ fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static s
     belief.into_iter().chain(decisions)
 }
 
-/// Reads the checkpoints of trainings, that of the belief first.
-///
-/// # Errors
-/// If decisions were learned on another belief.
-fn read(folders: impl Iterator<Item = PathBuf>) -> Result<Lesson> {
-    let folders: Vec<PathBuf> = folders.collect();
+/// Reads the checkpoint of the last training, which holds the belief of those before. Counts the seconds of all.
+fn read(folders: &[PathBuf]) -> Result<Lesson> {
     let seconds = folders.iter().map(|folder| seconds::read(folder));
     let seconds = seconds.collect::<Result<Vec<_>>>()?;
-    let places: Vec<PathBuf> = folders.iter().map(|it| it.join(CHECKPOINT)).collect();
-    let steps = places.iter().map(|place| {
+    let last = folders.last().map(|folder| folder.join(CHECKPOINT));
+    let step = |place: &PathBuf| -> Result<_> {
         let (name, contents) = checkpoint::read(place)?;
         let kind = learners::of_checkpoint(&name)?;
         Ok((kind, (kind.done)(&contents)?))
-    });
-    let steps = steps.collect::<Result<Vec<_>>>()?;
-    let learned = learners::read(places.iter().map(|place| &**place), &Device::Cpu);
-    let learned = learned.with_context(|| match folders.as_slice() {
-        [belief, decisions] => format!(
-            "{} was learned on another belief than {}: remove it to learn it again",
-            decisions.display(),
-            belief.display()
-        ),
-        _ => "cannot use the training".into(),
-    })?;
+    };
     Ok(Lesson {
-        learned,
+        steps: last.as_ref().map(step).transpose()?,
+        learned: learners::read(last.as_deref(), &Device::Cpu)?,
         seconds: seconds.into_iter().sum(),
         is_final: false,
-        steps,
     })
+}
+
+/// Refuses decisions that were learned on another belief than the one next to them.
+fn check_decisions(own: &[PathBuf]) -> Result<()> {
+    let places: Vec<PathBuf> = own.iter().map(|folder| folder.join(CHECKPOINT)).collect();
+    if let [belief, decisions] = places.as_slice()
+        && belief.exists()
+        && decisions.exists()
+    {
+        let both = learners::read([&**belief, &**decisions], &Device::Cpu);
+        let [belief, decisions] = [&own[0], &own[1]].map(|folder| folder.display());
+        let problem =
+            || format!("{decisions} was learned on another belief than {belief}: remove it");
+        both.with_context(problem)?;
+    }
+    Ok(())
+}
+
+/// Refuses to train a belief further, if decisions were learned on it as it is.
+fn check_dependents(belief: &Path, learner: &str) -> Result<()> {
+    for kind in BELIEFS {
+        let decisions = format!("{}-{}", DECISIONS.name, kind.label);
+        let decisions = belief.with_file_name(decisions);
+        let is_dependent = kind
+            .learned_by
+            .as_ref()
+            .is_some_and(|by| by.learner == learner);
+        ensure!(
+            !(is_dependent && decisions.join(CHECKPOINT).exists()),
+            "{} was learned on {} as it is: remove it to train the belief further",
+            decisions.display(),
+            belief.display()
+        );
+    }
+    Ok(())
 }
 
 /// The world steps of a training by the settings.
@@ -170,18 +190,16 @@ impl<'a> Trainings<'a> {
     pub fn complete(&self, task: &Task, policy: &Policy) -> Result<()> {
         let mut config = self.config.clone();
         let mut learned = Learned::default();
-        let mut belief = None;
-        for (learner, out) in trainings(&self.folder.join(&task.name), policy) {
+        let own: Vec<_> = trainings(&self.folder.join(&task.name), policy).collect();
+        let folders: Vec<PathBuf> = own.iter().map(|(_, out)| out.clone()).collect();
+        check_decisions(&folders)?;
+        for (learner, out) in own {
             if learner == DECISIONS.name {
                 config.decisions.estimator = policy.belief.label.into();
-                if out.join(CHECKPOINT).exists() {
-                    read(belief.take().into_iter().chain([out.clone()]))?;
-                }
             }
             config.learner = learner.into();
-            let trained = self.train(task, policy, self.spec(&config, out.clone(), learned)?);
+            let trained = self.train(task, policy, self.spec(&config, out, learned)?);
             learned = trained.with_context(|| format!("train --learner {learner}"))?;
-            belief = Some(out);
         }
         Ok(())
     }
@@ -216,13 +234,16 @@ impl<'a> Trainings<'a> {
         let all = training.steps;
         training.steps = all.saturating_sub(done);
         if let Some(contents) = &contents {
-            (kind.adopt)(contents, &mut training.config);
-            if training.steps == 0 && training.has_other_settings(contents)? {
+            if training.steps == 0 && training.has_other_settings(contents) {
                 let place = training.out.display();
                 tracing::warn!("{place} is kept, although it was trained with other settings");
             }
+            (kind.adopt)(contents, &mut training.config);
         }
         if training.steps > 0 {
+            if contents.is_some() && *kind != DECISIONS {
+                check_dependents(&training.out, kind.name)?;
+            }
             std::fs::create_dir_all(&training.out)
                 .with_context(|| format!("create {}", training.out.display()))?;
             tracing::info!(

@@ -211,7 +211,8 @@ impl<T: NdFloat> Transition<T> {
     /// Returns about how many bytes of memory it takes: the belief with margins, and work space.
     pub fn memory_bytes(&self) -> usize {
         let n_lanes = self.sums.len() + self.weights.len() + self.own_weights.len();
-        size_of_val(&*self.planes) + n_lanes * size_of::<[T; LANES]>()
+        let work = n_lanes * size_of::<[T; LANES]>();
+        size_of_val(&*self.planes) + work + self.slots.memory_bytes()
     }
 }
 

@@ -51,6 +51,11 @@ impl<T: Copy> ZonedNumbers<T> {
         }
     }
 
+    /// Returns the number of bytes of memory it takes, besides itself.
+    pub fn memory_bytes(&self) -> usize {
+        size_of_val(&*self.patterns) + size_of_val(&*self.lanes)
+    }
+
     /// Returns the numbers of a chunk's cells.
     #[inline(always)]
     pub fn of_chunk(&self, chunk: usize) -> &[[T; LANES]] {

@@ -133,7 +133,8 @@ impl Prediction {
     pub fn memory_bytes(&self) -> usize {
         // Weights, and as much work space.
         let n_weights = self.n_states * self.n_states * (1 + self.offsets.len());
-        2 * (size_of_val(&*self.beliefs.probabilities) + n_weights * size_of::<Lanes>())
+        let beliefs = size_of_val(&*self.beliefs.probabilities);
+        2 * (beliefs + n_weights * size_of::<Lanes>()) + self.layout.slots.memory_bytes()
     }
 
     /// Whether there are cavities, which [`Self::correct`] must update after each correction of the belief.

@@ -67,7 +67,7 @@ pub const FILTER: LearnerKind = LearnerKind {
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     let dimensions = dimensions(on.config, &on.worlds)?;
     ensure!(
-        !on.config.full_frames || on.info.coverage != CoverageRule::Path,
+        on.is_frozen || !on.config.full_frames || on.info.coverage != CoverageRule::Path,
         "full_frames: expected a server with --coverage client or full, got path"
     );
     Ok(Box::new(match on.contents {
@@ -224,7 +224,7 @@ impl Actor for FilterLearner {
 
 impl Learning for FilterLearner {
     fn wants_full_frames(&self) -> bool {
-        self.config.full_frames
+        !self.is_frozen && self.config.full_frames
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {

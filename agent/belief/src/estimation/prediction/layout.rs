@@ -4,7 +4,7 @@ use super::kernels::{FixedTransition, Group, OwnKernel, Source, Weights};
 use emberwatch_model::zoned::ZonedNumbers;
 use ndarray::Array4;
 
-/// Totals of weights that differ by less are equal: above the rounding errors of summing them in another order.
+/// Totals of scaled weights that differ by less are equal: above the rounding errors of summing them in another order.
 const TOTAL_TOLERANCE: f64 = 1e-9;
 
 /// All weights of a model, arranged for predictions.
@@ -56,6 +56,8 @@ struct Builder<'a> {
     /// Row and column of each neighbour in the kernel.
     taps: Vec<[usize; 2]>,
     centre: [usize; 2],
+    /// For each own state, the power of two that brings its largest weight to 1 or a little more, so that all fit in `f32`.
+    scales: Vec<f64>,
     /// The number in each slot, by zone.
     slots: Vec<Vec<f32>>,
 }
@@ -66,6 +68,12 @@ impl<'a> Builder<'a> {
         let n_kernels = weights.kernels.len() / weights.zones.1;
         let centre = [height / 2, width / 2];
         let taps = (0..height * width).map(|tap| [tap / width, tap % width]);
+        let scale = |own: usize| {
+            let kernels = weights.kernels.iter().skip(own).step_by(n_kernels);
+            let numbers = kernels.flatten().chain(weights.bias);
+            let largest = numbers.copied().fold(f64::MIN_POSITIVE, f64::max);
+            (-largest.log2().floor()).exp2()
+        };
         Self {
             weights,
             n_states,
@@ -74,6 +82,7 @@ impl<'a> Builder<'a> {
                 .filter(|tap| n_kernels == 1 || *tap != centre)
                 .collect(),
             centre,
+            scales: (0..n_kernels).map(scale).collect(),
             slots: Vec::new(),
         }
     }
@@ -120,15 +129,16 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// Evaluates `f` on each zone's kernel of an own state.
+    /// Returns the kernels of an own state, one per zone.
+    fn zones(&self, own: usize) -> impl Iterator<Item = &Array4<f64>> {
+        let kernels = self.weights.kernels.iter().skip(own);
+        kernels.step_by(self.n_kernels)
+    }
+
+    /// Evaluates a sum of weights, `f`, on each zone's kernel of an own state, and scales it.
     fn by_zone(&self, own: usize, f: impl Fn(&Array4<f64>) -> f64) -> Vec<f64> {
-        let kernels = self
-            .weights
-            .kernels
-            .iter()
-            .skip(own)
-            .step_by(self.n_kernels);
-        kernels.map(f).collect()
+        let scale = self.scales[own];
+        self.zones(own).map(|kernel| scale * f(kernel)).collect()
     }
 
     /// Returns the slot with the given numbers, a new one if there is none.
@@ -252,7 +262,7 @@ impl<'a> Builder<'a> {
             }
             change / total
         };
-        let by_zone = self.by_zone(own, influence);
+        let by_zone: Vec<f64> = self.zones(own).map(influence).collect();
         by_zone.iter().sum::<f64>() / by_zone.len() as f64
     }
 }
