@@ -3,7 +3,10 @@
 use super::decisions::LearnedDecisions;
 use super::parts::{Goal, Policy};
 use super::planners::{self, AHEAD, BEAM, RANDOM, SHOOTING};
-use crate::beliefs::{BELIEFS, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, NEXT_TRUTH, NONE, TRUTH};
+use crate::beliefs::{
+    AUTOENCODER, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, LEARNED, LEARNED_SPATIAL, NEURAL,
+    NEXT_TRUTH, NONE, TRUTH,
+};
 use crate::learned::Learned;
 use emberwatch_belief::planning::options::OPTIONS;
 use emberwatch_model::Model;
@@ -35,13 +38,15 @@ pub fn ladder(model: &Model) -> Vec<Policy> {
         .collect()
 }
 
-/// The policies that act on what was learned: shooting and beam search on each belief, and what a DQN decides.
+/// Learned beliefs that are compared unless others are named: each in its best form (`docs/filters.md`).
+const LEARNED_BELIEFS: [&BeliefKind; 4] = [&LEARNED, &LEARNED_SPATIAL, &NEURAL, &AUTOENCODER];
+
+/// Lists the policies that checkpoints allow: shooting and beam search on each learned belief, and a DQN's decisions.
 pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     use Goal::{Exploit, Explore};
     let policy = |belief, planner, goal| Policy::new(belief, planner, goal, model);
     let mut policies = Vec::new();
-    let kinds = BELIEFS.iter().copied();
-    for belief in kinds.filter(|belief| belief.learned_by.is_some()) {
+    for belief in LEARNED_BELIEFS {
         if belief.decides() {
             policies.push(policy(belief, &SHOOTING, Explore));
         }
