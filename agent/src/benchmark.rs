@@ -5,3 +5,4 @@ pub(crate) mod compare;
 pub(crate) mod evaluate;
 pub mod report;
 pub(crate) mod team;
+mod world_run;

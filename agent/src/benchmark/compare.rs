@@ -3,12 +3,10 @@
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
+use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
 use anyhow::{Context, Result, ensure};
-use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::scoring::Score;
-use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
 use emberwatch_learning::beliefs::first_belief::first_belief;
 use emberwatch_learning::beliefs::{Input, WorldForm};
@@ -20,10 +18,7 @@ use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::{
     self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
 };
-use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::message::WorldResult;
-use emberwatch_protocol::path::Flight;
 use emberwatch_protocol::{Grid, Model, Move};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
@@ -65,33 +60,6 @@ pub struct Results {
 struct Contestant {
     policy: Policy,
     team: Team,
-}
-
-/// What is measured of one world.
-struct WorldRun {
-    seed: u64,
-    tally: Tally,
-    /// This step's, until all robots have flown.
-    flights: Vec<Flight>,
-    merit: MeritTally,
-    snapshot: Option<Snapshot>,
-}
-
-/// Sums over the steps of a run.
-#[derive(Default)]
-struct Tally {
-    rewards: Vec<f32>,
-    fire_cells: Vec<f32>,
-    reward: f64,
-    n_visited: u64,
-    n_hits: u64,
-    /// Distinct cells of each robot, all together.
-    n_visited_each: u64,
-    n_fire: u64,
-    planning: Duration,
-    /// Where the hidden states are published.
-    brier: Option<f64>,
-    score: Score,
 }
 
 /// Runs every policy on every world; `progress` is told of each policy and of each world step.
@@ -143,7 +111,8 @@ pub fn compare(
             let model = arena.known_model();
             let fingerprint = comparison.policy_fingerprint(&contestant.policy, model);
             let runs = worlds.into_iter();
-            let runs = runs.map(|world| contestant.policy_run(world, arena.info(), &fingerprint));
+            let Contestant { policy, team } = contestant;
+            let runs = runs.map(|world| world.into_run(policy, *team, arena.info(), &fingerprint));
             results.runs.extend(runs);
         }
     }
@@ -254,13 +223,7 @@ impl Match<'_> {
             Rollout::begun(self.agent(arena, &prior, agent)?, seen)
         };
         let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
-        let world = |&seed: &u64| WorldRun {
-            seed,
-            tally: Tally::default(),
-            flights: Vec::new(),
-            merit: MeritTally::new(arena.shape(), target as u8, recent_steps),
-            snapshot: None,
-        };
+        let world = |&seed: &u64| WorldRun::new(seed, arena.shape(), target, recent_steps);
         Ok(Players {
             rollouts: agents.zip(seen).map(rollout).collect::<Result<_>>()?,
             worlds: self.seeds.iter().map(world).collect(),
@@ -374,109 +337,8 @@ impl Players<'_> {
     }
 }
 
-impl WorldRun {
-    /// Counts what an agent's robots visited; with those of the last agent the step is complete.
-    fn count(&mut self, rollout: &Rollout, plans: &[Plan], n_robots: usize) {
-        let airspace = rollout.agent.airspace();
-        let flown = rollout.results().zip(plans);
-        let flown = flown.map(|(result, plan)| airspace.fly(result.start(), &plan.moves));
-        self.flights.extend(flown);
-        let n_visited = rollout.results().map(|it| u64::from(it.n_visited));
-        self.tally.n_visited_each += n_visited.sum::<u64>();
-        if self.flights.len() == n_robots {
-            let result = &rollout.observation().world;
-            let found = Found {
-                n_hits: result.n_hits,
-                n_burning: result.n_target_cells,
-            };
-            self.merit.update(&self.flights, found, rollout.truth());
-            self.flights.clear();
-        }
-    }
-
-    /// Scores the posterior of the world's first agent.
-    fn score(&mut self, rollout: &Rollout, target: usize, score: Option<Score>) {
-        let agent = &rollout.agent;
-        let brier = rollout
-            .truth()
-            .map(|truth| brier_score(agent.belief(), truth, target, agent.target()));
-        self.tally.add(&rollout.observation().world, brier);
-        self.tally.score += score.unwrap_or_default();
-    }
-
-    fn snapshot(&self, rollout: &Rollout, record: &StepRecord, plans: &[Plan]) -> Option<Snapshot> {
-        let (agent, observation) = (&rollout.agent, rollout.observation());
-        let (airspace, start) = (agent.airspace(), record.before.robot.cell());
-        let belief = agent.policy().belief;
-        let moves = &plans[0].moves;
-        let mut path_cells = vec![start];
-        path_cells.extend((1..=moves.len()).map(|n| airspace.fly(start, &moves[..n]).end));
-        Some(Snapshot {
-            seed: self.seed,
-            step: observation.world.step,
-            truth: rollout.truth()?.clone(),
-            frame: observation.frame.clone(),
-            path_cells,
-            belief: (belief.input == Input::Frames).then(|| agent.belief().clone()),
-            learned_target: belief.learned_by.is_some().then(|| agent.target()),
-        })
-    }
-}
-
 /// An agent's plans, and the time that they took.
 fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
     let start = Instant::now();
     (rollout.plan(), start.elapsed())
-}
-
-impl Contestant {
-    fn policy_run(&self, world: WorldRun, info: &ServerInfo, fingerprint: &str) -> PolicyRun {
-        let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
-        let steps = tally.rewards.len() as u64;
-        let brier = tally.brier;
-        let brier = brier.filter(|_| policy.belief.input != Input::Nothing);
-        let mean = |sum: f64| sum / steps.max(1) as f64;
-        let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
-        let n_repeated = tally.n_visited_each - tally.n_visited;
-        PolicyRun {
-            policy: policy.name.clone(),
-            estimator: policy.belief.label.into(),
-            world_seed: world.seed,
-            steps,
-            mean_reward: mean(tally.reward),
-            mean_distinct_cells: mean(tally.n_visited as f64),
-            hit_rate: share(tally.n_hits, tally.n_visited),
-            mean_fire_cells: mean(tally.n_fire as f64),
-            mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
-            brier: brier.map(mean),
-            moves: info.n_moves,
-            robots: info.n_robots,
-            team: self.team.label().into(),
-            mean_repeated: share(n_repeated, tally.n_visited_each),
-            steps_to_detection: merit.steps_to_detection,
-            burning_cells_at_detection: merit.burning_cells_at_detection,
-            recent_steps: Some(world.merit.recent_steps()),
-            burning_seen_share: merit.burning_seen_share,
-            front_distance: merit.front_distance,
-            grid_seen_share: Some(merit.grid_seen_share),
-            log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
-            worlds_fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
-            policy_fingerprint: fingerprint.into(),
-            training_seconds: None,
-            is_added: false,
-            rewards: tally.rewards,
-        }
-    }
-}
-
-impl Tally {
-    fn add(&mut self, result: &WorldResult, brier: Option<f64>) {
-        self.rewards.push(result.reward as f32);
-        self.fire_cells.push(result.n_target_cells as f32);
-        self.reward += result.reward;
-        self.n_visited += u64::from(result.n_visited);
-        self.n_hits += u64::from(result.n_hits);
-        self.n_fire += u64::from(result.n_target_cells);
-        self.brier = brier.map(|brier| self.brier.unwrap_or_default() + brier);
-    }
 }

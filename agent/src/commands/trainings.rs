@@ -1,8 +1,8 @@
 //! The trainings of a suite's policies: finds their checkpoints, and runs missing trainings.
 //!
 //! `FOLDER/TASK` has a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
-//! `decisions-BELIEF` for decisions on a belief. A policy without a folder of its own uses the checkpoint that
-//! `train --out FOLDER/TASK` wrote.
+//! `decisions-BELIEF` for decisions on a belief. A policy that lacks its folder uses the checkpoint that `train --out
+//! FOLDER/TASK` wrote.
 
 use super::train::{N_WORLDS, learn, start_server};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};

@@ -155,8 +155,8 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep what they have
-    /// learned about how cells vary together.
+    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the
+    /// learned correlations of cells.
     fn reset(
         &self,
         py: Python<'_>,

@@ -13,7 +13,7 @@ use emberwatch_learning::learned::Learned;
 use emberwatch_model::{Model, ModelError, Shape};
 use pyo3::prelude::*;
 
-/// The kind of the beliefs, and what they are built from.
+/// The kind and the sources of beliefs.
 pub struct Origin {
     pub kind: &'static BeliefKind,
     pub model: Option<Model>,

@@ -52,7 +52,7 @@ def known(
         InvalidArgumentError: If the prior does not have the model's states or a cell of it is no
             distribution; if the kind does not exist or was learned; or if all weights of the model
             can be 0.
-        NotEnoughMemoryError: If beliefs about so many worlds do not fit in memory.
+        NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     model = model if isinstance(model, Model) else Model.named(model)
     numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
@@ -92,7 +92,7 @@ def load(
     Raises:
         InvalidArgumentError: If the file is not a complete checkpoint, does not fit the kind, the
             grid or the model, or holds decisions on the belief of a known model.
-        NotEnoughMemoryError: If beliefs about so many worlds do not fit in memory.
+        NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     if model is not None and not isinstance(model, Model):
         model = Model.named(model)
@@ -173,8 +173,8 @@ class Belief:
 
         Args:
             worlds: The worlds to reset.
-            keep_correlations: Whether kinds with `+spatial` keep what they have learned about how
-                cells vary together. No effect on other kinds.
+            keep_correlations: Whether kinds with `+spatial` keep the learned correlations of
+                cells. No effect on other kinds.
         """
         keeps = as_flag(keep_correlations, "keep_correlations")
         self._native.reset(self._chosen(worlds), keeps)

@@ -38,7 +38,7 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
     if not fits or given.dtype.kind not in "fiu":
         got = told(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
         raise invalid("prior", expected, got)
-    with np.errstate(all="ignore"):  # what overflows is refused below
+    with np.errstate(all="ignore"):  # an overflow is refused below
         belief = np.array(given, np.float64, order="C")
         is_one = np.abs(belief.sum(axis=0) - 1.0) <= _SUM_TOLERANCE
     fine = is_one & (belief >= 0.0).all(axis=0)

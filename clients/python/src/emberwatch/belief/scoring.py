@@ -67,7 +67,7 @@ def score(
             cells. K is at least 1.
         states: Hidden states of the same shape and type, below S.
         target: The number in `states` of the state that pays most; None: the belief's own.
-        keep_correlations: As in `Belief.reset`: whether kinds with `+spatial` keep what they have
+        keep_correlations: As in `Belief.reset`: whether kinds with `+spatial` keep correlations
             learned on earlier sequences.
 
     Raises:
