@@ -317,9 +317,9 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     for policies in ["", "--policies random_walk,coverage"] {
         let compare = format!("compare --seeds 0..2 --steps 9 {checkpoint} {draw}");
         act(&format!("{compare} {policies}"));
-        let bytes = std::fs::read(figures.join("snapshot.png")).expect("a snapshot");
-        assert!(bytes.starts_with(b"\x89PNG"));
-        std::fs::remove_file(figures.join("snapshot.png")).expect("remove");
+        let svg = std::fs::read(figures.join("snapshot.svg")).expect("a snapshot");
+        assert!(svg.starts_with(b"<svg"));
+        std::fs::remove_file(figures.join("snapshot.svg")).expect("remove");
     }
     let ladder = act(&format!("compare --seeds 0..2 {checkpoint}")).stdout;
     for policy in ["coverage", "learned_beam", "clairvoyant_beam"] {

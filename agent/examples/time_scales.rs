@@ -1,7 +1,7 @@
 //! Draws the step sizes of autoencoder and DQN over a run of 25,000 iterations: those that vanish
 //! (`config/agent.toml`), and the authors' constants (`--preset paper`).
 //!
-//! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.png`
+//! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.svg`
 
 use emberwatch_agent::benchmark::report::save;
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
@@ -12,7 +12,7 @@ const ITERATIONS: u64 = 25_000;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let path = std::env::args().nth(1);
-    let path = path.ok_or("expected the path of a PNG file")?;
+    let path = path.ok_or("expected the path of an SVG file")?;
     let panels = [
         ("Step sizes that vanish (default)", AgentConfig::default()),
         (

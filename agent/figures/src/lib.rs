@@ -1,7 +1,7 @@
-//! Charts: data in, SVG out, and PNG from that SVG, the same on every machine.
+//! Charts: data in, SVG out, the same on every machine.
 //!
-//! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step. Each makes a
-//! text; [`png`] turns it into pixels. `svg` draws, `axis` scales.
+//! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step; `svg` draws, `axis` scales.
+//! [`heat`] is a picture of pixels, for TensorBoard, which shows no SVG.
 
 #![allow(
     missing_docs,
@@ -9,19 +9,19 @@
 )]
 
 mod axis;
+mod heat;
 mod ladder;
 mod legend;
 mod lines;
 mod palette;
 mod panels;
-mod raster;
 mod snapshot;
 mod svg;
 mod text;
 
+pub use heat::{Heat, heat};
 pub use ladder::{Bar, Ladder};
 pub use legend::Named;
 pub use lines::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
 pub use palette::Color;
-pub use raster::{Heat, PngError, heat, png};
 pub use snapshot::Snapshot;

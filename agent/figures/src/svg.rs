@@ -61,7 +61,7 @@ impl Svg {
         )
     }
 
-    /// Fills a rectangle, its edges on whole pixels of a PNG.
+    /// Fills a rectangle, its edges on half points: whole pixels of a screen with two a point.
     pub fn rectangle(&mut self, from: Point, to: Point, color: Color) {
         let [left, top, right, bottom] = [from.0, from.1, to.0, to.1].map(on_pixel);
         if right > left && bottom > top {
@@ -169,7 +169,6 @@ fn short(number: f64) -> f64 {
     }
 }
 
-/// A PNG has two pixels a point.
 fn on_pixel(number: f64) -> f64 {
     short((number * 2.0).round() / 2.0)
 }
@@ -178,7 +177,7 @@ fn on_pixel(number: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::palette::INK;
-    use resvg::usvg::roxmltree::Document;
+    use roxmltree::Document;
 
     #[test]
     fn texts_are_escaped_and_read_back() {

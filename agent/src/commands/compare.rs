@@ -67,7 +67,7 @@ pub struct CompareCommand {
     /// given for each
     #[arg(long, value_name = "FILE")]
     add: Vec<PathBuf>,
-    /// Draw ladder, rewards and teams as .png and .svg, and snapshot.png, into this directory
+    /// Draw ladder.svg, rewards.svg, teams.svg and snapshot.svg into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show it in a browser while it runs, at this address
@@ -318,17 +318,10 @@ impl Report {
 
 fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
     let label = &*report.axis_label;
-    for kind in ["png", "svg"] {
-        let path = |name: &str| directory.join(name).with_extension(kind);
-        draw_ladder(&path("ladder"), all, label)?;
-        draw_rewards(
-            &path("rewards"),
-            &report.runs,
-            label,
-            Some(&report.fire_cells),
-        )?;
-        draw_teams(&path("teams"), all, label)?;
-    }
+    draw_ladder(&directory.join("ladder.svg"), all, label)?;
+    let fire_cells = Some(&*report.fire_cells);
+    draw_rewards(&directory.join("rewards.svg"), &report.runs, label, fire_cells)?;
+    draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
     replace_file(&path, settings.as_bytes(), Readers::Any)
@@ -390,7 +383,7 @@ fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<(
         );
         return Ok(());
     };
-    let path = directory.join("snapshot.png");
+    let path = directory.join("snapshot.svg");
     draw_snapshot(&path, arena.model(), snapshot, &observation)
 }
 

@@ -71,7 +71,7 @@ pub struct TrainCommand {
     /// Seconds to act for, with a belief that is learned first
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors, metrics.csv and training.png; a belief that is learned first has a folder in it
+    /// Folder for checkpoint.safetensors, metrics.csv and training.svg; a belief that is learned first has a folder in it
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them

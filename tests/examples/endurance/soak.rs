@@ -16,7 +16,7 @@ use tests::report::say;
 const FLAGS: &str =
     "--height 64 --width 64 --worlds 4 --burn-in 1000 --lease-millis 1000 --publish-truth";
 
-/// Does all that for some seconds; writes `soak.csv` and `soak.png`.
+/// Does all that for some seconds; writes `soak.csv` and `soak.svg`.
 pub fn soak(seconds: u64, folder: &Path) {
     std::fs::create_dir_all(folder).expect("the folder");
     let snapshots = folder.join("snapshots");
@@ -145,6 +145,5 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
             panel("shared memory, MiB in use", |used| used.shared as f64 / 1024.0),
         ],
     };
-    let picture = emberwatch_figures::png(&page.svg().expect("points")).expect("a picture");
-    std::fs::write(folder.join("soak.png"), picture).expect("write the figure");
+    std::fs::write(folder.join("soak.svg"), page.svg().expect("points")).expect("write the figure");
 }

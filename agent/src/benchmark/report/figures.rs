@@ -62,14 +62,9 @@ impl Snapshot {
     }
 }
 
-/// Puts a page at `path`: as SVG where the path ends so, else as PNG.
+/// Puts a page at `path`.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
-    let is_svg = path.extension().is_some_and(|extension| extension == "svg");
-    if is_svg {
-        replace_file(path, svg.as_bytes(), Readers::Any)
-    } else {
-        replace_file(path, &emberwatch_figures::png(svg)?, Readers::Any)
-    }
+    replace_file(path, svg.as_bytes(), Readers::Any)
 }
 
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see

@@ -7,8 +7,8 @@ use anyhow::{Context, Result};
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 
-/// The figure's names in the folder of a training.
-pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
+/// The figure's name in the folder of a training.
+pub const FIGURE: &str = "training.svg";
 
 /// Points of a curve: each is the mean over a part of the rows.
 const POINTS: usize = 200;
@@ -29,10 +29,7 @@ pub fn draw_training(folder: &Path) -> Result<()> {
         panels: panels(&rows),
     };
     let svg = page.svg().context("curves: expected metrics, got none")?;
-    for name in FIGURES {
-        save(&folder.join(name), &svg)?;
-    }
-    Ok(())
+    save(&folder.join(FIGURE), &svg)
 }
 
 fn panels(rows: &Rows) -> Vec<Panel> {
