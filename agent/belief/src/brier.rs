@@ -51,35 +51,19 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn a_brier_score_is_the_mean_squared_miss() {
-        let shape = Shape::new(1, 4).expect("test shape");
-        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
+    fn scores_are_about_the_true_state() {
+        let truth = ndarray::arr2(&[[2, 0, 1, 0]]);
+        let other = ndarray::arr2(&[[2, 1, 1, 0]]);
         let certain = Belief::from_states(&truth, 3).expect("test states");
         assert_eq!(brier_score(&certain, &truth, 2, 2), 0.0);
-        let uniform = Belief::uniform(3, shape);
+        let scores = |truth| (log_loss(&certain, truth), accuracy(&certain, truth));
+        assert_eq!(scores(&truth), (0.0, 1.0));
+        assert_eq!(scores(&other), (f64::INFINITY, 0.75));
+        let uniform = Belief::uniform(3, Shape::new(1, 4).expect("test shape"));
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
         assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
-    }
-
-    #[test]
-    fn loss_and_accuracy_are_about_the_true_state() {
-        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
-        let certain = Belief::from_states(&truth, 3).expect("test states");
-        assert_eq!(
-            (log_loss(&certain, &truth), accuracy(&certain, &truth)),
-            (0.0, 1.0)
-        );
-        let other = Grid::from_shape_vec((1, 4), vec![2, 1, 1, 0]).expect("test grid");
-        assert_eq!(
-            (log_loss(&certain, &other), accuracy(&certain, &other)),
-            (f64::INFINITY, 0.75)
-        );
-        let uniform = Belief::uniform(3, Shape::new(1, 4).expect("test shape"));
         assert!((log_loss(&uniform, &truth) - 3.0_f64.ln()).abs() < 1e-6);
-        assert_eq!(
-            accuracy(&uniform, &truth),
-            0.5,
-            "the first state of each cell"
-        );
+        // The first state of each cell.
+        assert_eq!(accuracy(&uniform, &truth), 0.5);
     }
 }

@@ -200,31 +200,16 @@ mod tests {
 
     #[test]
     fn fire_is_detected_by_the_first_visit_to_a_cell_that_burns_then() {
+        let of = |it: Merit| (it.steps_to_detection, it.burning_cells_at_detection);
         // Visited before it burns, missed, found when two cells burn.
-        let got = merit(
-            9,
-            &[("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])],
-        );
-        assert_eq!(
-            (got.steps_to_detection, got.burning_cells_at_detection),
-            (Some(3), Some(2))
-        );
+        let steps: [(&str, &[&[usize]]); 3] =
+            [("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])];
+        assert_eq!(of(merit(9, &steps)), (Some(3), Some(2)));
         // Later finds change nothing.
         let got = merit(9, &[("#...", &[&[0]]), ("####", &[&[1]])]);
-        assert_eq!(
-            (got.steps_to_detection, got.burning_cells_at_detection),
-            (Some(1), Some(1))
-        );
-    }
-
-    #[test]
-    fn what_is_never_detected_has_no_time() {
+        assert_eq!(of(got), (Some(1), Some(1)));
         let got = merit(9, &[("...#", &[&[0]]), ("...#", &[&[1]])]);
-        assert_eq!(
-            (got.steps_to_detection, got.burning_cells_at_detection),
-            (None, None)
-        );
-        assert_eq!(got.burning_seen_share, Some(0.0));
+        assert_eq!((of(got), got.burning_seen_share), ((None, None), Some(0.0)));
         // 3 moves, then 2.
         assert_eq!(got.front_distance, Some(2.5));
     }
@@ -243,10 +228,7 @@ mod tests {
         // Steps without fire do not count: those with it are half seen.
         let got = merit(9, &[("....", &[&[0]]), ("#..#", &[&[1]])]);
         assert_eq!(got.burning_seen_share, Some(0.5));
-    }
-
-    #[test]
-    fn fire_that_is_all_seen_has_no_front() {
+        // Fire that is all seen has no front.
         let got = merit(9, &[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
         assert_eq!(got.burning_seen_share, Some(1.0));
         assert_eq!((got.front_distance, got.grid_seen_share), (None, 1.0));
@@ -256,46 +238,28 @@ mod tests {
     fn cells_are_seen_for_the_last_steps_alone() {
         let steps: [(&str, &[&[usize]]); 3] =
             [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
-        // Of two burning cells one is seen: in all of 3 steps, in the first two, in the first.
-        let shares = [3, 2, 1].map(|recent_steps| merit(recent_steps, &steps).burning_seen_share);
-        let thirds = [1.5, 1.0, 0.5].map(|sum| Some(sum / 3.0));
-        assert_eq!(shares, thirds);
-        // To cell 3 from 0 and 1; in the third step cell 0 is 2 moves away, cell 3 one.
-        assert_eq!(
-            merit(2, &steps).front_distance,
-            Some((3.0 + 2.0 + 1.0) / 3.0)
-        );
-        // In the second step cell 0, which is forgotten, is nearer than cell 3.
-        assert_eq!(
-            merit(1, &steps).front_distance,
-            Some((3.0 + 1.0 + 1.0) / 3.0)
-        );
-        // Where a robot has ever been does not depend on it.
-        assert_eq!(merit(1, &steps).grid_seen_share, 0.75);
+        // Of two burning cells one is seen: in all of 3 steps, in the first two, in the first. To the nearest other are
+        // 3, 2 and 1 moves, or 3, 1 and 1 where cell 0 is forgotten at once.
+        for (recent_steps, seen, moves) in [(3, 1.5, 6.0), (2, 1.0, 6.0), (1, 0.5, 5.0)] {
+            let got = merit(recent_steps, &steps);
+            assert_eq!(got.burning_seen_share, Some(seen / 3.0), "{recent_steps}");
+            assert_eq!(got.front_distance, Some(moves / 3.0), "{recent_steps}");
+            assert_eq!(got.grid_seen_share, 0.75, "{recent_steps}");
+        }
     }
 
     #[test]
     fn the_robots_of_a_team_see_together() {
         let got = merit(9, &[("#....#.#", &[&[0, 1], &[4, 5]])]);
-        assert_eq!(got.burning_seen_share, Some(2.0 / 3.0));
-        assert_eq!(got.burning_cells_at_detection, Some(3));
-        // From cell 5 to 7, not from cell 1.
-        assert_eq!(got.front_distance, Some(2.0));
-        assert_eq!(got.grid_seen_share, 0.5);
-    }
-
-    #[test]
-    fn distances_count_moves_in_rows_and_columns() {
-        let shape = Shape::new(3, 4).expect("test shape");
-        let mut states = Grid::zeros((3, 4));
-        states[[2, 3]] = FIRE;
-        let mut tally = MeritTally::new(shape, FIRE, 1);
-        let found = Found {
-            n_hits: 0,
-            n_burning: 1,
+        let expected = Merit {
+            steps_to_detection: Some(1),
+            burning_cells_at_detection: Some(3),
+            burning_seen_share: Some(2.0 / 3.0),
+            // From cell 5 to 7, not from cell 1.
+            front_distance: Some(2.0),
+            grid_seen_share: 0.5,
         };
-        tally.update(&[flight(&[1])], found, Some(&states));
-        assert_eq!(tally.merit().front_distance, Some(4.0));
+        assert_eq!(got, expected);
     }
 
     #[test]
@@ -320,7 +284,7 @@ mod tests {
     #[test]
     fn the_nearest_of_some_cells_is_that_of_a_plain_scan() {
         let shape = Shape::new(5, 7).expect("test shape");
-        for seed in 0..500 {
+        for seed in 0..100 {
             let drawn = |index: usize| emberwatch_model::randomness::split_mix(seed, index as u64);
             let is_one = |cell: usize| drawn(cell) % (seed + 2) == 0;
             let from = shape.cell(drawn(99) as usize % shape.n_cells());

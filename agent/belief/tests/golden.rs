@@ -7,6 +7,12 @@
 //! for name in "a3_bayes", "a4_masked_small", "a5_planner":
 //!     z = np.load(f"golden/{name}.npz")
 //!     np.savez(f"{name}.npz", **{k: z[k] for k in z.files if z[k].dtype.kind != "U"})
+//! # Two of the reference's six steps at full size, for the Python package's tests.
+//! z = np.load("golden/a4_masked_step.npz")
+//! u, mask, p = np.stack([z["u0"], z["u_next"][0]]), z["mask"][:2], z["state_est"][:2]
+//! assert (p == u)[mask == 0].all()
+//! np.savez("a4_masked_filter.npz", W=z["W_obs_param"], u=u, obs=z["obs"][:2], mask=mask,
+//!          posterior_at_mask=p[mask > 0])
 //! ```
 
 #[path = "../../network/tests/network/golden_file.rs"]
@@ -16,11 +22,10 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{Integration, Objective, Target};
 use emberwatch_model::Model;
-use emberwatch_model::frame::Frame;
 use emberwatch_model::grid::{Cell, Shape};
 use emberwatch_model::path::{Move, fly};
 use golden_file::{Golden, frame_from};
-use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, s};
+use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, Axis};
 
 fn shape_of(dim: (usize, usize)) -> Shape {
     Shape::new(dim.0, dim.1).expect("test shape")
@@ -33,10 +38,8 @@ fn belief_from(channels_last: ArrayView3<'_, f32>) -> Belief {
 }
 
 fn assert_close(belief: &Belief, channels_last: ArrayView3<'_, f32>, what: &str) {
-    let difference = &belief.view() - &channels_last.permuted_axes([2, 0, 1]);
-    let worst = difference
-        .iter()
-        .fold(0.0_f32, |worst, d| worst.max(d.abs()));
+    let off = &belief.view() - &channels_last.permuted_axes([2, 0, 1]);
+    let worst = off.iter().fold(0.0_f32, |worst, d| worst.max(d.abs()));
     assert!(worst < 1e-6, "{what}: off by {worst}");
 }
 
@@ -55,174 +58,43 @@ fn the_filter_reproduces_posterior_and_predictor() {
         let everything = Array2::from_elem((height, width), 1);
         for (step, observed) in observations.outer_iter().enumerate() {
             let index = saved.iter().position(|&at| at == step as i64);
+            let check = |belief: &Belief, all: &Array4<f32>| {
+                if let Some(index) = index {
+                    let expected = all.index_axis(Axis(0), index);
+                    assert_close(belief, expected, &format!("{case} step {step}"));
+                }
+            };
             let frame = frame_from(observed, everything.view());
             filter.correct(&frame).expect("possible frame");
-            if let Some(index) = index {
-                let expected = posteriors.slice(s![index, .., .., ..]);
-                assert_close(
-                    filter.belief(),
-                    expected,
-                    &format!("{case} posterior {step}"),
-                );
-            }
+            check(filter.belief(), &posteriors);
             filter.predict();
-            if let Some(index) = index {
-                let expected = predictors.slice(s![index, .., .., ..]);
-                assert_close(
-                    filter.belief(),
-                    expected,
-                    &format!("{case} predictor {step}"),
-                );
-            }
+            check(filter.belief(), &predictors);
         }
     }
 }
 
-/// The wildfire model with the likelihood that the reference's network learned: `W` is `[O, S]` and
-/// the softmax runs over observations.
-fn model_observed_through(weights: &Array2<f32>) -> Model {
-    let mut file = Model::wildfire().file().clone();
-    for (state, column) in file.states.iter_mut().zip(weights.columns()) {
-        let exponentials: Vec<f64> = column.iter().map(|&w| f64::from(w).exp()).collect();
-        let sum: f64 = exponentials.iter().sum();
-        state.observed_as = exponentials.iter().map(|e| e / sum).collect();
-    }
-    Model::new(file).expect("a softmax is a distribution")
-}
-
-fn check_masked(
-    weights: &Array2<f32>,
-    prior: ArrayView3<'_, f32>,
-    frame: &Frame,
-    posterior: ArrayView3<'_, f32>,
-    what: &str,
-) {
-    let model = model_observed_through(weights);
-    let mut filter = BayesFilter::known(&model, belief_from(prior)).expect("valid model");
-    filter.correct(frame).expect("possible frame");
-    assert_close(filter.belief(), posterior, what);
-}
-
-/// A4 without the network: Bayes' rule on visited cells only.
+/// A4 without the network: Bayes' rule on visited cells only, with the likelihood that the reference's network learned:
+/// `W` is `[O, S]` and the softmax runs over observations.
 #[test]
 fn the_masked_posterior_agrees() {
     let mut golden = Golden::open("a4_masked_small");
     for case in ["3x3", "4x6"] {
-        let weights = golden.get(&format!("{case}_W"));
+        let weights: Array2<f32> = golden.get(&format!("{case}_W"));
         let prior: Array3<f32> = golden.get(&format!("{case}_u"));
         let observations: Array2<u8> = golden.get(&format!("{case}_obs"));
         let mask: Array2<u8> = golden.get(&format!("{case}_mask"));
         let posterior: Array3<f32> = golden.get(&format!("{case}_state_est"));
+        let mut file = Model::wildfire().file().clone();
+        for (state, column) in file.states.iter_mut().zip(weights.columns()) {
+            let exponentials = column.mapv(|w| f64::from(w).exp());
+            state.observed_as = (&exponentials / exponentials.sum()).to_vec();
+        }
+        let model = Model::new(file).expect("a softmax is a distribution");
+        let prior = belief_from(prior.view());
+        let mut filter = BayesFilter::known(&model, prior).expect("valid model");
         let frame = frame_from(observations.view(), mask.view());
-        check_masked(&weights, prior.view(), &frame, posterior.view(), case);
-    }
-}
-
-/// A4 at full size, along a path. The file holds two of the reference's six steps:
-///
-/// ```python
-/// z = np.load("golden/a4_masked_step.npz")
-/// u, mask, p = np.stack([z["u0"], z["u_next"][0]]), z["mask"][:2], z["state_est"][:2]
-/// assert (p == u)[mask == 0].all()
-/// np.savez("a4_masked_filter.npz", W=z["W_obs_param"], u=u, obs=z["obs"][:2], mask=mask,
-///          posterior_at_mask=p[mask > 0])
-/// ```
-#[test]
-fn the_masked_posterior_agrees_along_a_path() {
-    let mut golden = Golden::open("a4_masked_filter");
-    let weights: Array2<f32> = golden.get("W");
-    let priors: Array4<f32> = golden.get("u");
-    let observations: Array3<u8> = golden.get("obs");
-    let masks: Array3<u8> = golden.get("mask");
-    let at_mask: Array2<f32> = golden.get("posterior_at_mask");
-    let mut visited = at_mask.rows().into_iter();
-    for step in 0..2 {
-        let (prior, mask) = (
-            priors.slice(s![step, .., .., ..]),
-            masks.slice(s![step, .., ..]),
-        );
-        let mut posterior = prior.to_owned();
-        for ((row, col), _) in mask.indexed_iter().filter(|&(_, &seen)| seen > 0) {
-            let cell = visited.next().expect("one row per visited cell");
-            posterior.slice_mut(s![row, col, ..]).assign(&cell);
-        }
-        let frame = frame_from(observations.slice(s![step, .., ..]), mask);
-        check_masked(
-            &weights,
-            prior,
-            &frame,
-            posterior.view(),
-            &format!("step {step}"),
-        );
-    }
-    assert!(visited.next().is_none());
-}
-
-/// One of the reference's planning problems, in our coordinates.
-///
-/// The reference writes the visit mask at `[position[1], position[0]]`, so its second coordinate is the
-/// row, and its basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. The environment gets
-/// that same mask, so nothing but the names of the axes is turned.
-struct Case {
-    name: &'static str,
-    belief: Array3<f32>,
-    shape: Shape,
-    start: Cell,
-    /// The sampled moves, clamped after they are summed up, as moves that our robot flies.
-    paths: Vec<Vec<Move>>,
-}
-
-impl Case {
-    fn read(golden: &mut Golden, name: &'static str) -> Self {
-        let belief: Array3<f32> = golden.get(&format!("{name}_belief"));
-        let shape = shape_of((belief.dim().0, belief.dim().1));
-        let start: Array1<i64> = golden.get(&format!("{name}_start"));
-        let (row, col) = (start[1] as usize, start[0] as usize);
-        let start = Cell { row, col };
-        let basis = [Move::Right, Move::Left, Move::Down, Move::Up];
-        let samples: Array2<u8> = golden.get(&format!("{name}_moves"));
-        let flown = |sample: ndarray::ArrayView1<'_, u8>| {
-            let sampled: Vec<Move> = sample.iter().map(|&m| basis[usize::from(m)]).collect();
-            Integration::ClampSum.as_flown(shape, start, &sampled)
-        };
-        let paths = samples.outer_iter().map(flown).collect();
-        Self {
-            name,
-            belief,
-            shape,
-            start,
-            paths,
-        }
-    }
-}
-
-const CASES: [&str; 6] = [
-    "p1_6x6_hand_start00",
-    "p2_6x6_hand_start53",
-    "p3_6x6_zero_prob",
-    "p4_64x64_n64",
-    "p5_8x8_n40_T64",
-    "p7_64x64_n256_bayes",
-];
-
-/// A5: the robot, which clamps each move, flies over the cells that the reference got by clamping
-/// the sum of all moves so far.
-#[test]
-fn clamped_sums_are_flown_cell_by_cell() {
-    let mut golden = Golden::open("a5_planner");
-    for name in CASES {
-        let case = Case::read(&mut golden, name);
-        let positions: Array3<u8> = golden.get(&format!("{name}_traj"));
-        for (path, positions) in case.paths.iter().zip(positions.outer_iter()) {
-            let mut cell = case.start;
-            for (step, position) in path.iter().zip(positions.outer_iter()) {
-                cell = step.apply(cell, case.shape);
-                assert_eq!(
-                    [cell.col, cell.row],
-                    [0, 1].map(|axis| usize::from(position[axis]))
-                );
-            }
-        }
+        filter.correct(&frame).expect("possible frame");
+        assert_close(filter.belief(), posterior.view(), case);
     }
 }
 
@@ -230,22 +102,20 @@ fn clamped_sums_are_flown_cell_by_cell() {
 fn objective(planner_type: usize, action: usize) -> Objective {
     const DEFAULT: usize = 0;
     const RANDOM: usize = 1; // number of distinct cells, whatever the action
-    let target = match planner_type {
+    Objective::paper(match planner_type {
         DEFAULT if action < 3 => Target::State(action),
         RANDOM => Target::Coverage,
         // "Default" for action 3, and "VisitingGrayArea" for every action.
         _ => Target::Entropy,
-    };
-    Objective::paper(target)
+    })
 }
 
-/// The first of the highest numbers.
-fn argmax(scores: &[f32]) -> usize {
-    let better = |best: usize, i: usize| if scores[i] > scores[best] { i } else { best };
-    (0..scores.len()).fold(0, better)
-}
-
-/// A5: scores of every sample under three planner types and four actions, and the winners.
+/// A5: scores of every sample under three planner types and four actions, and the winners. The sampled moves, clamped
+/// after they are summed up, become moves that our robot flies over the same cells.
+///
+/// The reference writes the visit mask at `[position[1], position[0]]`, so its second coordinate is the
+/// row, and its basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. The environment gets
+/// that same mask, so nothing but the names of the axes is turned.
 ///
 /// A zero probability makes the reference's entropy `0 * log 0 = NaN`; it multiplies the whole grid
 /// by the visit mask, so the score of every path is NaN, and `torch.argmax` takes the first NaN. Our
@@ -256,35 +126,48 @@ fn argmax(scores: &[f32]) -> usize {
 #[test]
 fn path_scores_and_winners_agree() {
     const TOLERANCE: f32 = 5e-5;
+    let basis = [Move::Right, Move::Left, Move::Down, Move::Up];
     let mut golden = Golden::open("a5_planner");
-    for name in CASES {
-        let case = Case::read(&mut golden, name);
+    for name in [
+        "p1_6x6_hand_start00",
+        "p2_6x6_hand_start53",
+        "p3_6x6_zero_prob",
+        "p4_64x64_n64",
+        "p5_8x8_n40_T64",
+        "p7_64x64_n256_bayes",
+    ] {
+        let belief: Array3<f32> = golden.get(&format!("{name}_belief"));
+        let start: Array1<i64> = golden.get(&format!("{name}_start"));
+        let samples: Array2<u8> = golden.get(&format!("{name}_moves"));
         let scores: Array3<f32> = golden.get(&format!("{name}_scores"));
         let winners: Array2<i64> = golden.get(&format!("{name}_argmax"));
-        let has_zero = case.belief.iter().any(|&p| p == 0.0);
-        let belief = belief_from(case.belief.view());
+        let shape = shape_of((belief.dim().0, belief.dim().1));
+        let (row, col) = (start[1] as usize, start[0] as usize);
+        let start = Cell { row, col };
+        let paths = samples.outer_iter().map(|sample| {
+            let sampled: Vec<Move> = sample.iter().map(|&m| basis[usize::from(m)]).collect();
+            Integration::ClampSum.as_flown(shape, start, &sampled)
+        });
+        let paths: Vec<Vec<Move>> = paths.collect();
+        let has_zero = belief.iter().any(|&p| p == 0.0);
+        let belief = belief_from(belief.view());
         for (planner_type, action) in (0..3).flat_map(|p| (0..4).map(move |a| (p, a))) {
-            let what = format!("{} planner type {planner_type} action {action}", case.name);
+            let what = format!("{name} planner type {planner_type} action {action}");
             let objective = objective(planner_type, action);
             let values = objective.values(&belief);
-            let score = |path: &Vec<Move>| values.score(case.start, path);
-            let ours: Vec<f32> = case.paths.iter().map(score).collect();
-            let theirs = scores.slice(s![planner_type, action, ..]).to_vec();
+            let ours: Vec<f32> = paths.iter().map(|it| values.score(start, it)).collect();
+            let theirs = scores.slice(ndarray::s![planner_type, action, ..]);
             let winner = winners[[planner_type, action]] as usize;
             if has_zero && objective.target == Target::Entropy {
                 assert!(theirs.iter().all(|score| score.is_nan()), "{what}");
                 assert_eq!(winner, 0, "{what}: the first NaN");
                 continue;
             }
-            for (sample, (a, b)) in ours.iter().zip(&theirs).enumerate() {
-                assert!(
-                    (a - b).abs() < TOLERANCE,
-                    "{what} sample {sample}: {a}, expected {b}"
-                );
+            for (sample, (a, b)) in ours.iter().zip(theirs).enumerate() {
+                assert!((a - b).abs() < TOLERANCE, "{what} {sample}: {a}, not {b}");
             }
-            let best = argmax(&ours);
-            let tied = ours[best] - ours[winner] < TOLERANCE;
-            assert!(best == winner || tied, "{what}: {best}, expected {winner}");
+            let best = ours.iter().copied().fold(f32::MIN, f32::max);
+            assert!(best - ours[winner] < TOLERANCE, "{what}");
         }
     }
 }
@@ -302,16 +185,10 @@ fn random_walks_fly_the_same_cells() {
         let (row, col) = (start[0] as usize, start[1] as usize);
         let path: Vec<Move> = moves.iter().map(|&m| basis[usize::from(m)]).collect();
         let flight = fly(shape_of(mask.dim()), Cell { row, col }, &path);
-        let mut visited = flight.visited;
-        visited.sort_unstable();
-        let expected = mask.iter().enumerate().filter(|&(_, &seen)| seen > 0);
-        assert!(
-            visited.into_iter().eq(expected.map(|(index, _)| index)),
-            "{name}"
-        );
-        assert_eq!(
-            [flight.end.row as f64, flight.end.col as f64],
-            [end[0], end[1]]
-        );
+        for (cell, &seen) in mask.iter().enumerate() {
+            assert_eq!(flight.visited.contains(&cell), seen > 0, "{name} {cell}");
+        }
+        let ends = [flight.end.row as f64, flight.end.col as f64];
+        assert_eq!(ends, [end[0], end[1]], "{name}");
     }
 }

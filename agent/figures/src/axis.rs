@@ -132,42 +132,38 @@ pub fn spread(positions: &[f64], gap: f64, (least, most): (f64, f64)) -> Vec<f64
 mod tests {
     use super::*;
 
-    fn check(values: &[f64], ticks: &[f64], label: &str) {
-        let axis = Axis::covering(values.iter().copied(), 5);
-        assert_eq!(axis.ticks.len(), ticks.len(), "{axis:?}");
-        for (got, expected) in axis.ticks.iter().zip(ticks) {
-            assert!((got - expected).abs() < 1e-9, "{axis:?}");
-        }
-        assert_eq!(axis.label(axis.ticks[1]), label);
-    }
-
     #[test]
     fn ticks_are_round_and_cover_zero_and_the_values() {
-        check(&[38.0, 47.9], &[0.0, 10.0, 20.0, 30.0, 40.0, 50.0], "10");
-        check(&[-3.0, 1.0], &[-3.0, -2.0, -1.0, 0.0, 1.0], "-2");
-        check(
-            &[0.011],
-            &[0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125],
-            "0.0025",
-        );
-        check(&[], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
-        check(&[0.0, 0.0], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
-        check(
-            &[f64::NAN, 1e300, 1e-300],
-            &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0],
-            "0.2",
-        );
+        let none: [f64; 6] = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0];
+        for (values, ticks, label) in [
+            (
+                vec![38.0, 47.9],
+                &[0.0, 10.0, 20.0, 30.0, 40.0, 50.0][..],
+                "10",
+            ),
+            (vec![-3.0, 1.0], &[-3.0, -2.0, -1.0, 0.0, 1.0], "-2"),
+            (vec![0.011], &none.map(|tick| tick / 80.0), "0.0025"),
+            (vec![], &none, "0.2"),
+            (vec![0.0, 0.0], &none, "0.2"),
+            (vec![f64::NAN, 1e300, 1e-300], &none, "0.2"),
+        ] {
+            let axis = Axis::covering(values.into_iter(), 5);
+            assert_eq!(axis.ticks.len(), ticks.len(), "{axis:?}");
+            let mut pairs = axis.ticks.iter().zip(ticks);
+            assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-9), "{axis:?}");
+            assert_eq!(axis.label(axis.ticks[1]), label);
+        }
     }
 
     #[test]
     fn labels_of_extreme_numbers_stay_short() {
-        let label = |value: f64| {
+        for (value, label) in [(1e9, "2e8"), (1.2e-9, "2.5e-10"), (4e199, "1e199")] {
             let axis = Axis::covering(std::iter::once(value), 5);
-            (axis.label(0.0), axis.label(axis.ticks[1]))
-        };
-        assert_eq!(label(1e9), ("0".into(), "2e8".into()));
-        assert_eq!(label(1.2e-9), ("0".into(), "2.5e-10".into()));
-        assert_eq!(label(4e199), ("0".into(), "1e199".into()));
+            assert_eq!(
+                (&*axis.label(0.0), &*axis.label(axis.ticks[1])),
+                ("0", label)
+            );
+        }
     }
 
     #[test]
@@ -181,13 +177,11 @@ mod tests {
 
     #[test]
     fn spread_labels_keep_their_distance_order_and_bounds() {
-        assert_eq!(spread(&[10.0, 50.0], 10.0, (0.0, 100.0)), [10.0, 50.0]);
-        assert_eq!(spread(&[50.0, 50.0], 10.0, (0.0, 100.0)), [45.0, 55.0]);
-        assert_eq!(spread(&[99.0, 98.0], 10.0, (0.0, 100.0)), [100.0, 90.0]);
-        assert_eq!(
-            spread(&[1.0, 2.0, 3.0], 10.0, (0.0, 100.0)),
-            [0.0, 10.0, 20.0]
-        );
-        assert_eq!(spread(&[], 10.0, (0.0, 1.0)), Vec::<f64>::new());
+        let spread = |labels: &[f64]| spread(labels, 10.0, (0.0, 100.0));
+        assert_eq!(spread(&[10.0, 50.0]), [10.0, 50.0]);
+        assert_eq!(spread(&[50.0, 50.0]), [45.0, 55.0]);
+        assert_eq!(spread(&[99.0, 98.0]), [100.0, 90.0]);
+        assert_eq!(spread(&[1.0, 2.0, 3.0]), [0.0, 10.0, 20.0]);
+        assert_eq!(spread(&[]), [0.0; 0]);
     }
 }

@@ -430,41 +430,55 @@ mod tests {
     #[test]
     fn another_kind_format_tensor_or_state_is_named() {
         let whole = encode("tests", &contents()).expect("small");
-        let refused = |from: &str, to: &str| {
-            let at = whole
-                .windows(from.len())
-                .position(|word| word == from.as_bytes());
+        for (from, to, words) in [
+            (
+                "emberwatch.kind",
+                "emberwatch.kinb",
+                "kind: expected a learner, got none",
+            ),
+            (
+                r#"format":"4""#,
+                r#"format":"9""#,
+                "format: expected 4, got 9",
+            ),
+            (
+                r#"format":"4""#,
+                r#"formar":"4""#,
+                "format: expected 4, got none",
+            ),
+        ] {
+            let mut words_at = whole.windows(from.len());
+            let at = words_at.position(|word| word == from.as_bytes());
             let (mut bytes, at) = (whole.clone(), at.expect("in the file"));
             bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
-            decode(&bytes).expect_err(to).to_string()
-        };
-        let words = "emberwatch.kind: expected a learner, got none";
-        assert_eq!(refused("emberwatch.kind", "emberwatch.kinb"), words);
-        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"4""#, "none")] {
-            let words = format!("emberwatch.format: expected 4, got {got}");
-            assert_eq!(refused(r#"format":"4""#, to), words);
+            let error = decode(&bytes).expect_err(to).to_string();
+            assert_eq!(error, format!("emberwatch.{words}"));
         }
         let got = contents();
-        let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
-        assert_eq!(
-            error("kernel", &[4]),
-            "kernel: expected shape [4], got [2, 2]"
-        );
-        assert_eq!(error("bias", &[4]), "bias: expected shape [4], got none");
-        let error = got.state::<u64>().expect_err("longer").to_string();
-        assert!(
-            error.starts_with("state: expected 8 bytes, got "),
-            "{error}"
-        );
-        let error = Contents::new([], &u64::MAX).state::<Vec<String>>();
-        let error = error.expect_err("a forged length").to_string();
-        assert!(
-            error.starts_with("state: expected that of its learner"),
-            "{error}"
-        );
-        let endless = read(Path::new("/dev/zero")).expect_err("no file");
-        assert!(format!("{endless:#}").contains("expected a regular file"));
-        let missing = read(Path::new("no/such")).expect_err("none");
-        assert!(format!("{missing:#}").starts_with("checkpoint no/such: No such file"));
+        for (name, words) in [
+            ("kernel", "kernel: expected shape [4], got [2, 2]"),
+            ("bias", "bias: expected shape [4], got none"),
+        ] {
+            assert_eq!(got.tensor(name, &[4]).expect_err(name).to_string(), words);
+        }
+        let forged = Contents::new([], &u64::MAX).state::<Vec<String>>();
+        for (error, words) in [
+            (
+                got.state::<u64>().map(drop),
+                "state: expected 8 bytes, got ",
+            ),
+            (forged.map(drop), "state: expected that of its learner"),
+            (
+                read(Path::new("no/such")).map(drop),
+                "checkpoint no/such: No such file",
+            ),
+            (
+                read(Path::new("/dev/zero")).map(drop),
+                "checkpoint /dev/zero: expected a regular file",
+            ),
+        ] {
+            let error = format!("{:#}", error.expect_err(words));
+            assert!(error.starts_with(words), "{error}");
+        }
     }
 }

@@ -169,27 +169,33 @@ mod tests {
 
     #[test]
     fn wrong_settings_are_named() {
-        let config = AgentConfig {
-            beam_width: 0,
-            ..AgentConfig::default()
-        };
-        let error = config.check().expect_err("no beam").to_string();
-        assert_eq!(error, "beam_width: expected 1 to 10000, got 0");
-        let mut config = AgentConfig::default();
-        config.objective.beam_bonus = f32::NAN;
-        let error = config.check().expect_err("no number").to_string();
-        assert_eq!(error, "objective.beam_bonus: expected 0 to 1000, got NaN");
-        for (text, words) in [
-            (
-                "[objective]\nbelief = \"prior\"",
-                "unknown variant `prior`, expected `predictor` or `estimate`",
-            ),
-            (
-                "kernels = \"cell\"",
-                "unknown variant `cell`, expected `neighbours` or `own`",
-            ),
+        for (settings, expected) in [
+            ("beam_width = 0", "1 to 10000, got 0"),
+            ("objective.beam_bonus = nan", "0 to 1000, got NaN"),
+            ("learning.streams = 0", "1 to 1024, got 0"),
+            ("learning.states = 1", "2 to 64, got 1"),
+            ("learning.rate = nan", "0 to 1, got NaN"),
+            ("learning.beta1 = 1.0", "0 to 0.999999, got 1"),
+            ("neural.batch = 0", "1 to 1024, got 0"),
+            ("neural.rate = nan", "0 to 1, got NaN"),
+            ("autoencoder.replay_frames = 999", "1000 to 100000, got 999"),
+            ("autoencoder.step_size.rate = 2.0", "0 to 1, got 2"),
+            ("dqn.epsilon = 2.0", "0 to 1, got 2"),
+            ("decisions.n_step = 0", "1 to 1000, got 0"),
+            ("decisions.replay = 8", "256 to 200000, got 8"),
+            ("decisions.beam_width = 0", "1 to 10000, got 0"),
+            ("decisions.gamma = 1.5", "0 to 1, got 1.5"),
+            ("decisions.rate = nan", "0 to 1, got NaN"),
         ] {
-            let error = AgentConfig::from_toml(text).expect_err("no such name");
+            let error = AgentConfig::from_toml(settings).expect_err(settings);
+            let name = settings.split(" = ").next().unwrap_or_default();
+            assert_eq!(error.to_string(), format!("{name}: expected {expected}"));
+        }
+        for (settings, words) in [
+            ("objective.belief = 'prior'", "`predictor` or `estimate`"),
+            ("kernels = 'cell'", "`neighbours` or `own`"),
+        ] {
+            let error = AgentConfig::from_toml(settings).expect_err(settings);
             assert!(error.to_string().contains(words), "{error}");
         }
     }

@@ -58,9 +58,7 @@ mod tests {
         assert!(!learned.put(3_u8) && !learned.put("text"));
         assert!(!learned.put(3_u8), "the same");
         assert!(learned.put(4_u8), "another");
-        assert_eq!(
-            (learned.get::<u8>(), learned.get::<&str>()),
-            (Some(&4), Some(&"text"))
-        );
+        assert_eq!(learned.get::<u8>(), Some(&4));
+        assert_eq!(learned.get::<&str>(), Some(&"text"));
     }
 }

@@ -9,7 +9,7 @@ mod left;
 pub mod network;
 pub mod neural;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod update;
 
 pub use self::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds};

@@ -9,39 +9,30 @@ use emberwatch_learning::rollout::building::agent;
 use emberwatch_learning::rollout::{Actor, Rollout, Seen};
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
-use emberwatch_model::path::fly;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Frame, Model, Move, Shape};
-
-const N_MOVES: usize = 6;
+use emberwatch_model::{Cell, Frame, Model, Shape};
 
 fn shape() -> Shape {
     Shape::new(8, 9).expect("test shape")
 }
 
-/// What robots see of a made-up world at a step: each the cells that it flew over, in the frame of all.
-fn seen(step: u64, flights: &[(Cell, &[Move])]) -> Seen {
+/// What robots in some cells see of a made-up world.
+fn seen(step: u64, cells: &[Cell]) -> Seen {
     let mut frame = Frame::empty(shape());
-    let mut robot = |&(start, path): &(Cell, &[Move])| {
-        let flight = fly(shape(), start, path);
-        for &cell in &flight.visited {
-            frame.observe(cell, (split_mix(step, cell as u64) % 3) as u8);
-        }
-        RobotResult {
-            n_visited: flight.visited.len() as u32,
-            row: flight.end.row as u32,
-            col: flight.end.col as u32,
-            ..RobotResult::default()
-        }
-    };
-    let robots: Vec<RobotResult> = flights.iter().map(&mut robot).collect();
+    for cell in (0..72).filter(|cell| split_mix(step, *cell).is_multiple_of(4)) {
+        frame.observe(cell as usize, (split_mix(step + 9, cell) % 3) as u8);
+    }
     let world = WorldResult {
         step,
         ..WorldResult::default()
     };
-    Seen::new(robots.into_iter().map(|robot| Observation {
+    Seen::new(cells.iter().map(|cell| Observation {
         world,
-        robot,
+        robot: RobotResult {
+            row: cell.row as u32,
+            col: cell.col as u32,
+            ..RobotResult::default()
+        },
         frame: frame.clone(),
     }))
 }
@@ -56,10 +47,8 @@ fn robot(policy: &str, cells: &[Cell]) -> Rollout {
         learned: &Learned::default(),
     };
     let policy = Policy::named(policy, &model).expect("known");
-    let config = AgentConfig::default();
-    let agent = agent(&policy, &config, &conditions, N_MOVES, 7).expect("an agent");
-    let flights: Vec<(Cell, &[Move])> = cells.iter().map(|&cell| (cell, &[][..])).collect();
-    Rollout::begun(agent, seen(0, &flights)).expect("possible")
+    let agent = agent(&policy, &AgentConfig::default(), &conditions, 6, 7);
+    Rollout::begun(agent.expect("an agent"), seen(0, cells)).expect("possible")
 }
 
 const CELLS: [Cell; 3] = [
@@ -69,28 +58,29 @@ const CELLS: [Cell; 3] = [
 ];
 
 #[test]
-fn paths_are_flown_by_robot_and_each_agent_sees_its_own() {
-    let team = robot("beam_exploit", &CELLS[..2]);
-    let single = robot("beam_exploit", &CELLS[2..]);
-    let mut agents = vec![team, single];
-    for step in 1..5 {
-        let cells: Vec<Vec<Cell>> = agents.iter().map(Rollout::cells).collect();
-        let paths = agents.plan();
-        assert_eq!(paths.len(), 3);
-        let flights = |agent: usize, first: usize| -> Vec<(Cell, &[Move])> {
-            let own = cells[agent].iter().copied();
-            own.zip(paths[first..].iter().map(|path| &**path)).collect()
-        };
-        let seen = vec![seen(step, &flights(0, 0)), seen(step, &flights(1, 2))];
-        agents.see(seen).expect("possible");
-        assert!(agents.iter().all(|agent| agent.step() == step));
-        agents.predict();
-        // No two paths of a team meet where there is room for both.
-        let n_visited: u32 = agents[0].results().map(|it| it.n_visited).sum();
-        assert_eq!(
-            n_visited as usize,
-            agents[0].observation().frame.observed().count()
-        );
+fn paths_come_by_robot_and_each_agent_sees_its_own() {
+    let new = || {
+        vec![
+            robot("beam_exploit", &CELLS[..2]),
+            robot("beam_exploit", &CELLS[2..]),
+        ]
+    };
+    let (mut together, mut alone) = (new(), new());
+    for step in 1..4 {
+        let paths = together.plan();
+        let of_each = alone.iter_mut().flat_map(Rollout::plan);
+        assert_eq!(paths, of_each.map(|plan| plan.moves).collect::<Vec<_>>());
+        let sights = || [seen(step, &CELLS[..2]), seen(step + 50, &CELLS[2..])];
+        together.see(sights().into()).expect("possible");
+        together.predict();
+        for (agent, seen) in alone.iter_mut().zip(sights()) {
+            agent.see(seen).expect("possible");
+            agent.agent.predict();
+        }
+        for (one, other) in together.iter().zip(&alone) {
+            assert_eq!(one.agent.belief(), other.agent.belief());
+            assert_eq!(one.step(), other.step());
+        }
     }
 }
 
@@ -110,24 +100,4 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         let first = team.agent.plan(&CELLS[..1], team.step());
         assert_eq!(own, first, "{policy}");
     }
-}
-
-#[test]
-fn missed_steps_equal_steps_without_a_frame() {
-    let mut late = robot("beam_exploit", &CELLS[..1]);
-    let mut hovering = robot("beam_exploit", &CELLS[..1]);
-    for step in 1..4 {
-        hovering.plan();
-        let nothing = seen(step, &[(CELLS[0], &[])]);
-        hovering.see(nothing).expect("possible");
-        hovering.agent.predict();
-        if step < 3 {
-            late.agent.predict();
-        }
-    }
-    late.see(seen(3, &[(CELLS[0], &[])])).expect("possible");
-    late.agent.predict();
-    assert_eq!(late.agent.belief(), hovering.agent.belief());
-    assert_eq!(late.observation(), hovering.observation());
-    assert_eq!(late.plan(), hovering.plan());
 }

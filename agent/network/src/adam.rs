@@ -249,11 +249,8 @@ mod tests {
             let mut adam = Adam::new(variables()).expect("moments");
             step(&mut adam, &settings, g);
             let first: Vec<f32> = adam.moments["first.p"].to_vec1().expect("numbers");
-            let off = first
-                .iter()
-                .zip(expected)
-                .map(|(a, b): (&f32, f32)| (a - b).abs());
-            assert!(off.fold(0.0, f32::max) < 1e-6, "{first:?}");
+            let off = first.iter().zip(expected).map(|(a, b)| (a - b).abs());
+            assert!(off.fold(0.0_f32, f32::max) < 1e-6, "{first:?}");
         }
     }
 
@@ -266,8 +263,7 @@ mod tests {
             step(&mut adam, &settings, [0.0, 0.0]);
         }
         for moment in adam.moments.values() {
-            let numbers: Vec<f32> = moment.to_vec1().expect("numbers");
-            for number in numbers {
+            for number in moment.to_vec1::<f32>().expect("numbers") {
                 assert!(number < 1e-30 && !number.is_subnormal(), "{number}");
             }
         }

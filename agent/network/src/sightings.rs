@@ -224,56 +224,20 @@ mod tests {
         assert_eq!((crop.sides, Features::n_channels(3)), ([4, 4], 16));
         let mut features = vec![0.0; 16 * 16];
         Features::new(3).write(&sightings(), &crop, &mut features);
-        let cell = |cell: usize| {
-            features
-                .iter()
-                .skip(cell)
-                .step_by(16)
-                .copied()
-                .collect::<Vec<_>>()
+        let cell = |cell: usize| -> Vec<f32> {
+            let of_cell = features.iter().skip(cell).step_by(16);
+            of_cell.copied().collect()
         };
         let fresh = |age: f32, steps: f32| (-age / steps).exp();
         let [a, b, c] = FADING_STEPS.map(|steps| fresh(10.0, steps));
         let log = |age: f32| age.ln_1p() / 8.0;
-        let (d, e) = (fresh(15.0, 60.0), fresh(15.0, 400.0));
-        let first = [
-            a,
-            0.,
-            0.,
-            b,
-            0.,
-            0.,
-            c,
-            0.,
-            0.,
-            0.,
-            d,
-            0.,
-            0.,
-            log(10.0),
-            1.,
-            e,
-        ];
-        assert_eq!(cell(0), first);
-        let second = [
-            0.,
-            0.,
-            a,
-            0.,
-            0.,
-            b,
-            0.,
-            0.,
-            c,
-            0.,
-            0.,
-            0.,
-            0.,
-            log(10.0),
-            1.,
-            0.,
-        ];
-        assert_eq!(cell(1), second);
+        let earlier = [0.0, fresh(15.0, 60.0), 0.0, 0.0];
+        let last = [log(10.0), 1.0, fresh(15.0, 400.0)];
+        let first = [a, 0.0, 0.0, b, 0.0, 0.0, c, 0.0, 0.0];
+        assert_eq!(cell(0), [&first[..], &earlier, &last].concat());
+        let second = [0.0, 0.0, a, 0.0, 0.0, b, 0.0, 0.0, c];
+        let last = [log(10.0), 1.0, 0.0];
+        assert_eq!(cell(1), [&second[..], &[0.0; 4], &last].concat());
         let mut never = [0.0; 16];
         (never[12], never[13], never[14]) = (1.0, log(4000.0), 1.0);
         assert_eq!(cell(2), never);

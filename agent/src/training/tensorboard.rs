@@ -224,12 +224,6 @@ mod tests {
     }
 
     #[test]
-    fn the_checksum_is_that_of_castagnoli() {
-        // RFC 3720, appendix B.4: 32 bytes of zero.
-        assert_eq!(CASTAGNOLI.checksum(&[0; 32]), 0x8a91_36aa);
-    }
-
-    #[test]
     fn files_begun_in_one_second_sort_in_their_order() {
         let folder = tempfile::tempdir().expect("a folder");
         let begin = || EventFile::begin(folder.path(), 0).expect("begun").path;

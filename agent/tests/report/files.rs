@@ -32,12 +32,12 @@ fn many_writers_of_one_file_lose_no_rows() {
     let folder = folder();
     let path = folder.path().join("runs.csv");
     std::thread::scope(|scope| {
-        for writer in 0..8 {
+        for writer in 0..4 {
             let path = &path;
-            scope.spawn(move || (0..10).for_each(|row| add(path, &format!("{writer}_{row}"))));
+            scope.spawn(move || (0..5).for_each(|row| add(path, &format!("{writer}_{row}"))));
         }
     });
-    assert_eq!(read_runs(&path).expect("rows").len(), 80);
+    assert_eq!(read_runs(&path).expect("rows").len(), 20);
     assert_eq!(names(&folder), ["runs.csv"]);
 }
 
@@ -87,16 +87,23 @@ fn the_file_behind_a_link_is_replaced() {
 fn files_with_a_byte_order_mark_and_of_older_releases_are_read() {
     let folder = folder();
     let path = folder.path().join("runs.csv");
-    add(&path, "mine");
+    let mut team = run("mine", "none", 0, 1.0);
+    team.robots = 4;
+    let file = RunsFile::lock(&path, MINUTE).expect("locked");
+    file.replace(&[team]).expect("written");
     let text = std::fs::read_to_string(&path).expect("rows");
     std::fs::write(&path, format!("\u{feff}{text}")).expect("written");
     let runs = read_runs(&path).expect("rows");
     assert_eq!((runs.len(), &*runs[0].policy), (1, "mine"));
-    let cut = |line: &str| line.rsplitn(4, ',').last().map(String::from);
-    let old: Vec<String> = text.lines().filter_map(cut).collect();
-    std::fs::write(&path, old.join("\r\n")).expect("written");
-    let runs = read_runs(&path).expect("rows");
-    assert_eq!((runs.len(), &*runs[0].worlds_fingerprint), (1, ""));
+    // Without fingerprints, then without teams and figures of merit.
+    for (n_cut, robots) in [(4, 4), (14, 1)] {
+        let cut = |line: &str| line.rsplitn(n_cut, ',').last().map(String::from);
+        let old: Vec<String> = text.lines().filter_map(cut).collect();
+        std::fs::write(&path, old.join("\r\n")).expect("written");
+        let runs = read_runs(&path).expect("rows");
+        assert_eq!((runs.len(), &*runs[0].worlds_fingerprint), (1, ""));
+        assert_eq!((runs[0].robots, &*runs[0].team), (robots, "alone"));
+    }
     for text in ["", "\u{feff}", "not a table\n", "policy,steps\nmine,3\n"] {
         std::fs::write(&path, text).expect("written");
         match read_runs(&path) {

@@ -5,8 +5,15 @@ use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
 use emberwatch_agent::benchmark::report::leaderboard::{About, Entry};
 use emberwatch_agent::benchmark::report::suite::TaskRuns;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
-type Change<T> = fn(&mut T);
+/// A value with the entries of a line of TOML.
+fn changed<T: Serialize + DeserializeOwned>(value: &T, line: &str) -> T {
+    let mut table = toml::Table::try_from(value).expect("a table");
+    table.extend(line.parse::<toml::Table>().expect("TOML"));
+    table.try_into().expect("of the same type")
+}
 
 fn worlds() -> CommonWorlds {
     CommonWorlds {
@@ -32,44 +39,27 @@ fn check(worlds: &CommonWorlds, runs: &[PolicyRun]) -> Result<(), String> {
 #[test]
 fn runs_of_other_worlds_are_refused_with_what_differs() {
     assert_eq!(check(&worlds(), &runs()), Ok(()));
-    let changes: [(Change<Vec<PolicyRun>>, &str); 9] = [
-        (|runs| runs[1].steps = 5, "steps: expected 4, got 5"),
-        (|runs| runs[1].moves = 16, "moves: expected 64, got 16"),
-        (|runs| runs[1].robots = 4, "robots: expected 1, got 4"),
-        (
-            |runs| runs[1].recent_steps = Some(25),
-            "--recent-steps: expected 10, got 25",
-        ),
-        (
-            |runs| runs[1].worlds_fingerprint = "0123456789abcdef".into(),
-            "expected 884869f24f9fd933, got 0123456789abcdef",
-        ),
-        (
-            |runs| runs[1].worlds_fingerprint.clear(),
-            "expected 884869f24f9fd933, got none",
-        ),
-        (
-            |runs| runs[1].policy_fingerprint.clear(),
-            "policy_fingerprint: expected 0df41e66fd442aca, got ",
-        ),
-        (
-            |runs| runs.truncate(2),
-            "one row for each world, 3 from seed 0 to 2, got 2 from seed 0 to 1",
-        ),
-        (
-            |runs| runs[1].world_seed = 2,
-            "one row for each world, 3 from seed 0 to 2, got 3 from seed 0 to 2",
-        ),
-    ];
-    for (change, words) in changes {
-        let mut changed = runs();
-        change(&mut changed);
-        let refusal = check(&worlds(), &changed).expect_err(words);
-        assert!(
-            refusal.starts_with("policy \"mine\"") && refusal.contains(words),
-            "{refusal}"
-        );
+    for refused in "\
+steps = 5 | steps: expected 4, got 5
+moves = 16 | moves: expected 64, got 16
+robots = 4 | robots: expected 1, got 4
+recent_steps = 25 | --recent-steps: expected 10, got 25
+worlds_fingerprint = '0123456789abcdef' | expected 884869f24f9fd933, got 0123456789abcdef
+worlds_fingerprint = '' | expected 884869f24f9fd933, got none
+policy_fingerprint = '' | policy_fingerprint: expected 0df41e66fd442aca, got
+world_seed = 2 | one row for each world, 3 from seed 0 to 2, got 3 from seed 0 to 2"
+        .lines()
+    {
+        let (change, words) = refused.split_once(" | ").expect("two columns");
+        let mut runs = runs();
+        runs[1] = changed(&runs[1], change);
+        let refusal = check(&worlds(), &runs).expect_err(words);
+        assert!(refusal.starts_with("policy \"mine\""), "{refusal}");
+        assert!(refusal.contains(words), "{refusal}");
     }
+    let refusal = check(&worlds(), &runs()[..2]).expect_err("two of three");
+    let words = "one row for each world, 3 from seed 0 to 2, got 2 from seed 0 to 1";
+    assert!(refusal.contains(words), "{refusal}");
 }
 
 #[test]
@@ -92,53 +82,54 @@ fn added_runs_of_older_files_need_no_fingerprint_but_the_same_fire() {
 
 #[test]
 fn an_entry_has_nothing_but_plain_words_and_web_addresses() {
-    let entry = |change: Change<Entry>| {
-        let mut entry = Entry {
-            about: About {
-                policy: "mine".into(),
-                by: "Zoë O'Neil & Søn (MIT), 北京".into(),
-                code: "https://example.org/~zoe/mine?tag=v1#readme".into(),
-                commit: "abcdef0".into(),
-                training_seconds: 5.0,
-            },
+    let about = About {
+        policy: "mine".into(),
+        by: "Zoë O'Neil & Søn (MIT), 北京".into(),
+        code: "https://example.org/~zoe/mine?tag=v1#readme".into(),
+        commit: "abcdef0".into(),
+        training_seconds: 5.0,
+    };
+    let check = |about: &About, task: &str, run: PolicyRun| {
+        let mut runs = runs();
+        runs[1] = run;
+        let entry = Entry {
+            about: about.clone(),
             tasks: vec![TaskRuns {
-                task: "small".into(),
-                runs: runs(),
+                task: task.into(),
+                runs,
             }],
         };
-        change(&mut entry);
         entry.check().map_err(|error| format!("{error:#}"))
     };
-    assert_eq!(entry(|_| ()), Ok(()));
-    let wrong: [(Change<Entry>, &str); 15] = [
-        (|it| it.about.policy = "<b>mine</b>".into(), "policy: "),
-        (|it| it.about.policy = "../mine".into(), "policy: "),
-        (|it| it.about.by = "<svg onload=alert(2)>".into(), "by: "),
-        (|it| it.about.by = "![](//example.org/a.png)".into(), "by: "),
-        (|it| it.about.by = "&#60;svg&#62;".into(), "by: "),
-        (|it| it.about.by = "two | cells".into(), "by: "),
-        (|it| it.about.by = "two\nlines".into(), "by: "),
-        (|it| it.about.by.clear(), "by: "),
-        (
-            |it| it.about.code = "[here](javascript:alert(1))".into(),
-            "code: ",
-        ),
-        (|it| it.about.code = "javascript:alert(1)".into(), "code: "),
-        (|it| it.about.code = "`rm`".into(), "code: "),
-        (|it| it.about.commit = "<i>abcdef0".into(), "commit: "),
-        (|it| it.tasks[0].task = "<script>".into(), "task: "),
-        (
-            |it| it.tasks[0].runs[2].estimator = "<i>none".into(),
-            "estimator: ",
-        ),
-        (|it| it.tasks[0].runs[1].team = "<i>".into(), "team: "),
-    ];
-    for (change, words) in wrong {
-        let refusal = entry(change).expect_err(words);
-        assert!(refusal.starts_with(words), "{refusal}");
+    let run = runs().swap_remove(1);
+    assert_eq!(check(&about, "small", run.clone()), Ok(()));
+    for change in [
+        "policy = '<b>mine</b>'",
+        "policy = '../mine'",
+        "by = '<svg onload=alert(2)>'",
+        "by = '![](//example.org/a.png)'",
+        "by = '&#60;svg&#62;'",
+        "by = 'two | cells'",
+        "by = \"two\\nlines\"",
+        "by = ''",
+        "code = '[here](javascript:alert(1))'",
+        "code = 'javascript:alert(1)'",
+        "code = '`rm`'",
+        "commit = '<i>abcdef0'",
+        "training_seconds = nan",
+        "estimator = '<i>none'",
+        "team = '<i>'",
+        "brier = nan",
+    ] {
+        let name = change.split(' ').next().expect("a name");
+        let refusal = match name {
+            "estimator" | "team" | "brier" => check(&about, "small", changed(&run, change)),
+            _ => check(&changed(&about, change), "small", run.clone()),
+        };
+        let refusal = refusal.expect_err(change);
+        let name = if name == "brier" { "world 1" } else { name };
+        assert!(refusal.starts_with(&format!("{name}: ")), "{refusal}");
     }
-    let refusal = entry(|it| it.about.training_seconds = f64::NAN).expect_err("no number");
-    assert!(refusal.starts_with("training_seconds: "), "{refusal}");
-    let refusal = entry(|it| it.tasks[0].runs[1].brier = Some(f64::NAN)).expect_err("no number");
-    assert!(refusal.starts_with("world 1: "), "{refusal}");
+    let refusal = check(&about, "<script>", run).expect_err("no name");
+    assert!(refusal.starts_with("task: "), "{refusal}");
 }

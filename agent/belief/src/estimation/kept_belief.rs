@@ -156,6 +156,58 @@ mod tests {
     }
 
     #[test]
+    fn a_belief_is_kept_for_all_that_it_depends_on() {
+        let kept = |seed, n_worlds, (height, width)| {
+            let shape = Shape::new(height, width).expect("test shape");
+            let burn_in = 40;
+            let prior = Prior::Simulated { n_worlds, burn_in };
+            KeptBelief::new(prior, &Model::wildfire(), shape, seed).expect("small")
+        };
+        let names = [
+            kept(0, 9, (5, 7)),
+            kept(1, 9, (5, 7)),
+            kept(0, 8, (5, 7)),
+            kept(0, 9, (7, 5)),
+        ];
+        let names = names.map(|it| it.path);
+        for (at, name) in names.iter().enumerate() {
+            assert!(!names[..at].contains(name), "{names:?}");
+        }
+        assert_eq!(kept(0, 9, (5, 7)).path, names[0]);
+    }
+
+    #[test]
+    fn what_was_written_is_read_and_anything_else_is_not() {
+        let folder = tempfile::TempDir::new().expect("a folder");
+        let kept = |key: &str| KeptBelief {
+            path: folder.path().join("new/a.belief"),
+            key: key.into(),
+            dim: (3, 1, 2),
+        };
+        let belief = Belief::uniform(3, Shape::new(1, 2).expect("test shape"));
+        assert_eq!(kept("key").read(), None, "not there");
+        kept("key").write(&belief).expect("written");
+        assert_eq!(kept("key").read(), Some(belief.clone()));
+        assert_eq!(kept("kez").read(), None, "another key");
+        let path = kept("key").path;
+        let whole = std::fs::read(&path).expect("the file");
+        let mut flipped = whole.clone();
+        flipped[whole.len() - 9] ^= 1;
+        for wrong in [&whole[1..], &flipped, b"", &[0; 100]] {
+            std::fs::write(&path, wrong).expect("written");
+            assert_eq!(kept("key").read(), None, "{wrong:?}");
+        }
+        std::fs::remove_file(&path).expect("removed");
+        std::fs::create_dir(&path).expect("a folder in its place");
+        assert_eq!(kept("key").read(), None);
+        kept("key")
+            .write(&belief)
+            .expect_err("a folder in its place");
+        let left = std::fs::read_dir(folder.path().join("new"));
+        assert_eq!(left.expect("listed").count(), 1, "nothing beside it");
+    }
+
+    #[test]
     fn the_oldest_files_go() {
         let folder = tempfile::TempDir::new().expect("a folder");
         for (name, seconds) in [("a", 20), ("b", 10), ("c", 30)] {

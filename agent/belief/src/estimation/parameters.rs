@@ -350,31 +350,23 @@ mod tests {
 
     #[test]
     fn tables_are_distributions_and_weights() {
-        let tables = Parameters::first(dimensions(), 7).tables();
-        for row in tables.likelihood.chunks_exact(4).chain([&*tables.initial]) {
-            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
+        for (n_matrices, n_values) in [(1, 4), (2, 2)] {
+            let dimensions = Dimensions {
+                n_matrices,
+                ..dimensions()
+            };
+            let tables = Parameters::first(dimensions, 7).tables();
+            let rows = tables.likelihood.chunks_exact(n_values);
+            for row in rows.chain([&*tables.initial]) {
+                assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
+            }
+            assert!(tables.kernel.iter().all(|&w| w > 0.0));
+            assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
+            check_chain_rule(dimensions);
         }
-        let of_rings = Dimensions {
-            n_matrices: 2,
-            ..dimensions()
-        };
-        let tables_of_rings = Parameters::first(of_rings, 7).tables();
-        for row in tables_of_rings.likelihood.chunks_exact(2) {
-            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
-        }
-        assert!(tables.kernel.iter().all(|&w| w > 0.0));
-        assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
     }
 
-    #[test]
-    fn the_chain_rule_agrees_with_differences() {
-        check_chain_rule(dimensions());
-        check_chain_rule(Dimensions {
-            n_matrices: 2,
-            ..dimensions()
-        });
-    }
-
+    /// Gradients agree with differences.
     fn check_chain_rule(dimensions: Dimensions) {
         let parameters = Parameters::first(dimensions, 3);
         // Any smooth function of the tables: a sum with arbitrary factors.
@@ -399,30 +391,30 @@ mod tests {
                     (value(&moved), f64::from(by))
                 };
                 let ((above, up), (below, down)) = (moved(1e-2), moved(-1e-2));
-                let difference = (above - below) / (up - down);
+                let expected = (above - below) / (up - down);
                 let got = f64::from(gradient.tensors[tensor][index]);
-                assert!(
-                    (got - difference).abs() < 1e-4,
-                    "{tensor} {index}: {got} {difference}"
-                );
+                let off = (got - expected).abs();
+                assert!(off < 1e-4, "{tensor} {index}: {got} {expected}");
             }
         }
     }
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        let check = |change: fn(&mut Dimensions), words: &str| {
+        let changes: [(fn(&mut Dimensions), &str); 4] = [
+            (|it| it.n_states = 1, "states: expected 2 to 64, got 1"),
+            (|it| it.n_observations = 65, "got 65"),
+            (
+                |it| it.n_matrices = 3,
+                "a multiple of 3, the number of matrices, got 4",
+            ),
+            (|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2"),
+        ];
+        for (change, words) in changes {
             let mut dimensions = dimensions();
             change(&mut dimensions);
             let error = dimensions.check().expect_err(words).to_string();
             assert!(error.contains(words), "{error}");
-        };
-        check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
-        check(|it| it.n_observations = 65, "got 65");
-        check(
-            |it| it.n_matrices = 3,
-            "a multiple of 3, the number of matrices, got 4",
-        );
-        check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
+        }
     }
 }

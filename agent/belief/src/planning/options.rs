@@ -313,21 +313,16 @@ mod tests {
 
     fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
         let shape = Shape::new(height, width).expect("test shape");
-        let number = |at: usize| (split_mix(5, at as u64) % 1000) as f32 / 1000.0;
-        let fire = |row, col| number(row * width + col).powi(3);
         let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
-            if state == 1 {
-                fire(row, col)
-            } else {
-                1.0 - fire(row, col)
-            }
+            let random = split_mix(5, (row * width + col) as u64) % 1000;
+            let fire = (random as f32 / 1000.0).powi(3);
+            [1.0 - fire, fire][state]
         });
         let belief = Belief::from_probabilities(numbers).expect("valid");
         let mut memory = Memory::new(shape);
         let mut frame = Frame::empty(shape);
-        (0..shape.n_cells())
-            .step_by(3)
-            .for_each(|cell| frame.observe(cell, 0));
+        let every_third = (0..shape.n_cells()).step_by(3);
+        every_third.for_each(|cell| frame.observe(cell, 0));
         memory.see(&frame);
         memory.earn(3.0, n_moves);
         Outlook::new(&belief, &Airspace::open(shape), 1, &memory, n_moves)
@@ -347,10 +342,8 @@ mod tests {
         let mut planner = OptionPlanner::new(2000);
         for (height, width) in [(1, 4), (5, 3), (30, 40)] {
             let outlook = outlook(height, width, 3);
-            let robot = Cell {
-                row: height / 2,
-                col: 1,
-            };
+            let (row, col) = (height / 2, 1);
+            let robot = Cell { row, col };
             for option in &OPTIONS {
                 let goal = option.goal_on(&outlook, robot);
                 let values = option.values(&outlook, goal);
@@ -358,11 +351,8 @@ mod tests {
                 assert_eq!(plan.moves.len(), 3);
                 let best = best_of_all(&values, robot, 3 * option.n_paths.min(2));
                 let is_best = (plan.score - best).abs() < 1e-3 * best.abs().max(1.0);
-                assert!(
-                    is_best || option.n_paths > 2 && plan.score > best,
-                    "{}",
-                    option.name
-                );
+                let is_longer = option.n_paths > 2 && plan.score > best;
+                assert!(is_best || is_longer, "{}", option.name);
             }
         }
     }
@@ -376,11 +366,8 @@ mod tests {
             let plan = planner.plan(option, &outlook, robot);
             let end = fly(outlook.shape(), robot, &plan.moves).end;
             let left = distance(robot, goal).saturating_sub(6 + 2 * GOAL_RADIUS);
-            assert!(
-                distance(end, goal) <= left + 2 * GOAL_RADIUS,
-                "{}: {end} {goal}",
-                option.name
-            );
+            let is_near = distance(end, goal) <= left + 2 * GOAL_RADIUS;
+            assert!(is_near, "{}: {end} {goal}", option.name);
             assert!(distance(robot, goal) > 3);
         }
     }

@@ -3,7 +3,7 @@
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Move, Probabilities, Shape};
+use emberwatch_model::{Cell, Probabilities, Shape};
 use proptest::prelude::*;
 
 /// Seed and step of the planners' random numbers.
@@ -77,15 +77,4 @@ pub fn objectives() -> impl Strategy<Value = Objective> {
         coverage_bonus,
         ..Objective::new(target)
     })
-}
-
-/// All paths of so many moves.
-pub fn paths(n_moves: usize) -> Vec<Vec<Move>> {
-    let path = |code: u64| {
-        let moves = 0..n_moves;
-        moves
-            .map(|t| Move::from_low_bits(code >> (2 * t)))
-            .collect()
-    };
-    (0..1_u64 << (2 * n_moves)).map(path).collect()
 }

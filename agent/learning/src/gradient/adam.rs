@@ -77,9 +77,7 @@ mod tests {
         close(&parameters.tensors[0], &[-0.5, 0.5, 0.0, -0.5]);
         // Against minus the same gradient: the mean is (.9 * .1 - .1) g = -.01 g over 1 - .81, the
         // square g^2 again.
-        gradient.tensors[0]
-            .iter_mut()
-            .for_each(|slope| *slope = -*slope);
+        gradient.tensors[0] = vec![-3.0, 0.2, 0.0, -1.0];
         adam.step(&mut parameters, &gradient, rates, betas);
         let back = 0.5 * 0.01 / 0.19;
         close(&parameters.tensors[0][..2], &[-0.5 + back, 0.5 - back]);

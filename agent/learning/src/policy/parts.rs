@@ -135,43 +135,39 @@ mod tests {
     use emberwatch_belief::planning::objective::BEAM_BONUS;
     use emberwatch_model::Model;
 
+    fn objective(name: &str, config: &AgentConfig) -> Objective {
+        let policy = Policy::named(name, &Model::wildfire()).expect("a known name");
+        policy.objective(2, config)
+    }
+
     #[test]
     fn the_default_bonuses_are_the_authors_and_a_small_one() {
-        let (model, config) = (Model::wildfire(), AgentConfig::default());
-        let objective = |name: &str| {
-            let policy = Policy::named(name, &model).expect("a known name");
-            policy.objective(2, &config)
-        };
-        let (fire, entropy) = (Target::State(2), Target::Entropy);
-        assert_eq!(objective("shooting_exploit"), Objective::paper(fire));
-        assert_eq!(objective("shooting_explore"), Objective::paper(entropy));
-        assert_eq!(objective("beam_exploit").coverage_bonus, BEAM_BONUS);
+        let config = AgentConfig::default();
+        let [fire, entropy] = [Target::State(2), Target::Entropy].map(Objective::paper);
+        assert_eq!(objective("shooting_exploit", &config), fire);
+        assert_eq!(objective("shooting_explore", &config), entropy);
+        let of_beam = objective("beam_exploit", &config);
+        assert_eq!(of_beam.coverage_bonus, BEAM_BONUS);
         let choices = network_choices(3);
-        assert_eq!(choices[2].objective(0, &config), Objective::paper(fire));
-        assert_eq!(choices[3].objective(0, &config), Objective::paper(entropy));
+        assert_eq!(choices[2].objective(0, &config), fire);
+        assert_eq!(choices[3].objective(0, &config), entropy);
     }
 
     #[test]
     fn settings_of_the_objective_reach_the_policies() {
-        let model = Model::wildfire();
         let mut config = AgentConfig::default();
         config.objective.shooting_bonus = 3.0;
         config.objective.revisits = true;
-        let objective = |name: &str| {
-            let policy = Policy::named(name, &model).expect("a known name");
-            policy.objective(2, &config)
-        };
-        let bonus = |name| objective(name).coverage_bonus;
-        assert_eq!(
-            [bonus("shooting_explore"), bonus("beam_exploit")],
-            [3.0, 0.02]
-        );
-        assert_eq!(
-            [bonus("shooting_exploit_only"), bonus("coverage")],
-            [0.0, 1.0]
-        );
-        assert!(objective("beam_exploit").revisits);
-        assert_eq!(objective("beam_exploit").target, Target::State(2));
-        assert_eq!(objective("shooting_latent").target, Target::State(1));
+        for (name, bonus, target) in [
+            ("shooting_explore", 3.0, Target::Entropy),
+            ("shooting_latent", 3.0, Target::State(1)),
+            ("shooting_exploit_only", 0.0, Target::State(2)),
+            ("beam_exploit", 0.02, Target::State(2)),
+            ("coverage", 1.0, Target::Coverage),
+        ] {
+            let got = objective(name, &config);
+            assert_eq!((got.coverage_bonus, got.target), (bonus, target), "{name}");
+        }
+        assert!(objective("beam_exploit", &config).revisits);
     }
 }

@@ -1,6 +1,6 @@
-//! What holds of every network: seeds, threads, saved state, numbers that are not finite, learning.
+//! What holds of every network: threads, saved state, numbers that are not finite.
 
-use crate::synthetic::{coin, dropout, frames, rayon_pool};
+use crate::synthetic::{frames, rayon_pool};
 use candle_core::Tensor;
 use emberwatch_model::grid::Shape;
 use emberwatch_network::{
@@ -43,10 +43,9 @@ fn overwrite(network: &Autoencoder, name: &str, numbers: &[f32]) {
 #[test]
 fn one_and_more_threads_give_the_same_bits() {
     let results = |n_threads| {
-        let pool = rayon_pool(n_threads);
-        pool.install(|| {
+        rayon_pool(n_threads).install(|| {
             let mut network = network([64, 64], 5);
-            let windows = [window(&network, 50, 100), window(&network, 9, 1)];
+            let windows = [window(&network, 20, 100), window(&network, 5, 1)];
             let losses = windows.map(|window| network.update(&window).expect("finite").to_bits());
             (losses, tensors(&network))
         })
@@ -76,12 +75,8 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
         assert!(matches!(error, NetworkError::NotFinite(_)), "{error}");
         assert_eq!(tensors(&network), before);
     }
-}
-
-#[test]
-fn a_step_that_overflows_is_not_made() {
-    let mut network = network([32, 32], 1);
-    let window = window(&network, 8, 20);
+    // A step that overflows is not made.
+    overwrite(&network, "encoder.13.bias", &[0.0; 16]);
     let before = tensors(&network);
     network.set_learning_rate(f32::INFINITY);
     let error = network.update(&window).expect_err("not finite");
@@ -125,32 +120,6 @@ fn a_saved_network_resumes_bit_for_bit() {
         assert_eq!(network.predict(&hidden), resumed.predict(&hidden));
     }
     assert_eq!(tensors(&resumed), tensors(&network));
-}
-
-#[test]
-fn updates_lower_the_loss_of_what_repeats() {
-    let mut network = network([32, 32], 4);
-    let mut frames = frames(network.shape().grid, 1, 24, 5);
-    for frame in &mut frames {
-        let cells: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
-        for cell in cells {
-            frame.observe(cell, (cell % 32 / 16) as u8);
-        }
-    }
-    let window = Window::new(&frames);
-    let dropout = dropout(24, 2.0, coin);
-    let update = |_| {
-        network
-            .update_with(&window, &dropout, &[0.0; 16])
-            .expect("finite")
-    };
-    let losses: Vec<f64> = (0..60).map(update).collect();
-    assert!(
-        losses[59] < 0.8 * losses[0],
-        "from {} to {}",
-        losses[0],
-        losses[59]
-    );
 }
 
 #[test]

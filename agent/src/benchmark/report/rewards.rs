@@ -137,10 +137,8 @@ mod tests {
     #[test]
     fn moving_averages_look_back_over_the_window() {
         let values = [1.0, 3.0, 5.0, 7.0];
-        assert_eq!(
-            moving_average(&values, 2),
-            [(2.0, 2.0), (3.0, 4.0), (4.0, 6.0)]
-        );
+        let expected = [(2.0, 2.0), (3.0, 4.0), (4.0, 6.0)];
+        assert_eq!(moving_average(&values, 2), expected);
         assert_eq!(moving_average(&values, 9), [(4.0, 4.0)]);
         assert_eq!(moving_average(&[], 3), []);
         let long = vec![1.0; 25_000];

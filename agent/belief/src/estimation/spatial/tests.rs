@@ -9,7 +9,7 @@
 use super::*;
 use crate::estimation::correlations::N_AGES;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Grid, Model, Probabilities, Shape};
+use emberwatch_model::{Cell, Model, ModelFile, Shape};
 use ndarray::{Array2, Array3, Array4, Axis};
 use ndarray_npy::NpzReader;
 use proptest::prelude::*;
@@ -17,63 +17,60 @@ use std::fs::File;
 
 const FIRE: usize = 2;
 
-fn wildfire(prior: Belief, correlations: Correlations) -> SpatialFilter {
-    let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
-    SpatialFilter::new(filter, FIRE, correlations)
+/// The wildfire model with a changed file.
+fn wildfire(change: impl FnOnce(&mut ModelFile)) -> Model {
+    let mut file = Model::wildfire().file().clone();
+    change(&mut file);
+    Model::new(file).expect("a model")
 }
 
-fn check_golden(side: usize) {
-    let root = env!("CARGO_MANIFEST_DIR");
-    let path = format!("{root}/tests/data/spatial_{side}.npz");
-    let mut npz = NpzReader::new(File::open(path).expect("a file")).expect("npz");
-    let table: Array4<f32> = npz.by_name("table.npy").expect("a table");
-    let cells: Array2<i16> = npz.by_name("cells.npy").expect("cells");
-    let observed: Array2<i8> = npz.by_name("obs.npy").expect("observations");
-    let first: Array3<f32> = npz.by_name("first_predictor.npy").expect("a predictor");
-    let posteriors: Array4<f32> = npz.by_name("post.npy").expect("posteriors");
-    let prior = Belief::from_probabilities(first).expect("a belief");
-    let mut filter = wildfire(prior, Correlations::of_table(&table));
-    // The first prediction was made already.
-    filter.ages.grow();
-    for (step, (cells, observed)) in cells.outer_iter().zip(observed.outer_iter()).enumerate() {
-        let seen = cells.iter().zip(observed).filter(|(cell, _)| **cell >= 0);
-        let seen = seen.map(|(&cell, &value)| (cell as usize, value as u8));
-        filter.correct_in_order(seen).expect("possible");
-        if step % 3 == 2 {
-            let off = &filter.belief().view() - &posteriors.index_axis(Axis(0), step / 3);
-            let off = off.iter().fold(0.0_f32, |worst, d| worst.max(d.abs()));
-            assert!(off < 1e-5, "{side}: posterior {step} is off by {off}");
-        }
-        filter.predict();
-    }
+fn shape(height: usize, width: usize) -> Shape {
+    Shape::new(height, width).expect("a grid")
 }
 
 #[test]
 fn corrections_are_those_of_an_independent_implementation() {
-    check_golden(16);
-    check_golden(64);
+    for side in [16, 64] {
+        let root = env!("CARGO_MANIFEST_DIR");
+        let path = format!("{root}/tests/data/spatial_{side}.npz");
+        let mut npz = NpzReader::new(File::open(path).expect("a file")).expect("npz");
+        let table: Array4<f32> = npz.by_name("table.npy").expect("a table");
+        let cells: Array2<i16> = npz.by_name("cells.npy").expect("cells");
+        let observed: Array2<i8> = npz.by_name("obs.npy").expect("observations");
+        let first: Array3<f32> = npz.by_name("first_predictor.npy").expect("a predictor");
+        let posteriors: Array4<f32> = npz.by_name("post.npy").expect("posteriors");
+        let prior = Belief::from_probabilities(first).expect("a belief");
+        let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
+        let mut filter = SpatialFilter::new(filter, FIRE, Correlations::of_table(&table));
+        // The first prediction was made already.
+        filter.ages.grow();
+        for (step, (cells, seen)) in cells.outer_iter().zip(observed.outer_iter()).enumerate() {
+            let seen = cells.iter().zip(seen).filter(|(cell, _)| **cell >= 0);
+            let seen = seen.map(|(&cell, &value)| (cell as usize, value as u8));
+            filter.correct_in_order(seen).expect("possible");
+            if step % 3 == 2 {
+                let off = &filter.belief().view() - &posteriors.index_axis(Axis(0), step / 3);
+                let off = off.iter().fold(0.0_f32, |worst, d| worst.max(d.abs()));
+                assert!(off < 1e-5, "{side}: posterior {step} is off by {off}");
+            }
+            filter.predict();
+        }
+    }
 }
 
 #[test]
 fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
-    let mut file = Model::wildfire().file().clone();
-    file.states[0].observed_as = vec![1.0, 0.0, 0.0];
-    let model = Model::new(file).expect("a model");
-    let shape = Shape::new(2, 2).expect("a grid");
-    let mut states = Grid::from_elem((2, 2), 2);
-    states[[1, 0]] = 0;
+    let model = wildfire(|file| file.states[0].observed_as = vec![1.0, 0.0, 0.0]);
+    let states = ndarray::arr2(&[[2, 2], [0, 2]]);
     let prior = Belief::from_states(&states, 3).expect("states");
     // Cell 0 could be corrected, cell 2 is certainly normal and never looks like fire.
-    let frame = Frame::from_bytes(shape, 3, &[2, 255, 2, 2]).expect("a frame");
-    let filter = BayesFilter::known(&model, prior.clone()).expect("valid");
-    let spatial = SpatialFilter::new(filter.clone(), FIRE, Correlations::default());
-    let filters: [Box<dyn Estimator>; 2] = [Box::new(filter), Box::new(spatial)];
-    for mut filter in filters {
+    let frame = Frame::from_bytes(shape(2, 2), 3, &[2, 255, 2, 2]).expect("a frame");
+    let filter = BayesFilter::known(&model, prior).expect("valid");
+    for neighbours in [None, Some((FIRE, Correlations::default()))] {
+        let mut filter = correcting(filter.clone(), neighbours);
         let before = filter.handover().expect("a filter").to_bytes();
-        let error = filter.correct(&frame);
-        let error = error.expect_err("a normal cell seen as fire");
-        let EstimatorError::ZeroEvidence(error) = error else {
-            panic!("{error}");
+        let Err(EstimatorError::ZeroEvidence(error)) = filter.correct(&frame) else {
+            panic!("expected a normal cell seen as fire");
         };
         assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
         assert_eq!(filter.handover().expect("a filter").to_bytes(), before);
@@ -82,28 +79,23 @@ fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
 
 #[test]
 fn a_tiny_probability_is_evidence_with_neighbours_too() {
-    let mut file = Model::wildfire().file().clone();
-    file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98];
-    let numbers = [1e-9, 0.0, 1.0];
-    let prior = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);
+    let model = wildfire(|file| file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98]);
+    let prior = ndarray::arr3(&[[[1e-9]], [[0.0]], [[1.0]]]);
     let prior = Belief::from_probabilities(prior).expect("a belief");
-    let model = Model::new(file).expect("a model");
     let filter = BayesFilter::known(&model, prior).expect("valid");
     let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
-    let shape = Shape::new(1, 1).expect("a grid");
-    let frame = Frame::from_bytes(shape, 3, &[0]).expect("a frame");
+    let frame = Frame::from_bytes(shape(1, 1), 3, &[0]).expect("a frame");
     filter.correct(&frame).expect("possible");
     assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
 }
 
 /// A model of three or four states, any of which can pay.
 fn model(paying: usize) -> Model {
-    let road = include_str!("../../../../../config/models/road-ice.toml");
-    let (model, paying) = match paying.checked_sub(3) {
-        Some(paying) => (Model::from_toml(road).expect("a model"), paying),
-        None => (Model::wildfire(), paying),
+    let (name, paying) = match paying.checked_sub(3) {
+        Some(paying) => ("road-ice", paying),
+        None => ("wildfire", paying),
     };
-    let mut file = model.file().clone();
+    let mut file = Model::built_in(name).expect("built in").file().clone();
     for (state, entry) in file.states.iter_mut().enumerate() {
         entry.reward = f64::from(u8::from(state == paying));
     }
@@ -111,14 +103,15 @@ fn model(paying: usize) -> Model {
 }
 
 proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(64) })]
+
     #[test]
     fn beliefs_stay_distributions_and_memory_is_all_there_is(
         (height, width) in (1_usize..12, 1_usize..12),
         frames in prop::collection::vec(prop::collection::vec(0_u8..6, 144), 1..12),
         paying in 0_usize..7,
     ) {
-        let shape = Shape::new(height, width).expect("a grid");
-        let model = model(paying);
+        let (shape, model) = (shape(height, width), model(paying));
         let new = || {
             let prior = Belief::uniform(model.n_states(), shape);
             let filter = BayesFilter::known(&model, prior).expect("valid");
@@ -145,46 +138,25 @@ proptest! {
     }
 }
 
-/// Frames of a grid whose cells all look the same, by the number of the frame.
-fn alike(shape: Shape, number: u64) -> Frame {
-    let observed = if split_mix(number, 0).is_multiple_of(3) {
-        2
-    } else {
-        0
-    };
-    Frame::from_bytes(shape, 3, &vec![observed; shape.n_cells()]).expect("a frame")
-}
-
-/// Frames of cells that each look as they like.
-fn apart(shape: Shape, number: u64) -> Frame {
-    let look = |cell| {
-        if split_mix(number, cell).is_multiple_of(3) {
-            2
-        } else {
-            0
-        }
-    };
-    let bytes: Vec<u8> = (0..shape.n_cells() as u64).map(look).collect();
-    Frame::from_bytes(shape, 3, &bytes).expect("a frame")
-}
-
 #[test]
 fn cells_that_look_alike_inform_each_other_and_others_do_not() {
-    let shape = Shape::new(5, 5).expect("a grid");
+    let shape = shape(5, 5);
     let belief = Belief::everywhere(&[0.5, 0.17, 0.33], shape);
     let model = Model::wildfire();
-    let of = |frame: &dyn Fn(Shape, u64) -> Frame| {
+    let [alike, apart] = [true, false].map(|is_alike| {
         let mut correlations = Correlations::default();
         let ages = Ages::new(shape.n_cells());
         for number in 0..100 {
-            let frame = frame(shape, number);
+            let burns = |cell| split_mix(number, if is_alike { 0 } else { cell }).is_multiple_of(3);
+            let looks = (0..25).map(|cell| if burns(cell) { 2 } else { 0 });
+            let frame = Frame::from_bytes(shape, 3, &looks.collect::<Vec<_>>());
+            let frame = frame.expect("a frame");
             let evidence = Evidence::of(&frame, &belief, model.likelihood(), FIRE, &ages);
             correlations.learn(&evidence);
         }
         correlations
-    };
+    });
     let oldest = N_AGES - 1;
-    let (alike, apart) = (of(&alike), of(&apart));
     for class in 1..15 {
         assert!(alike.of(oldest)[oldest][class] > 0.7, "{class}");
         assert!(apart.of(oldest)[oldest][class] < 0.1, "{class}");

@@ -18,29 +18,32 @@ fn frame(values: &[u8]) -> Frame {
 #[test]
 fn visited_cells_are_certain_until_the_next_step() {
     let mut estimator = estimator();
-    let value = |estimator: &NeuralEstimator, cell: usize| estimator.belief().states(cell);
-    assert!(
-        value(&estimator, 1)
-            .iter()
-            .all(|p| (p - 1.0 / 3.0).abs() < 1e-6)
-    );
+    let check = |estimator: &NeuralEstimator, cell, expected: [f64; 3]| {
+        let states = estimator.belief().states(cell);
+        let mut pairs = states.iter().zip(expected);
+        assert!(pairs.all(|(p, q)| (p - q).abs() < 1e-6), "{states:?}");
+    };
+    check(&estimator, 1, [1.0 / 3.0; 3]);
     let seen = frame(&[255, 2, 255, 255, 255, 255]);
     estimator.correct(&seen).expect("possible");
-    assert_eq!(value(&estimator, 1), [0.0, 0.0, 1.0]);
-    assert!((value(&estimator, 0)[2] - 1.0 / 3.0).abs() < 1e-6);
+    check(&estimator, 1, [0.0, 0.0, 1.0]);
+    check(&estimator, 0, [1.0 / 3.0; 3]);
     estimator.predict();
-    assert!(
-        (value(&estimator, 1)[2] - 1.0 / 3.0).abs() < 1e-6,
-        "nothing is learned"
-    );
+    // Nothing is learned.
+    check(&estimator, 1, [1.0 / 3.0; 3]);
+}
+
+fn filter() -> Box<dyn Estimator> {
+    let model = emberwatch_model::Model::wildfire();
+    let filter = BayesFilter::known(&model, Belief::uniform(3, shape()));
+    Box::new(filter.expect("a filter"))
 }
 
 #[test]
 fn with_a_sensor_an_unlearned_network_is_the_filter() {
     let model = emberwatch_model::Model::wildfire();
-    let filter = || BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter");
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    let mut own = NeuralEstimator::new(&network, Some(Box::new(filter())), shape())
+    let mut own = NeuralEstimator::new(&network, Some(filter()), shape())
         .expect("a belief")
         .with_sensor(model.likelihood().clone())
         .expect("an inverse");
@@ -69,14 +72,10 @@ fn many_of_several_networks_predict_together_as_each_alone() {
         network
     });
     let estimators = || -> Vec<Box<dyn Estimator>> {
-        let filter = || {
-            let model = emberwatch_model::Model::wildfire();
-            BayesFilter::known(&model, Belief::uniform(3, shape())).expect("a filter")
-        };
-        let mut all: Vec<Box<dyn Estimator>> = vec![Box::new(filter())];
+        let mut all = vec![filter()];
         // Networks in turn, with a filter below and without.
         for index in 0..8 {
-            let below = (index % 4 > 1).then(|| Box::new(filter()) as Box<dyn Estimator>);
+            let below = (index % 4 > 1).then(filter);
             let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
             let mut estimator = estimator.expect("a belief");
             let seen = [255, 255, index as u8 % 3, 255, 1, 255];

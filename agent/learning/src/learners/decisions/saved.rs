@@ -233,14 +233,10 @@ mod tests {
             let error = read(&other).expect_err(words).to_string();
             assert!(error.starts_with(words), "{error}");
         };
-        refused(
-            |saved| saved.options.truncate(1),
-            "options: expected exploit exploit_entropy",
-        );
-        refused(
-            |saved| saved.dqn.n_updates = u64::MAX,
-            "dqn.n_updates: expected at most",
-        );
+        let words = "options: expected exploit exploit_entropy";
+        refused(|saved| saved.options.truncate(1), words);
+        let words = "dqn.n_updates: expected at most";
+        refused(|saved| saved.dqn.n_updates = u64::MAX, words);
         refused(|saved| saved.earned = f64::NAN, "earned: expected 0 to");
     }
 

@@ -303,17 +303,12 @@ mod tests {
     }
 
     #[test]
-    fn kernels_for_each_zone_are_refused() {
-        let mut contents = contents(&fit());
-        let zones = Tensor {
-            shape: vec![1, 3],
-            numbers: vec![0.0, 1.0, 1.0],
-        };
-        contents.tensors.insert("zones".into(), zones);
-        assert_eq!(
-            resume(&contents, DIMENSIONS, &config()).expect_err("zones"),
-            "zones: expected the same kernels in every cell, got kernels for each zone of land: train the filter again"
-        );
+    fn the_target_is_the_state_that_was_seen_to_pay() {
+        let mut fit = fit();
+        let states = ndarray::arr2(&[[0, 1, 2]]);
+        let belief = Belief::from_states(&states, 3).expect("states");
+        (0..50).for_each(|at| fit.earn(&belief, &[at % 3], f64::from(u8::from(at % 3 == 1))));
+        assert_eq!(fit.learned().target, 1);
     }
 
     #[test]
@@ -324,14 +319,10 @@ mod tests {
             let error = resume(&contents(&fit()), dimensions, &config()).expect_err(words);
             assert_eq!(error, words);
         };
-        other(
-            |dimensions| dimensions.kernel = (3, 3),
-            "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]",
-        );
-        other(
-            |dimensions| dimensions.n_observations = 4,
-            "likelihood: expected shape [3, 4], got [3, 2]",
-        );
+        let words = "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]";
+        other(|dimensions| dimensions.kernel = (3, 3), words);
+        let words = "likelihood: expected shape [3, 4], got [3, 2]";
+        other(|dimensions| dimensions.n_observations = 4, words);
         let forged = |change: fn(&mut Contents, &mut FilterFit), words: &str| {
             let (mut contents, mut saved) = (contents(&fit()), fit());
             change(&mut contents, &mut saved);
@@ -339,6 +330,16 @@ mod tests {
             let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
             assert!(error.starts_with(words), "{error}");
         };
+        forged(
+            |contents, _| {
+                let numbers = vec![0.0, 1.0, 1.0];
+                let shape = vec![1, 3];
+                contents
+                    .tensors
+                    .insert("zones".into(), Tensor { shape, numbers });
+            },
+            "zones: expected the same kernels in every cell, got kernels for each zone of land: train the filter again",
+        );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
             "initial.first_moment: expected shape [3], got none",
@@ -350,21 +351,13 @@ mod tests {
             },
             "kernel.second_moment: expected numbers from 0 on, got -0.5",
         );
-        forged(
-            |_, saved| saved.earned = 1e300,
-            "earned: expected 0 to 2000000, got 1",
-        );
-        forged(
-            |_, saved| saved.reward.rewards[1] = f64::NAN,
-            "reward.rewards: expected 3 finite numbers, got NaN",
-        );
-        forged(
-            |_, saved| saved.optimiser.adam.n_steps = u64::MAX,
-            "n_updates: expected at most",
-        );
-        forged(
-            |_, saved| saved.optimiser.streams.clear(),
-            "streams: expected 2, got 0",
-        );
+        let words = "earned: expected 0 to 2000000, got 1";
+        forged(|_, saved| saved.earned = 1e300, words);
+        let words = "reward.rewards: expected 3 finite numbers, got NaN";
+        forged(|_, saved| saved.reward.rewards[1] = f64::NAN, words);
+        let words = "n_updates: expected at most";
+        forged(|_, saved| saved.optimiser.adam.n_steps = u64::MAX, words);
+        let words = "streams: expected 2, got 0";
+        forged(|_, saved| saved.optimiser.streams.clear(), words);
     }
 }

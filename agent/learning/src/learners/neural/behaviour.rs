@@ -177,11 +177,8 @@ mod tests {
         assert!((850..1050).contains(&n_changes), "{n_changes}");
         for (count, (aim, chances)) in counts.iter().zip(AIMS) {
             // Shares of 1,000 draws: three standard deviations are .045 at most, lengths vary too.
-            let share = f64::from(*count) / 20_000.0;
-            assert!(
-                (share - chances[1] as f64 / 100.0).abs() < 0.08,
-                "{aim:?} {share}"
-            );
+            let off = f64::from(*count) / 20_000.0 - chances[1] as f64 / 100.0;
+            assert!(off.abs() < 0.08, "{aim:?} {off}");
         }
     }
 
@@ -193,23 +190,24 @@ mod tests {
         seen.pass();
         let belief = Belief::uniform(2, shape());
         let objective = Objective::new(emberwatch_belief::planning::Target::State(1));
-        let best = |aim| {
+        let open = Airspace::open(shape());
+        let values = |aim, airspace: &Airspace| {
             let mut rng = stream(1, Purpose::Exploration, 0);
             let behaviour = Behaviour { aim, goal: 11 };
-            let airspace = Airspace::open(shape());
-            let values =
-                behaviour.values(objective, &airspace, 1, &belief, || seen.clone(), &mut rng);
-            let values = values.expect("values");
-            let values = values.value().iter().copied().collect::<Vec<_>>();
-            let best = (0..12).max_by(|&a, &b| values[a].total_cmp(&values[b]));
-            (best.expect("cells"), values[0])
+            let seen = || seen.clone();
+            let values = behaviour.values(objective, airspace, 1, &belief, seen, &mut rng);
+            values.expect("values")
         };
-        assert_eq!(best(Aim::Cover).0, 7);
-        assert_eq!(best(Aim::Far).0, 11);
-        assert_eq!(best(Aim::Last).0, 2);
-        assert_eq!(best(Aim::Exploit { entropy: 0 }).1, 0.5);
-        let with_entropy = best(Aim::Exploit { entropy: 3 }).1;
-        assert!((with_entropy - 0.5 - 0.3 * 2_f32.ln()).abs() < 1e-6);
+        for (aim, expected) in [(Aim::Cover, 7), (Aim::Far, 11), (Aim::Last, 2)] {
+            let values = values(aim, &open);
+            let value = |cell: usize| values.value()[[cell / 4, cell % 4]];
+            let best = (0..12).max_by(|&a, &b| value(a).total_cmp(&value(b)));
+            assert_eq!(best, Some(expected), "{aim:?}");
+        }
+        for (entropy, expected) in [(0, 0.5), (3, 0.5 + 0.3 * 2_f32.ln())] {
+            let got = values(Aim::Exploit { entropy }, &open).value()[[0, 0]];
+            assert!((got - expected).abs() < 1e-6, "{entropy}: {got}");
+        }
         // With a wider sensor, covering and entropy are of what is seen.
         let model = Model::wildfire().with_radius(1).expect("a radius");
         let wide = model.airspace(shape()).expect("an airspace");
@@ -219,10 +217,7 @@ mod tests {
             (Aim::Exploit { entropy: 0 }, false),
             (Aim::Exploit { entropy: 3 }, true),
         ] {
-            let mut rng = stream(1, Purpose::Exploration, 0);
-            let behaviour = Behaviour { aim, goal: 11 };
-            let values = behaviour.values(objective, &wide, 1, &belief, || seen.clone(), &mut rng);
-            let values = values.expect("values");
+            let values = values(aim, &wide);
             assert_eq!(values.in_sight().is_some(), in_sight, "{aim:?}");
             assert_eq!(values.airspace(), &wide);
         }

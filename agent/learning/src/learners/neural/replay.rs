@@ -203,9 +203,7 @@ mod tests {
     /// Robots 3 and 4 see the steps' numbers, in cells of their own.
     fn replay(n_steps: usize, max_frames: usize) -> LessonReplay {
         let mut replay = LessonReplay::new(max_frames);
-        [3, 4]
-            .into_iter()
-            .for_each(|robot| replay.begin(robot, shape()));
+        (3..5).for_each(|robot| replay.begin(robot, shape()));
         for step in 0..n_steps {
             for robot in [3, 4] {
                 let mut frame = Frame::empty(shape());
@@ -235,11 +233,8 @@ mod tests {
             }
             assert_eq!(before.last(1 - cell), None);
         }
-        assert!(
-            LessonReplay::new(9)
-                .lessons(5, &mut stream(1, Purpose::Replay, 0))
-                .is_empty()
-        );
+        let none = LessonReplay::new(9).lessons(5, &mut stream(1, Purpose::Replay, 0));
+        assert!(none.is_empty());
     }
 
     #[test]
@@ -251,15 +246,16 @@ mod tests {
             check.map_err(|error| error.to_string())
         };
         assert_eq!(check(100, [3, 4]), Ok(()));
-        let error = check(98, [3, 4]).expect_err("a value");
-        assert!(
-            error.starts_with("replay: expected 98 observations on 2"),
-            "{error}"
-        );
-        let error = check(100, [4, 5]).expect_err("a robot");
-        assert_eq!(
-            error,
-            "replay: expected a track of each robot, got none of robot 5"
-        );
+        for (n_observations, robots, words) in [
+            (98, [3, 4], "replay: expected 98 observations on 2"),
+            (
+                100,
+                [4, 5],
+                "replay: expected a track of each robot, got none of robot 5",
+            ),
+        ] {
+            let error = check(n_observations, robots).expect_err(words);
+            assert!(error.starts_with(words), "{error}");
+        }
     }
 }

@@ -4,34 +4,22 @@ use super::*;
 use crate::beliefs::autoencoder::AutoencoderEstimator;
 use crate::beliefs::neural::NeuralModel;
 use crate::beliefs::{KNOWN, numbered_states};
-use crate::learners::Worlds;
 use crate::learners::decisions::SHAPE;
-use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::Progress;
+use crate::learners::tests::{config, learned_filter, worlds};
 use crate::policy::LearnedDecisions;
 use anyhow::Result;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Airspace, Cell, Frame, Grid, Model, Shape};
+use emberwatch_model::{Cell, Frame, Grid, Model, Shape};
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape, NeuralBelief};
 use std::sync::Arc;
 
-const N_MOVES: usize = 6;
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
 fn shape() -> Shape {
-    Shape::new(8, 9).expect("test shape")
-}
-
-fn config(belief: BasisKind) -> AgentConfig {
-    let mut config = AgentConfig {
-        beam_width: 8,
-        shooting_samples: 64,
-        ..AgentConfig::default()
-    };
-    config.objective.belief = belief;
-    config
+    worlds().shape()
 }
 
 /// Hidden states, and what some cells show of them.
@@ -50,15 +38,9 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 
 /// A network that never learned, with the first seed whose DQN suits.
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
-    let worlds = Worlds {
-        airspace: Airspace::open(shape()),
-        n_observations: 3,
-        n_moves: N_MOVES,
-        numbers: 0..1,
-    };
     let mut config = config(basis);
     config.seed = 1;
-    let mut network = Progress::first(&worlds, &config, &Device::Cpu).expect("a network");
+    let mut network = Progress::first(&worlds(), &config, &Device::Cpu).expect("a network");
     let actions = DqnShape::of_actions(network.autoencoder.shape().hidden, 4);
     let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
     network.dqn = (0..1000).map(dqn).find(suits).expect("a seed that suits");
@@ -74,7 +56,7 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
         learned,
     };
     let policy = Policy::named(policy, &model).expect("known");
-    super::agent(&policy, config, &conditions, N_MOVES, 7)
+    super::agent(&policy, config, &conditions, worlds().n_moves, 7)
 }
 
 /// Whether all plans of some steps are those on an estimate, a predictor: `on` plans with another agent of the policy
@@ -82,7 +64,7 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
 fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
     let mut agent = agent(policy, config, learned).expect("an agent");
     let mut all = [true; 2];
-    for step in 0..6 {
+    for step in 0..4 {
         let (states, frame) = world(step);
         agent.correct(&frame, Some(&states)).expect("possible");
         let estimate = agent.belief().clone();
@@ -100,20 +82,9 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 
 #[test]
 fn every_policy_plans_on_the_belief_that_settings_say() {
-    let network = network(BasisKind::Predictor, |_| true);
-    let filter = |sees_own_state| {
-        let dimensions = emberwatch_belief::estimation::parameters::Dimensions {
-            n_states: 3,
-            n_observations: 3,
-            kernel: (3, 3),
-            sees_own_state,
-            n_matrices: 1,
-        };
-        FilterFit::new(dimensions, shape(), &AgentConfig::default()).learned()
-    };
     let mut learned = Learned::default();
-    learned.put(filter(true));
-    learned.put(network);
+    learned.put(learned_filter(true));
+    learned.put(network(BasisKind::Predictor, |_| true));
     learned.put(NeuralModel {
         network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
         filter: None,
@@ -121,82 +92,70 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
     });
     for policy in [
         "shooting_exploit",
-        "beam_exploit",
         "known/options/entropy",
-        "learned+spatial/options/rule",
-        "oracle_beam",
         "oracle_ahead",
         "learned_beam",
-        "learned_spatial_beam",
-        "neural_beam",
+        "learned+spatial/options/rule",
         "neural/options/rule",
-        "autoencoder/shooting/explore",
         "autoencoder/beam/exploit",
     ] {
-        let [predictor, estimate] = [BasisKind::Predictor, BasisKind::Estimate]
+        let plans = [BasisKind::Estimate, BasisKind::Predictor]
             .map(|belief| plans(policy, &config(belief), &learned));
-        assert_eq!(predictor, [false, true], "{policy}");
-        assert_eq!(estimate, [true, false], "{policy}");
+        assert_eq!(plans, [[true, false], [false, true]], "{policy}");
     }
     // The state that the path will meet is no prediction.
     let clairvoyant = plans("clairvoyant_beam", &config(BasisKind::Estimate), &learned);
     assert_eq!(clairvoyant, [false, true]);
 }
 
+/// A DQN that chooses options on the belief of a known model.
+fn decisions(basis: BasisKind) -> LearnedDecisions {
+    let settings = config(basis).decisions.settings();
+    LearnedDecisions {
+        beam_width: 30,
+        scorer: Arc::new(Dqn::new(settings, SHAPE, 0)),
+        belief: &KNOWN,
+        basis,
+    }
+}
+
 #[test]
 fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
-    for basis in [BasisKind::Predictor, BasisKind::Estimate] {
-        let other = config(match basis {
-            BasisKind::Predictor => BasisKind::Estimate,
-            BasisKind::Estimate => BasisKind::Predictor,
-        });
-        let mut learned = Learned::default();
+    for (basis, other, expected) in [
+        (BasisKind::Estimate, BasisKind::Predictor, [true, false]),
+        (BasisKind::Predictor, BasisKind::Estimate, [false, true]),
+    ] {
+        let (other, mut learned) = (config(other), Learned::default());
         learned.put(network(basis, |_| true));
-        let expected = [basis == BasisKind::Estimate, basis == BasisKind::Predictor];
-        assert_eq!(plans("autoencoder_policy", &other, &learned), expected);
-        let scorer = Dqn::new(config(basis).decisions.settings(), SHAPE, 0);
-        learned.put(LearnedDecisions {
-            beam_width: 30,
-            scorer: Arc::new(scorer),
-            belief: &KNOWN,
-            basis,
-        });
-        assert_eq!(plans("known/options/learned", &other, &learned), expected);
+        learned.put(decisions(basis));
+        for policy in ["autoencoder_policy", "known/options/learned"] {
+            assert_eq!(plans(policy, &other, &learned), expected, "{policy}");
+        }
         let error = agent("known+spatial/options/learned", &other, &learned).err();
         let error = format!("{:#}", error.expect("decisions on another belief"));
-        assert!(
-            error.contains("on the belief known+spatial, got some on known"),
-            "{error}"
-        );
+        let words = "on the belief known+spatial, got some on known";
+        assert!(error.contains(words), "{error}");
     }
 }
 
 #[test]
 fn decisions_are_planned_with_the_beam_that_they_were_learned_with() {
     let mut config = config(BasisKind::Predictor);
-    let scorer = Dqn::new(config.decisions.settings(), SHAPE, 0);
     let mut learned = Learned::default();
-    learned.put(LearnedDecisions {
-        scorer: Arc::new(scorer),
-        belief: &KNOWN,
-        basis: BasisKind::Predictor,
-        beam_width: 30,
-    });
-    let mut plan = |policy, width| {
-        config.decisions.beam_width = width;
-        let mut agent = agent(policy, &config, &learned).expect("an agent");
-        agent.correct(&world(0).1, None).expect("possible");
-        agent.predict();
-        agent.plan(&[ROBOT], 0)
-    };
-    assert_ne!(
-        plan("known/options/coverage", 1),
-        plan("known/options/coverage", 30)
-    );
-    assert_eq!(
-        plan("known/options/learned", 1),
-        plan("known/options/learned", 30)
-    );
+    learned.put(decisions(BasisKind::Predictor));
+    for (policy, is_learned) in [
+        ("known/options/coverage", false),
+        ("known/options/learned", true),
+    ] {
+        let [narrow, wide] = [1, 30].map(|width| {
+            config.decisions.beam_width = width;
+            let mut agent = agent(policy, &config, &learned).expect("an agent");
+            agent.correct(&world(0).1, None).expect("possible");
+            agent.predict();
+            agent.plan(&[ROBOT], 0)
+        });
+        assert_eq!(narrow == wide, is_learned, "{policy}");
+    }
 }
 
 #[test]

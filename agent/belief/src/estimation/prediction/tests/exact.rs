@@ -1,14 +1,9 @@
 //! The exact Bayes filter of a small grid: it enumerates the joint states of all cells.
 
-use super::predict;
+use super::{KINDS, predict, random};
 use crate::estimation::belief::Belief;
-use crate::estimation::prediction::{Prediction, PredictionKind, Weights};
-use emberwatch_model::randomness::split_mix;
+use crate::estimation::prediction::{Prediction, Weights};
 use emberwatch_model::{Grid, Shape};
-
-/// Probability that a cell is observed as its state, and as each of the two others.
-const RIGHT: f64 = 0.9;
-const WRONG: f64 = 0.05;
 
 /// The probability of each joint state of a small grid.
 #[derive(Clone)]
@@ -19,21 +14,28 @@ struct Exact {
     joint: Vec<f64>,
 }
 
+/// The state of a cell in a joint state: cell 0 is the last digit of its number.
+fn state(joint: usize, cell: usize) -> usize {
+    joint / 3_usize.pow(cell as u32) % 3
+}
+
+/// The probability that a cell is observed as a value.
+fn likelihood(state: usize, value: usize) -> f64 {
+    if state == value { 0.9 } else { 0.05 }
+}
+
 impl Exact {
-    fn new(shape: Shape, weights: Weights<'_>, first: &[u8]) -> Self {
-        let kernels = weights.kernels;
+    /// State 1 in cell 0, else state 0.
+    fn new(shape: Shape, weights: Weights<'_>) -> Self {
         let n = 3_usize.pow(shape.n_cells() as u32);
-        let state = |joint: usize, cell: usize| joint / 3_usize.pow(cell as u32) % 3;
         let next = |joint: usize| {
             let cell = |index: usize| {
                 let (cell, own) = (shape.cell(index), state(joint, index));
                 let mut sums = [0, 1, 2].map(|m| weights.bias[m]);
-                let kernel = &kernels[own % kernels.len()];
+                let kernel = &weights.kernels[own % weights.kernels.len()];
                 for (a, c) in (0..9).map(|at| (at / 3, at % 3)) {
-                    let (row, col) = (
-                        (cell.row + a).wrapping_sub(1),
-                        (cell.col + c).wrapping_sub(1),
-                    );
+                    let row = (cell.row + a).wrapping_sub(1);
+                    let col = (cell.col + c).wrapping_sub(1);
                     if row < shape.height() && col < shape.width() {
                         let n = state(joint, row * shape.width() + col);
                         (0..3).for_each(|m| sums[m] += kernel[[m, n, a, c]]);
@@ -45,23 +47,15 @@ impl Exact {
             (0..shape.n_cells()).map(cell).collect()
         };
         let mut joint = vec![0.0; n];
-        let index = first
-            .iter()
-            .rev()
-            .fold(0, |index, state| 3 * index + usize::from(*state));
-        joint[index] = 1.0;
-        Self {
-            shape,
-            next: (0..n).map(next).collect(),
-            joint,
-        }
+        joint[1] = 1.0;
+        let next = (0..n).map(next).collect();
+        Self { shape, next, joint }
     }
 
     fn predict(&mut self) {
         let mut joint = vec![0.0; self.joint.len()];
         for (next, p) in self.next.iter().zip(&self.joint).filter(|(_, p)| **p > 0.0) {
             let mut all = vec![*p];
-            // Cell 0 is the last digit of a joint state's number.
             for cell in next.iter().rev() {
                 all = all.iter().flat_map(|p| cell.map(|q| p * q)).collect();
             }
@@ -70,11 +64,10 @@ impl Exact {
         self.joint = joint;
     }
 
-    fn correct(&mut self, seen: impl Iterator<Item = (usize, u8)>) {
-        for (cell, value) in seen {
-            let step = 3_usize.pow(cell as u32);
-            for (joint, p) in self.joint.iter_mut().enumerate() {
-                *p *= likelihood(joint / step % 3, value);
+    fn correct(&mut self, seen: &[(usize, usize)]) {
+        for (joint, p) in self.joint.iter_mut().enumerate() {
+            for (cell, value) in seen {
+                *p *= likelihood(state(joint, *cell), *value);
             }
         }
         let total: f64 = self.joint.iter().sum();
@@ -85,22 +78,19 @@ impl Exact {
     fn divergence_of(&self, belief: &Belief) -> f64 {
         let mut sum = 0.0;
         for cell in 0..self.shape.n_cells() {
-            for (state, q) in belief.states(cell).into_iter().enumerate() {
-                let p = self.marginal(cell, state);
-                if p > 0.0 {
-                    sum += p * (p / q.max(1e-12)).ln();
-                }
+            let mut marginal = [0.0; 3];
+            for (joint, p) in self.joint.iter().enumerate() {
+                marginal[state(joint, cell)] += p;
+            }
+            for (p, q) in marginal.into_iter().zip(belief.states(cell)) {
+                sum += if p > 0.0 {
+                    p * (p / q.max(1e-12)).ln()
+                } else {
+                    0.0
+                };
             }
         }
         sum
-    }
-
-    fn marginal(&self, cell: usize, state: usize) -> f64 {
-        let step = 3_usize.pow(cell as u32);
-        let all = self.joint.iter().enumerate();
-        all.filter(|(joint, _)| joint / step % 3 == state)
-            .map(|(_, p)| p)
-            .sum()
     }
 
     /// Draws the joint state after `joint`.
@@ -117,44 +107,42 @@ impl Exact {
     }
 }
 
-/// Runs worlds whose first cell starts in the state `burning`, and returns the mean over steps and cells of the
-/// Kullback-Leibler divergence of the prediction's beliefs from the exact ones. Frames show each cell with probability
-/// `1 / one_in`, and never for 0.
-pub fn divergence(
-    (weights, burning): (Weights<'_>, u8),
-    shape: Shape,
-    kind: PredictionKind,
-    (one_in, n_worlds): (u64, u64),
-) -> f64 {
-    let mut first = vec![0; shape.n_cells()];
-    first[0] = burning;
-    let start = Exact::new(shape, weights, &first);
-    let states = Grid::from_shape_vec(shape.dim(), first).expect("a grid");
-    let (mut sum, mut count) = (0.0, 0.0);
+/// Runs worlds whose first cell starts in state 1, and returns the mean over steps and cells of the Kullback-Leibler
+/// divergence of each kind's beliefs from the exact ones. Frames show each cell with probability `1 / one_in`, and
+/// never for 0.
+pub fn divergences(weights: Weights<'_>, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 3] {
+    let mut states = Grid::zeros(shape.dim());
+    states[[0, 0]] = 1;
+    let start = Exact::new(shape, weights);
+    let mut sums = [0.0; 3];
     for world in 0..n_worlds {
-        let mut exact = start.clone();
-        let mut belief = Belief::from_states(&states, 3).expect("states");
-        let mut prediction = Prediction::new(weights, kind, &belief);
-        let mut truth = start.joint.iter().position(|p| *p > 0.0).expect("a state");
+        let (mut exact, mut truth) = (start.clone(), 1);
+        let mut followed = KINDS.map(|kind| {
+            let belief = Belief::from_states(&states, 3).expect("states");
+            (Prediction::new(weights, kind, &belief), belief)
+        });
         let mut n_drawn = 0;
         let mut random = || {
             n_drawn += 1;
-            (split_mix(world, n_drawn) >> 11) as f64 / (1_u64 << 53) as f64
+            random(world, n_drawn)
         };
         for _ in 0..12 {
             truth = exact.draw(truth, &mut random);
             exact.predict();
-            predict(&mut prediction, &mut belief);
-            sum += exact.divergence_of(&belief);
-            count += shape.n_cells() as f64;
+            for ((prediction, belief), sum) in followed.iter_mut().zip(&mut sums) {
+                predict(prediction, belief);
+                *sum += exact.divergence_of(belief);
+            }
             let seen = observe(truth, shape, one_in, &mut random);
-            exact.correct(seen.iter().copied());
-            let before = belief.as_slice().to_vec();
-            correct(&mut belief, &seen);
-            prediction.correct(&before, belief.as_slice());
+            exact.correct(&seen);
+            for (prediction, belief) in &mut followed {
+                let before = belief.as_slice().to_vec();
+                correct(belief, &seen);
+                prediction.correct(&before, belief.as_slice());
+            }
         }
     }
-    sum / count
+    sums.map(|sum| sum / (12 * n_worlds as usize * shape.n_cells()) as f64)
 }
 
 /// Draws the observed cells and their observations.
@@ -163,43 +151,29 @@ fn observe(
     shape: Shape,
     one_in: u64,
     random: &mut impl FnMut() -> f64,
-) -> Vec<(usize, u8)> {
+) -> Vec<(usize, usize)> {
     let mut seen = Vec::new();
     for cell in 0..shape.n_cells() {
         if one_in > 0 && random() * (one_in as f64) < 1.0 {
-            let state = truth / 3_usize.pow(cell as u32) % 3;
-            let u = random();
-            let other = (state + if u < WRONG { 1 } else { 2 }) % 3;
-            seen.push((
-                cell,
-                if u < 2.0 * WRONG {
-                    other as u8
-                } else {
-                    state as u8
-                },
-            ));
+            let others = match random() {
+                u if u < 0.05 => 1,
+                u if u < 0.1 => 2,
+                _ => 0,
+            };
+            seen.push((cell, (state(truth, cell) + others) % 3));
         }
     }
     seen
 }
 
 /// Corrects each observed cell's belief by Bayes' rule.
-fn correct(belief: &mut Belief, seen: &[(usize, u8)]) {
+fn correct(belief: &mut Belief, seen: &[(usize, usize)]) {
     let n_cells = belief.shape().n_cells();
     let numbers = belief.as_mut_slice();
     for (cell, value) in seen {
         let likelihood = |state: usize| likelihood(state, *value) as f32;
-        let total: f32 = (0..3)
-            .map(|state| numbers[state * n_cells + cell] * likelihood(state))
-            .sum();
-        (0..3).for_each(|state| numbers[state * n_cells + cell] *= likelihood(state) / total);
-    }
-}
-
-fn likelihood(state: usize, value: u8) -> f64 {
-    if state == usize::from(value) {
-        RIGHT
-    } else {
-        WRONG
+        let joint = [0, 1, 2].map(|state| numbers[state * n_cells + cell] * likelihood(state));
+        let total: f32 = joint.iter().sum();
+        (0..3).for_each(|state| numbers[state * n_cells + cell] = joint[state] / total);
     }
 }
