@@ -8,6 +8,8 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Folder, PATIENCE, Program, Server, eventually};
 
+const LIVELY: &str = "--model wildfire-small --height 16 --width 24 --moves 12 --burn-in 200";
+
 fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief> {
     let sample = observer.receive(limit).expect("receive")?;
     let shown = AgentBelief::try_from(&sample).expect("a belief");
@@ -31,7 +33,7 @@ fn until_all(observer: &Observer<AgentHeader>, worlds: std::ops::Range<u32>) -> 
 
 #[test]
 fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
+    let server = Server::start(LIVELY);
     let observer = Observer::agents(&server.instance).expect("observe");
     let mut agent = Program::agent(&server.instance, "--steps 500 --policy known/beam/explore");
     let mut shown = Vec::new();
@@ -67,7 +69,7 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
 
 #[test]
 fn beliefs_that_nobody_looks_at_are_not_shown() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
+    let server = Server::start(LIVELY);
     let agent = Program::agent(&server.instance, "");
     agent.until(|| server.step_of(0) > 100);
     let observer = Observer::agents(&server.instance).expect("observe");
@@ -103,7 +105,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
 
 #[test]
 fn a_training_shows_what_it_believes_of_all_its_worlds() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
+    let server = Server::start(&format!("{LIVELY} --worlds 3"));
     let observer = Observer::agents(&server.instance).expect("observe");
     let folder = Folder::default();
     let config = folder.write("agent.toml", "[learning]\nexplore_steps = 1000000\n");

@@ -88,7 +88,7 @@ fn an_episode_is_over_at_max_steps_until_it_is_reset() {
 
 #[test]
 fn what_waits_for_a_burn_in_is_answered_after_it() {
-    let flags = "--height 32 --width 32 --moves 6 --burn-in 100000";
+    let flags = "--height 32 --width 32 --moves 6 --burn-in 30000";
     let server = Server::start_in_burn_in(flags);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0..1).lease;

@@ -11,7 +11,8 @@ use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, fly, frames_until,
 use tests::wire::{RawClient, Wire, recall_header, step_body};
 
 /// A world with fires to find, and room for all their frames.
-const FLAGS: &str = "--height 16 --width 16 --moves 12 --burn-in 3000 --seed 3";
+const FLAGS: &str =
+    "--model wildfire-small --height 16 --width 16 --moves 12 --burn-in 300 --seed 3";
 
 /// Room for all frames of these tests.
 const ALL: &str = "--history 100000";
@@ -77,7 +78,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut client = server.acquire(0..1);
     let at = client.observe(0..1).expect("observe")[0].world;
-    let model = Model::wildfire();
+    let model = Model::built_in("wildfire-small").expect("built in");
     let shape = client.shape();
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
     let kind = filter.expect("a filter").kind();

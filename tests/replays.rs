@@ -135,6 +135,7 @@ fn a_long_replay_at_full_speed_reaches_an_observer_that_reads() {
     assert!(got.is_sorted_by_key(|sample| sample.header.sequence));
     replay.ends(0);
     // Without an observer it begins only when told.
+    write_recording(&file, 2, 0);
     start_replay(&new_instance(), &file, "--no-wait").ends(0);
     let waiting = start_replay(&new_instance(), &file, "");
     waiting.wait_for_words("waiting for an observer");

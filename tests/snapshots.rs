@@ -97,16 +97,6 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
     let at = |robot: u32| server.observe(robot);
     assert_eq!(at(0), at(1));
-    for (flags, words) in [
-        ("--from 2", "--from: expected a world below 2"),
-        (
-            "--worlds 3 --takeover",
-            "worlds: expected at least 3, got 2",
-        ),
-        ("--first-world 2 --takeover", "there are robots 0 to 2"),
-    ] {
-        refused(&server, &restore(flags), words);
-    }
     // A fork has the future of its world, and a life of its own.
     server.command("fork 1 2").check(0);
     assert_eq!(at(2), at(1));
@@ -133,6 +123,16 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
         to: 0,
     });
     assert_eq!(stolen.status(), Status::NoLease, "{stolen:?}");
+    for (flags, words) in [
+        ("--from 2", "--from: expected a world below 2"),
+        (
+            "--worlds 3 --takeover",
+            "worlds: expected at least 3, got 2",
+        ),
+        ("--first-world 2 --takeover", "there are robots 0 to 2"),
+    ] {
+        refused(&server, &restore(flags), words);
+    }
 }
 
 /// What a client with one robot saw.
