@@ -81,7 +81,7 @@ fn a_restored_world_and_its_memory_continue_bit_for_bit() {
 fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     let folder = Folder::default();
     let file = folder.word("lab.snapshot");
-    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let server = Server::start(&format!("{SMALL} --worlds 3 --lease-millis 86400000"));
     let mut second = server.acquire(1..2);
     fly(&mut second, Paths::new(3).next(N_MOVES));
     let part = format!("snapshot {file} --first-world 1");
