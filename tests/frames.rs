@@ -108,7 +108,7 @@ fn a_stalled_observer_sees_a_gap_and_slows_nobody() {
 }
 
 #[test]
-fn hidden_states_are_published_on_request_and_agree_with_what_is_told() {
+fn hidden_states_come_on_request_and_agree_with_what_is_told() {
     let flags = "--height 9 --width 6 --moves 8 --burn-in 3000 --coverage full";
     let server = Server::start(flags);
     let truth = Observer::truth(&server.instance).expect("the truth channel");

@@ -50,7 +50,7 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
 }
 
 #[test]
-fn a_neural_belief_corrects_a_filter_and_decisions_are_learned_on_one() {
+fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     let place = Place::new(SETTINGS, HEADER);
     place.train("filter", &format!("{WORLDS} --learner filter --steps 40"));
     let filter = place.flag("filter");
