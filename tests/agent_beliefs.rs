@@ -1,36 +1,41 @@
 //! What agents show of their beliefs, to readers of their channel.
 
+use crate::trainings::on;
 use emberwatch_protocol::agent_belief::AgentBelief;
 use emberwatch_protocol::message::AgentHeader;
 use emberwatch_protocol::observer::Observer;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
-use tests::harness::{AGENT, PATIENCE, Program, Server, eventually};
+use tests::harness::{AGENT, Folder, PATIENCE, Program, Server, eventually};
 
-/// Reads until one is as wanted.
-fn until(
-    observer: &Observer<AgentHeader>,
-    mut wanted: impl FnMut(&AgentBelief) -> bool,
-) -> Vec<AgentBelief> {
+const LIVELY: &str = "--model wildfire-small --height 16 --width 24 --moves 12 --burn-in 200";
+
+fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief> {
+    let sample = observer.receive(limit).expect("receive")?;
+    let shown = AgentBelief::try_from(&sample).expect("a belief");
+    let sums = shown.belief.sum_axis(ndarray::Axis(0));
+    assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
+    Some(shown)
+}
+
+/// Reads until beliefs about all these worlds have come.
+fn until_all(observer: &Observer<AgentHeader>, worlds: std::ops::Range<u32>) -> Vec<AgentBelief> {
     let (mut all, start) = (Vec::<AgentBelief>::new(), Instant::now());
-    while !all.last().is_some_and(&mut wanted) {
+    let mut missing: BTreeSet<u32> = worlds.collect();
+    while !missing.is_empty() {
         let remaining = PATIENCE.saturating_sub(start.elapsed());
         let shown = next(observer, remaining);
-        all.push(shown.expect("an agent that shows its belief"));
+        all.push(shown.unwrap_or_else(|| panic!("no belief about worlds {missing:?}")));
+        missing.remove(&all[all.len() - 1].header.world);
     }
     all
 }
 
-fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief> {
-    let sample = observer.receive(limit).expect("receive")?;
-    Some(AgentBelief::try_from(&sample).expect("a belief"))
-}
-
 #[test]
 fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
+    let server = Server::start(LIVELY);
     let observer = Observer::agents(&server.instance).expect("observe");
-    let mut agent = Program::agent(&server.instance, "--steps 2000 --policy known/beam/explore");
+    let mut agent = Program::agent(&server.instance, "--steps 500 --policy known/beam/explore");
     let mut shown = Vec::new();
     let has_ended = eventually(4 * PATIENCE, || {
         shown.extend(next(&observer, Duration::ZERO));
@@ -39,10 +44,6 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     assert!(has_ended, "{}", agent.stderr());
     agent.ends(0);
     shown.extend(std::iter::from_fn(|| next(&observer, Duration::ZERO)));
-    let last = shown
-        .last()
-        .expect("an observer that was there before the agent meets it");
-    assert_eq!(last.header.step, 2000);
     for AgentBelief {
         header,
         belief,
@@ -50,8 +51,6 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     } in &shown
     {
         assert_eq!(belief.dim(), (3, 16, 24));
-        let sums = belief.sum_axis(ndarray::Axis(0));
-        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
         assert_eq!(intent.policy, "known/beam/explore");
         assert_eq!(intent.states, ["normal", "latent", "fire"]);
         assert!(
@@ -59,6 +58,10 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
             "{intent:?}"
         );
     }
+    let last = shown
+        .last()
+        .expect("an observer that was there before the agent meets it");
+    assert_eq!(last.header.step, 500);
     // The posterior is sure of what was seen on the last path: 98 of 100 fires look like one.
     let surest = last.belief.iter().copied().fold(0.0, f32::max);
     assert!(surest > 0.9, "{surest}");
@@ -66,13 +69,12 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
 
 #[test]
 fn beliefs_that_nobody_looks_at_are_not_shown() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
+    let server = Server::start(LIVELY);
     let agent = Program::agent(&server.instance, "");
-    agent.until(|| server.step_of(0) > 500);
+    agent.until(|| server.step_of(0) > 100);
     let observer = Observer::agents(&server.instance).expect("observe");
-    let shown = until(&observer, |_| true);
-    assert!(shown[0].header.step > 500, "a belief of before");
-    let header = &shown[0].header;
+    let header = until_all(&observer, 0..1)[0].header;
+    assert!(header.step > 100, "a belief of before");
     let flown = (header.first_robot, header.n_robots);
     assert_eq!((header.pid, flown), (agent.pid(), (0, 1)));
 }
@@ -85,23 +87,13 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
     let compare = |n_steps: u64| {
         let words = format!(
             "compare --policies beam_exploit --baseline beam_exploit --seeds 0..8 --steps {n_steps} \
-             --watch 127.0.0.1:0 --instance {}",
-            server.instance.name()
+             --watch 127.0.0.1:0 {}",
+            on(&server)
         );
         Program::start(AGENT, &words)
     };
     let comparison = compare(1_000_000);
-    let mut missing: BTreeSet<u32> = (0..8).collect();
-    let start = Instant::now();
-    while !missing.is_empty() {
-        let remaining = PATIENCE.saturating_sub(start.elapsed());
-        let sample = observer
-            .receive(remaining)
-            .expect("receive")
-            .unwrap_or_else(|| panic!("no belief about worlds {missing:?}"));
-        missing.remove(&sample.header.world);
-        std::thread::sleep(Duration::from_millis(2)); // as a dashboard looks
-    }
+    until_all(&observer, 0..8);
     comparison.wait_for_words("watch at http://127.0.0.1:");
     drop((comparison, observer));
     server.program.until(|| {
@@ -113,30 +105,19 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
 
 #[test]
 fn a_training_shows_what_it_believes_of_all_its_worlds() {
-    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
+    let server = Server::start(&format!("{LIVELY} --worlds 3"));
     let observer = Observer::agents(&server.instance).expect("observe");
-    let folder = tempfile::TempDir::new().expect("a folder");
-    let out = folder.path().join("out");
-    let config = folder.path().join("agent.toml");
-    std::fs::write(&config, "[learning]\nexplore_steps = 1000000\n").expect("write");
+    let folder = Folder::default();
+    let config = folder.write("agent.toml", "[learning]\nexplore_steps = 1000000\n");
     let flags = format!(
-        "train --instance {} --config {} --out {} --world 1 --worlds 2",
-        server.instance.name(),
-        config.display(),
-        out.display()
+        "--config {config} --out {} --world 1 --worlds 2",
+        folder.word("out")
     );
-    let training = Program::start(AGENT, &flags);
-    let mut worlds = BTreeSet::new();
-    let shown = until(&observer, |shown| {
-        worlds.insert(shown.header.world);
-        worlds.len() == 2 && shown.header.step > 5
-    });
-    drop(training);
-    assert_eq!(worlds, BTreeSet::from([1, 2]));
+    let _training = Program::start(AGENT, &format!("train {} {flags}", on(&server)));
+    let shown = until_all(&observer, 1..3);
+    assert!(shown.iter().all(|shown| shown.header.world > 0));
     for AgentBelief { belief, intent, .. } in &shown {
         assert_eq!(belief.dim(), (3, 16, 24));
-        let sums = belief.sum_axis(ndarray::Axis(0));
-        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
         assert_eq!(intent.policy, "train filter");
         assert_eq!(intent.belief_from, "learned_filter");
         assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);

@@ -22,25 +22,10 @@ const MAX_SECONDS: i64 = 1;
 /// Maximum growth of the process's peak memory over all inputs of a decoder, in KiB.
 const MAX_GROWTH: u64 = 64 << 10;
 
-/// Integers at which lengths, counts and signs break.
-const INTEGERS: [u64; 16] = [
-    0,
-    1,
-    2,
-    3,
-    7,
-    8,
-    0x7f,
-    0xff,
-    0x100,
-    0x7fff,
-    0xffff,
-    0x7fff_ffff,
-    0xffff_ffff,
-    1 << 53,
-    i64::MAX as u64,
-    u64::MAX,
-];
+/// Integers at which lengths, counts and signs break; each is also taken one and two larger.
+#[rustfmt::skip]
+const INTEGERS: [u64; 9] =
+    [0, 7, 0x7f, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, u64::MAX >> 1];
 
 /// Texts on which readers of TOML, JSON and numbers stumble.
 const WORDS: &str = r#"0 1 -1 -0.0 255 65536 4294967296 9007199254740993 9223372036854775807 18446744073709551615 1e400
@@ -97,19 +82,13 @@ fn apply(change: &Change, bytes: &mut Vec<u8>) {
     bytes.truncate(MAX_BYTES);
 }
 
-/// Returns the first run of digits and points after a place.
+/// The first run of digits and points after a place.
 fn number_after(bytes: &[u8], at: usize) -> Range<usize> {
     let is_number = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
-    let start = at
-        + bytes[at..]
-            .iter()
-            .take_while(|byte| !is_number(byte))
-            .count();
-    let length = bytes[start..]
-        .iter()
-        .take_while(|byte| is_number(byte))
-        .count();
-    start..start + length
+    let begin = bytes[at..].iter().position(is_number);
+    let start = begin.map_or(bytes.len(), |begin| at + begin);
+    let length = bytes[start..].iter().position(|byte| !is_number(byte));
+    start..length.map_or(bytes.len(), |length| start + length)
 }
 
 /// Decodes one input; returns whether the decoder accepted it.
@@ -157,26 +136,4 @@ fn attack(target: &Target) {
 #[test]
 fn every_decoder_survives_damaged_files() {
     TARGETS.iter().for_each(attack);
-}
-
-#[test]
-fn changes_of_each_kind_do_what_they_say() {
-    let at = 9;
-    let changed = |change| {
-        let mut bytes = b"lease = 12.5, seed".to_vec();
-        apply(&change, &mut bytes);
-        String::from_utf8(bytes).expect("text")
-    };
-    assert_eq!(
-        changed(Change::Splice(at, 3, b"x".to_vec())),
-        "lease = 1x, seed"
-    );
-    assert_eq!(
-        changed(Change::Overwrite(at, vec![b'9'; 4])),
-        "lease = 9999, seed"
-    );
-    assert_eq!(
-        changed(Change::Number(at, b"nan".to_vec())),
-        "lease = 1nan, seed"
-    );
 }

@@ -3,6 +3,7 @@
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Move};
+use std::ops::Range;
 use tests::harness::{PATIENCE, Paths, Server, fly, reset};
 
 /// Seeds, one world each.
@@ -10,9 +11,6 @@ const N_SEEDS: u32 = 8;
 
 /// Steps flown on each world.
 const N_STEPS: usize = 12;
-
-/// Moves of a path.
-const N_MOVES: usize = 10;
 
 /// A grid on which a batch takes one thread.
 const SMALL: &str = "--height 9 --width 14 --burn-in 200";
@@ -27,8 +25,8 @@ fn start(flags: &str) -> Server {
     Server::start(&format!("--moves 10 {flags}"))
 }
 
-fn paths(seed: u64) -> Vec<Vec<Move>> {
-    Paths::new(seed).take(N_MOVES, N_STEPS)
+fn paths(seed: u32) -> Vec<Vec<Move>> {
+    Paths::new(seed.into()).take(10, N_STEPS)
 }
 
 fn without_episode(mut observation: Observation) -> Observation {
@@ -40,22 +38,21 @@ fn without_episode(mut observation: Observation) -> Observation {
 fn reference(size: &str) -> Vec<Trajectory> {
     let server = start(&format!("{size} --worlds 1 --threads 1"));
     let mut client = server.acquire(0..1);
-    (0..u64::from(N_SEEDS))
-        .map(|seed| {
-            reset(&mut client, seed);
-            let flights = paths(seed).into_iter();
-            flights
-                .map(|path| without_episode(fly(&mut client, path)))
-                .collect()
-        })
-        .collect()
+    let mut trajectory = |seed| {
+        reset(&mut client, u64::from(seed));
+        let flights = paths(seed).into_iter();
+        flights
+            .map(|path| without_episode(fly(&mut client, path)))
+            .collect()
+    };
+    (0..N_SEEDS).map(&mut trajectory).collect()
 }
 
 /// All worlds at once.
-fn batches(client: &mut Client, steps: std::ops::Range<usize>, trajectories: &mut [Trajectory]) {
-    let all: Vec<Vec<Vec<Move>>> = (0..u64::from(N_SEEDS)).map(paths).collect();
+fn batches(client: &mut Client, steps: Range<usize>, trajectories: &mut [Trajectory]) {
+    let all: Vec<_> = (0..N_SEEDS).map(paths).collect();
     for step in steps {
-        let batch: Vec<Vec<Move>> = all.iter().map(|paths| paths[step].clone()).collect();
+        let batch: Vec<_> = all.iter().map(|paths| paths[step].clone()).collect();
         let answer = client.step(0..N_SEEDS, &batch).expect("step");
         for (trajectory, observation) in trajectories.iter_mut().zip(answer) {
             trajectory.push(without_episode(observation));
@@ -63,35 +60,35 @@ fn batches(client: &mut Client, steps: std::ops::Range<usize>, trajectories: &mu
     }
 }
 
-fn check_batches(size: &str, flags: &str, n_observers: usize, expected: &[Trajectory]) {
-    let server = start(&format!("{size} --worlds {N_SEEDS} {flags}"));
-    let observers: Vec<_> = (0..n_observers)
-        .map(|_| Observer::frames(&server.instance).expect("observe"))
-        .collect();
-    let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
-    let mut client = server.acquire(0..N_SEEDS);
-    batches(&mut client, 0..N_STEPS, &mut trajectories);
-    let is_same = trajectories == expected;
-    assert!(is_same, "{size} {flags}, {n_observers} observers");
-    for observer in observers {
-        assert!(observer.receive(PATIENCE).expect("receive").is_some());
+#[test]
+fn worlds_do_not_depend_on_worlds_beside_them_observers_or_threads() {
+    for (size, flags, n_observers) in [
+        (SMALL, "--threads 2 --publish-truth", 3),
+        (LARGE, "--threads 1", 0),
+        (LARGE, "--threads 2", 3),
+    ] {
+        let server = start(&format!("{size} --worlds {N_SEEDS} {flags}"));
+        let observe = |_| Observer::frames(&server.instance).expect("observe");
+        let observers: Vec<_> = (0..n_observers).map(observe).collect();
+        let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
+        batches(
+            &mut server.acquire(0..N_SEEDS),
+            0..N_STEPS,
+            &mut trajectories,
+        );
+        assert!(
+            trajectories[0] != trajectories[1],
+            "seeds tell worlds apart"
+        );
+        assert!(trajectories == reference(size), "{size} {flags}");
+        for observer in observers {
+            assert!(observer.receive(PATIENCE).expect("receive").is_some());
+        }
     }
 }
 
 #[test]
-fn worlds_do_not_depend_on_worlds_beside_them_observers_or_threads() {
-    let expected = reference(SMALL);
-    assert!(expected[0] != expected[1], "seeds tell worlds apart");
-    check_batches(SMALL, "--threads 1", 0, &expected);
-    check_batches(SMALL, "--threads 2 --publish-truth", 3, &expected);
-    let expected = reference(LARGE);
-    check_batches(LARGE, "--threads 1", 0, &expected);
-    check_batches(LARGE, "--threads 2", 3, &expected);
-}
-
-#[test]
-fn worlds_do_not_notice_who_acts_on_them() {
-    let expected = reference(SMALL);
+fn worlds_do_not_notice_who_acts_on_them_or_where_robots_fly() {
     let server = start(&format!("{SMALL} --worlds {N_SEEDS}"));
     let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
     let mut first = server.acquire(0..N_SEEDS);
@@ -105,20 +102,15 @@ fn worlds_do_not_notice_who_acts_on_them() {
     let stale = second.step(0..1, &paths(99)[..1]);
     assert!(stale.is_err(), "a lost lease steps nothing");
     batches(&mut third, 8..N_STEPS, &mut trajectories);
-    assert!(trajectories == expected);
-}
-
-#[test]
-fn random_starts_and_paths_far_apart_leave_the_world_the_same() {
-    let flags = &format!("{SMALL} --coverage full");
-    let (corner, random) = (start(flags), start(&format!("{flags} --start random")));
-    let (mut one, mut other) = (corner.acquire(0..1), random.acquire(0..1));
+    assert!(trajectories == reference(SMALL));
+    // Full frames show the world and its noise.
+    let flags = format!("{SMALL} --coverage full");
+    let servers = [start(&flags), start(&format!("{flags} --start random"))];
+    let mut clients = servers.each_ref().map(|server| server.acquire(0..1));
+    let [one, other] = &mut clients;
     for (mine, theirs) in paths(1).into_iter().zip(paths(2)) {
-        let (mine, theirs) = (fly(&mut one, mine), fly(&mut other, theirs));
-        assert_eq!(
-            mine.frame, theirs.frame,
-            "full frames show the world and its noise"
-        );
+        let (mine, theirs) = (fly(one, mine), fly(other, theirs));
+        assert_eq!(mine.frame, theirs.frame);
         assert_eq!(mine.world.n_target_cells, theirs.world.n_target_cells);
     }
 }

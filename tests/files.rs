@@ -2,62 +2,13 @@
 
 use crate::commands::{TINY, check};
 use emberwatch_protocol::Model;
-use tempfile::TempDir;
-use tests::harness::{AGENT, SERVER, SMALL, Server, repository, run};
-
-/// Files of wrong content, by name.
-struct Files(TempDir);
-
-impl Files {
-    fn new() -> Self {
-        Self(TempDir::new().expect("a folder"))
-    }
-
-    fn write(&self, name: &str, text: &str) -> String {
-        let path = self.0.path().join(name);
-        std::fs::write(&path, text).expect("write a file");
-        path.to_str().expect("a plain path").into()
-    }
-}
-
-/// Writes a file, names it with a flag, and checks that it is refused by its path.
-fn check_file(flag: &str, text: &str, words: &str) {
-    let files = Files::new();
-    let path = files.write("wrong.toml", text);
-    let words = format!("{path} | {words}");
-    check(SERVER, &format!("{flag} {path} --check"), &words);
-}
+use tests::harness::{AGENT, Folder, SERVER, SMALL, Server, repository, run};
 
 #[test]
-fn wrong_settings_files_are_refused_by_path_and_entry() {
-    check_file("--config", "wrolds = 3\n", "unknown field `wrolds`");
-    check_file("--config", "worlds = 'three'\n", "invalid type | worlds");
-    check_file("--config", "worlds = = 3\n", "config file");
-}
-
-#[test]
-fn wrong_model_files_are_refused_by_path_and_entry() {
-    let wildfire = repository().join("config/models/wildfire.toml");
-    let wildfire = std::fs::read_to_string(wildfire).expect("the model file");
-    let check = |from: &str, to: &str, words: &str| {
-        assert!(wildfire.contains(from), "{from}");
-        check_file("--model", &wildfire.replacen(from, to, 1), words);
-    };
-    check_file("--model", "", "missing field");
-    check_file("--model", "name = ", "model file");
-    check("name =", "colour = 1\nname =", "unknown field `colour`");
-    check(
-        "[[kernel]]",
-        "[[kernel]]\nown = \"normal\"",
-        "own in every entry, or in none, got 1 of 6",
-    );
-}
-
-#[test]
-fn a_model_that_can_divide_by_zero_on_the_grid_is_refused() {
-    let files = Files::new();
+fn wrong_files_are_refused_by_path_and_entry() {
+    let folder = Folder::default();
     // A cell's weights come from the cell above it alone: the top row has none.
-    let model = r##"
+    let above = r##"
         name = "from-above"
         kernel_size = [3, 1]
         states = [
@@ -70,66 +21,75 @@ fn a_model_that_can_divide_by_zero_on_the_grid_is_refused() {
             { from = "b", to = "b", weights = [[1.0], [0.0], [0.0]] },
         ]
     "##;
-    let path = files.write("above.toml", model);
-    let words = "from-above | cell (0, 0) can sum to zero | expected a positive sum";
-    check(SERVER, &format!("--model {path}"), words);
-    check(AGENT, &format!("compare {TINY} --model {path}"), words);
+    let zero = "from-above | cell (0, 0) can sum to zero | expected a positive sum";
+    for (flag, text, words) in [
+        ("--config", "wrolds = 3\n", "PATH | unknown field `wrolds`"),
+        (
+            "--config",
+            "worlds = 'three'\n",
+            "PATH | invalid type | worlds",
+        ),
+        ("--config", "worlds = = 3\n", "PATH | config file"),
+        ("--model", "", "PATH | missing field"),
+        ("--model", "name = ", "PATH | model file"),
+        ("--model", above, zero),
+    ] {
+        let path = folder.write("wrong.toml", text);
+        check(
+            SERVER,
+            &format!("{flag} {path} --check"),
+            &words.replace("PATH", &path),
+        );
+    }
+    let path = folder.word("wrong.toml");
+    check(AGENT, &format!("compare {TINY} --model {path}"), zero);
 }
 
 #[test]
-fn the_checked_settings_are_accepted_again_as_a_file() {
-    let files = Files::new();
-    let model = repository().join("config/models/road-ice.toml");
-    let model = model.to_str().expect("a plain path");
+fn documented_and_checked_settings_are_accepted_as_files() {
+    let folder = Folder::default();
+    let config = repository().join("config");
+    let config = config.display();
     for flags in [
         "",
         "--start 3,5 --worlds 7 --coverage client --publish-truth --reveal-model false",
         "--start random --seed 9007199254740993 --max-steps 12 --burn-in 0",
-        &format!("--model {model} --height 24 --width 40"),
+        &format!("--model {config}/models/road-ice.toml --height 24 --width 40"),
     ] {
         let first = run(SERVER, &format!("--check {flags}")).check(0);
-        let path = files.write("settings.toml", &first.stdout);
+        let path = folder.write("settings.toml", &first.stdout);
         let second = run(SERVER, &format!("--check --config {path}")).check(0);
         assert_eq!(second.stdout, first.stdout);
     }
-}
-
-#[test]
-fn a_model_in_which_no_state_pays_is_warned_of() {
-    let wildfire = repository().join("config/models/wildfire.toml");
-    let wildfire = std::fs::read_to_string(wildfire).expect("the model file");
-    assert!(wildfire.contains("reward = 1.0"));
-    let files = Files::new();
-    for (reward, is_warned_of) in [("reward = -1.0", false), ("", true)] {
-        let model = files.write("model.toml", &wildfire.replace("reward = 1.0", reward));
-        let server = Server::start(&format!("{SMALL} --model {model}"));
-        let log = server.program.stderr();
-        assert_eq!(log.contains("no state pays"), is_warned_of, "{log}");
-    }
-}
-
-#[test]
-fn worlds_in_which_nothing_burns_are_warned_of_once() {
-    for (burn_in, n_warnings) in [(0, 1), (3000, 0)] {
-        let server = Server::start(&format!(
-            "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in {burn_in}"
-        ));
-        let log = server.program.stderr();
-        let found = log
-            .matches("no cell is in the state that pays most")
-            .count();
-        assert_eq!(found, n_warnings, "{log}");
-    }
-}
-
-#[test]
-fn the_documented_files_are_accepted() {
-    let check = |flag: &str, file: &str| {
-        let path = repository().join("config").join(file);
-        run(SERVER, &format!("--check {flag} {}", path.display())).check(0);
-    };
-    check("--config", "server.toml");
+    run(SERVER, &format!("--check --config {config}/server.toml")).check(0);
     for name in Model::built_in_names() {
-        check("--model", &format!("models/{name}.toml"));
+        run(
+            SERVER,
+            &format!("--check --model {config}/models/{name}.toml"),
+        )
+        .check(0);
+    }
+}
+
+#[test]
+fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
+    let folder = Folder::default();
+    let wildfire = include_str!("../config/models/wildfire.toml");
+    assert!(wildfire.contains("reward = 1.0"));
+    let pays = folder.write(
+        "pays.toml",
+        wildfire.replace("reward = 1.0", "reward = -1.0"),
+    );
+    let free = folder.write("free.toml", wildfire.replace("reward = 1.0", ""));
+    let none_burns = "no cell is in the state that pays most";
+    let lively = "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in";
+    for (flags, words, n_warnings) in [
+        (format!("{SMALL} --model {pays}"), "no state pays", 0),
+        (format!("{SMALL} --model {free}"), "no state pays", 1),
+        (format!("{lively} 0"), none_burns, 1),
+        (format!("{lively} 3000"), none_burns, 0),
+    ] {
+        let log = Server::start(&flags).program.stderr();
+        assert_eq!(log.matches(words).count(), n_warnings, "{log}");
     }
 }

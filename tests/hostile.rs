@@ -1,7 +1,7 @@
 //! Clients of the right types and the wrong intentions: whatever they send, the server lives and
 //! other clients' worlds go on as if nothing had been.
 //!
-//! `cargo test -p tests -- --ignored` sends a million messages, and thousands of observers.
+//! `cargo test -p tests -- --ignored` sends a million messages.
 
 use emberwatch_protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
 use emberwatch_protocol::client::Claim;
@@ -37,7 +37,7 @@ fn attack(n_messages: u64) {
 
 #[test]
 fn random_messages_change_nothing_for_others() {
-    attack(20_000);
+    attack(5_000);
 }
 
 #[test]
@@ -66,18 +66,6 @@ fn a_server_recovers_when_it_has_descriptors_again() {
     server.connect();
 }
 
-#[test]
-fn refusals_are_counted_one_by_one() {
-    let server = Server::start(FLAGS);
-    let wire = Wire::open(&server.instance);
-    for count in 1..=100 {
-        let status = wire.status_of(step_header(1, 6), &step_body(&[0], &[0; 6]));
-        assert_eq!(status.0, Status::NoLease);
-        wire.control(control_header(1), b"nonsense");
-        assert_eq!(server.status().n_refused, 2 * count);
-    }
-}
-
 /// The header of a correct step of robot 1.
 fn second_robot(lease: u64) -> StepRequest {
     StepRequest {
@@ -98,24 +86,66 @@ fn fly_second(server: &Server, wire: &Wire, lease: u64) -> Status {
 }
 
 #[test]
-fn a_flood_of_requests_whose_answers_nobody_reads_disturbs_nobody() {
+fn requests_whose_answers_nobody_reads_disturb_nobody() {
     besiege(|server, _| {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
-        for round in 0..2_000 {
+        for round in 0..1_000 {
             // The first may be flown; what comes after it is late.
-            let step = wire
-                .send_step(second_robot(lease), &body(0))
-                .expect("send a step");
+            let step = wire.send_step(second_robot(lease), &body(0)).expect("send");
             let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
-            let control = control.expect("send a control request");
             let refused = wire.send_step(second_robot(lease), &body(0));
             assert!(refused.is_err(), "a client has one request under way");
-            drop((step, control));
+            drop((step, control.expect("send")));
         }
         assert!(server.step_of(1) <= 1, "a step was made twice");
         assert_eq!(fly_second(server, &wire, lease), Status::Ok);
     });
+}
+
+#[test]
+fn clients_that_come_and_go_disturb_nobody() {
+    let server = Server::start(FLAGS);
+    let mut bystander = server.acquire(0..1);
+    for round in 1..=60 {
+        let wire = Wire::open(&server.instance);
+        let step = wire
+            .send_step(step_header(round, 6), &body(0))
+            .expect("send");
+        let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
+        match round % 3 {
+            0 => drop((wire, step, control)),
+            1 => drop((step, wire, control)),
+            _ => drop((answer(&step, PATIENCE), control, wire)),
+        }
+        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, round);
+    }
+    server.acquire(1..3);
+}
+
+#[test]
+fn abandoned_requests_during_a_reset_leak_nothing() {
+    let server = Server::start_with_endless_resets("");
+    let mut bystander = server.acquire(0..1);
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(1..2).lease;
+    let send = |text: String| {
+        wire.send_control(control_header(0), text.as_bytes())
+            .expect("send")
+    };
+    let reset = send(format!(
+        r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#
+    ));
+    server.program.until(|| server.status().worlds[1].resetting);
+    drop(reset);
+    for step in 1..=50 {
+        let renew = send(format!(r#"{{"op":"renew","lease":{lease}}}"#));
+        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, step);
+        server.status();
+        drop(renew);
+    }
+    let holders = &server.status().worlds[1].holder_pids;
+    assert_eq!(*holders, [Some(std::process::id())]);
 }
 
 #[test]
@@ -148,23 +178,19 @@ fn old_leases_and_numbers_open_nothing_again() {
     besiege(|server, stolen| {
         let (wire, other) = (Wire::open(&server.instance), Wire::open(&server.instance));
         let mut old = Vec::new();
-        for round in 0..20 {
+        for k in 0..10 {
             let lease = wire.acquire(1..3).lease;
-            for k in 5 * round..5 * (round + 1) {
-                let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
-                // The very same request again comes too late.
-                assert_eq!(status(&wire), Status::Ok);
-                assert_eq!(status(&wire), Status::Late);
-                assert_eq!(status(&other), Status::NoLease);
-            }
+            let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
+            // The very same request again comes too late.
+            assert_eq!(status(&wire), Status::Ok);
+            assert_eq!(status(&wire), Status::Late);
+            assert_eq!(status(&other), Status::NoLease);
             assert_eq!(wire.ask(&Request::Release { lease }), Reply::Done);
             old.push(lease);
             for (&lease, from) in old.iter().flat_map(|it| [(it, &wire), (it, &other)]) {
-                let now = body(5 * (round + 1));
-                let status = from.status_of(second_robot(lease), &now).0;
-                assert_eq!(status, Status::LeaseLost);
-                let renewed = from.ask(&Request::Renew { lease });
-                assert_eq!(renewed.status(), Status::LeaseLost);
+                let status = from.status_of(second_robot(lease), &body(k + 1)).0;
+                let renewed = from.ask(&Request::Renew { lease }).status();
+                assert_eq!([status, renewed], [Status::LeaseLost; 2]);
             }
         }
         // All three worlds with a lease on two of them, and the victim's with its own lease.
@@ -173,11 +199,11 @@ fn old_leases_and_numbers_open_nothing_again() {
             n_robots: 3,
             ..step_header(lease, 6)
         };
-        let status = wire.status_of(all, &step_body(&[0, 100, 0], &[3; 18]));
+        let status = wire.status_of(all, &step_body(&[0, 10, 0], &[3; 18]));
         assert_eq!(status.0, Status::NoLease);
         let status = wire.status_of(step_header(stolen, 6), &body(server.step_of(0)));
         assert_eq!(status.0, Status::NoLease);
-        assert_eq!(server.step_of(1), 100);
+        assert_eq!(server.step_of(1), 10);
     });
 }
 
@@ -204,29 +230,19 @@ fn half_open_connections_use_only_their_own_slots() {
     });
 }
 
-fn observe_and_leave(n_observers: usize) {
-    besiege(|server, _| {
-        let mut kept = Vec::new();
-        for _ in 0..n_observers {
-            kept.push(Observer::frames(&server.instance).expect("a place"));
-            if kept.len() == MAX_OBSERVERS {
-                let refused = Observer::frames(&server.instance);
-                assert!(refused.is_err(), "a place too many");
-                kept.clear();
-            }
-        }
-    });
-}
-
 #[test]
 fn observers_that_come_and_go_leave_nothing() {
-    observe_and_leave(100);
-}
-
-#[test]
-#[ignore = "takes minutes"]
-fn thousands_of_observers_that_come_and_go_leave_nothing() {
-    observe_and_leave(5_000);
+    besiege(|server, _| {
+        for _ in 0..3 {
+            let observe = |_| Observer::frames(&server.instance).expect("a place");
+            let kept: Vec<_> = (0..MAX_OBSERVERS).map(observe).collect();
+            assert!(
+                Observer::frames(&server.instance).is_err(),
+                "a place too many"
+            );
+            drop(kept);
+        }
+    });
 }
 
 #[test]
@@ -234,9 +250,8 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
     besiege(|server, _| {
         let agent = Program::agent(&server.instance, "--world 1");
         let mut step = 0;
-        for round in 0..40 {
+        for _ in 0..40 {
             agent.until(|| server.step_of(1) > step);
-            std::thread::sleep(Duration::from_micros(37 * round));
             agent.stop();
             step = server.step_of(1);
             assert!(server.step_of(1) <= step + 1, "it is stopped");
@@ -251,83 +266,36 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
 }
 
 #[test]
-fn the_longest_control_requests_are_answered_in_short() {
-    let longest = |begin: &str, unit: &str, end: &str| {
+fn messages_of_any_length_are_answered_in_short() {
+    let longest = |(begin, unit, end, status): (&str, &str, &str, Status)| {
         let room = MAX_CONTROL_BYTES - begin.len() - end.len();
-        [begin, &unit.repeat(room / unit.len()), end].concat()
+        let text = [begin, &unit.repeat(room / unit.len()), end].concat();
+        (text, status)
     };
-    let texts = [
-        (
-            r#"{"op":"hello","protocol":2,"client":""#,
-            "x",
-            r#""}"#,
-            Status::Ok,
-        ),
-        (r#"{"op":""#, "x", r#""}"#, Status::Malformed),
-        (r#"{"op":"status",""#, "é", r#"":1}"#, Status::Malformed),
-        (
-            r#"{"op":"renew","lease":""#,
-            "x",
-            r#""}"#,
-            Status::Malformed,
-        ),
-        (
-            r#"{"op":"reset","lease":1,"worlds":["#,
-            r#"{"world":1},"#,
-            r#"{"world":2}]}"#,
-            Status::NoLease,
-        ),
-        ("", "9", "", Status::Malformed),
-    ];
-    let texts = texts.map(|(begin, unit, end, status)| (longest(begin, unit, end), status));
-    besiege(|server, _| {
-        let wire = Wire::open(&server.instance);
-        for (text, expected) in &texts {
-            for _ in 0..10 {
-                let (reply, answer) = wire.control(control_header(1), text.as_bytes());
-                let (text, got) = (&text[..40], answer.len());
-                assert_eq!(reply.status, *expected as u32, "{text}");
-                assert!(got <= 16 << 10, "{got} bytes in answer to {text}");
-            }
-        }
-    });
-}
-
-#[test]
-fn abandoned_requests_during_a_reset_leak_nothing() {
-    let server = Server::start_with_endless_resets("");
-    let mut bystander = server.acquire(0..1);
-    let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1..2).lease;
-    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#);
-    let renew = format!(r#"{{"op":"renew","lease":{lease}}}"#);
-    let send = |text: &str| {
-        let sent = wire.send_control(control_header(0), text.as_bytes());
-        sent.expect("send")
-    };
-    let given_up = send(&reset);
-    assert!(eventually(PATIENCE, || server.status().worlds[1].resetting));
-    drop(given_up);
-    for step in 1..=50 {
-        let given_up = send(&renew);
-        let seen = fly(&mut bystander, Paths::new(0).next(6));
-        assert_eq!(seen.world.step, step);
-        server.status();
-        drop(given_up);
-    }
-    let Reply::Status(status) = wire.ask(&Request::Status {}) else {
-        panic!("expected a status");
-    };
-    assert_eq!(status.worlds[1].holder_pids, [Some(std::process::id())]);
-}
-
-#[test]
-fn messages_of_any_length_are_refused_whole() {
-    let server = Server::start(FLAGS);
-    let mut bystander = server.acquire(0..1);
-    let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1..2).lease;
-    for length in [
+    let malformed = Status::Malformed;
+    let end = r#""}"#;
+    let mut texts = Vec::from(
+        [
+            (
+                r#"{"op":"hello","protocol":2,"client":""#,
+                "x",
+                end,
+                Status::Ok,
+            ),
+            (r#"{"op":""#, "x", end, malformed),
+            (r#"{"op":"status",""#, "é", r#"":1}"#, malformed),
+            (r#"{"op":"renew","lease":""#, "x", end, malformed),
+            (
+                r#"{"op":"reset","lease":1,"worlds":["#,
+                r#"{"world":1},"#,
+                r#"{"world":2}]}"#,
+                Status::NoLease,
+            ),
+            ("", "9", "", malformed),
+        ]
+        .map(longest),
+    );
+    let lengths = [
         1,
         7,
         4096,
@@ -335,32 +303,18 @@ fn messages_of_any_length_are_refused_whole() {
         100_000,
         MAX_CONTROL_BYTES + 1,
         3 * MAX_CONTROL_BYTES,
-    ] {
-        let refused = wire.status_of(second_robot(lease), &vec![0; length]);
-        assert_eq!(refused, (Status::WrongLength, 8 + 6));
-        let (reply, text) = wire.control(control_header(1), &vec![b' '; length]);
-        let text = String::from_utf8_lossy(&text);
-        assert_eq!(reply.status, Status::Malformed as u32, "{text}");
-        fly(&mut bystander, Paths::new(0).next(6));
-    }
-}
-
-#[test]
-fn clients_that_come_and_go_disturb_nobody() {
-    let server = Server::start(FLAGS);
-    let mut bystander = server.acquire(0..1);
-    for round in 1..=60 {
+    ];
+    texts.extend(lengths.map(|length| (" ".repeat(length), malformed)));
+    besiege(|server, _| {
         let wire = Wire::open(&server.instance);
-        let step = wire
-            .send_step(step_header(round, 6), &body(0))
-            .expect("send");
-        let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
-        match round % 3 {
-            0 => drop((wire, step, control)),
-            1 => drop((step, wire, control)),
-            _ => drop((answer(&step, PATIENCE), control, wire)),
+        let lease = wire.acquire(1..2).lease;
+        for (text, expected) in &texts {
+            let (reply, answer) = wire.control(control_header(1), text.as_bytes());
+            let (begin, got) = (text.get(..40), answer.len());
+            assert_eq!(reply.status, *expected as u32, "{begin:?}");
+            assert!(got <= 16 << 10, "{got} bytes in answer to {begin:?}");
+            let refused = wire.status_of(second_robot(lease), text.as_bytes());
+            assert_eq!(refused, (Status::WrongLength, 8 + 6));
         }
-        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, round);
-    }
-    server.acquire(1..3);
+    });
 }

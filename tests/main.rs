@@ -3,8 +3,8 @@
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
 //! What they share is in `src`; `python` lets `wire_reference.py` speak the protocol, `random_robot` is the example of a
 //! client; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own.
-//! `cargo test -p tests -- --ignored` adds the long run of the hostile clients, and what needs Python (`scripts/test`
-//! installs it).
+//! `cargo test -p tests -- --ignored` adds what takes minutes, such as deaths at random moments, and what needs Python
+//! (`scripts/test` installs it).
 
 mod agent_beliefs;
 mod autoencoder;
@@ -34,7 +34,6 @@ mod security;
 mod snapshots;
 mod suite;
 mod tasks;
-mod team_agents;
 mod teams;
 mod trained_decisions;
 mod trained_neural;

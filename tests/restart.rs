@@ -1,14 +1,16 @@
 //! Servers that end: by signal, by kill, and what their agents and successors make of it.
 
-use emberwatch_protocol::channels::{ChannelError, Instance, Ipc, create_node, node_config};
+use emberwatch_protocol::channels::{ChannelError, Instance, create_node};
 use emberwatch_protocol::connection::{Connection, ConnectionError};
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::observer::Observer;
-use iceoryx2::prelude::{CallbackProgression, Service, ServiceName};
+use iceoryx2::prelude::ServiceName;
 use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use tests::harness::{ENDLESS, PATIENCE, Paths, Program, SMALL, Server, fly, new_instance, reset};
+use tests::harness::{
+    ENDLESS, PATIENCE, Paths, Program, SMALL, Server, fly, new_instance, reset, service_files,
+};
 
 fn start_agent(instance: &Instance) -> Program {
     Program::agent(instance, "--policy random_walk")
@@ -48,35 +50,27 @@ fn an_agent_outlives_a_pause_of_its_server() {
 }
 
 #[test]
-fn a_server_takes_the_place_of_a_killed_one_whose_client_stays() {
+fn clients_learn_of_a_killed_server_and_the_next_takes_its_place() {
+    use ConnectionError::{Refused, ServerGone};
     let instance = new_instance();
     let first = Server::start_on(&instance, SMALL);
     let mut client = first.acquire(0..1);
     let step = fly(&mut client, Paths::new(0).next(6));
+    let mut waiting = first.connect();
+    first.program.stop();
+    let refused = std::thread::scope(|scope| {
+        scope.spawn(|| first.program.signal(Signal::KILL));
+        waiting.control(&Request::Status {}, 4 * PATIENCE)
+    });
+    assert!(matches!(refused, Err(ServerGone { .. })), "{refused:?}");
     first.kill();
     let second = Server::start_on(&instance, SMALL);
     let refused = client.step(0..1, &[Paths::new(0).next(6)]);
-    use ConnectionError::{Refused, ServerGone};
     let is_told = matches!(refused, Err(ServerGone { .. } | Refused { .. }));
     assert!(is_told, "{refused:?}");
     let mut next = second.acquire(0..1);
     // A new server starts from its seed.
     assert_eq!(fly(&mut next, Paths::new(0).next(6)), step);
-}
-
-#[test]
-fn a_client_that_waits_learns_that_its_server_was_killed() {
-    let server = Server::start("--height 64 --width 64 --burn-in 0");
-    let mut connection = server.connect();
-    server.program.stop();
-    let refused = std::thread::scope(|scope| {
-        scope.spawn(|| server.program.signal(Signal::KILL));
-        connection.control(&Request::Status {}, 4 * PATIENCE)
-    });
-    assert!(
-        matches!(refused, Err(ConnectionError::ServerGone { .. })),
-        "{refused:?}"
-    );
 }
 
 #[test]
@@ -87,20 +81,18 @@ fn a_server_of_another_version_is_called_so() {
     let name = ServiceName::new(&name).expect("a name");
     let service = node.service_builder(&name).request_response::<[u8], [u8]>();
     let service = service.create().expect("a service of the next version");
-    let refused = Connection::open(&instance, "test", PATIENCE).err();
-    let other = Connection::open(&new_instance(), "test", PATIENCE).err();
-    let words = refused.map(|error| error.to_string()).unwrap_or_default();
+    let refused = Connection::open(&instance, "test", PATIENCE).map(drop);
+    let words = refused.expect_err("another version").to_string();
     assert!(
         words.contains("the client speaks 2, the server 3;"),
         "{words}"
     );
-    let is_none = |error: &ConnectionError| {
-        matches!(
-            error,
-            ConnectionError::Channel(ChannelError::NoServer { .. })
-        )
-    };
-    assert!(other.as_ref().is_some_and(is_none), "{other:?}");
+    let other = Connection::open(&new_instance(), "test", PATIENCE).map(drop);
+    let is_none = matches!(
+        &other,
+        Err(ConnectionError::Channel(ChannelError::NoServer { .. }))
+    );
+    assert!(is_none, "{other:?}");
     drop(service);
 }
 
@@ -139,33 +131,16 @@ fn a_clean_stop_leaves_nothing_behind() {
         .filter(|(_, length)| *length > 16)
         .collect();
     assert!(left.is_empty(), "{left:?}");
-    assert_eq!(services(&instance), Vec::<String>::new());
+    assert_eq!(service_files(&instance), Vec::<PathBuf>::new());
 }
 
 /// The files in shared memory that processes have mapped.
 fn shared_files(pids: &[u32]) -> BTreeSet<PathBuf> {
-    let maps = pids.iter().map(|pid| {
-        std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("the process's maps")
-    });
-    let maps: String = maps.collect();
+    let read = |pid| std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("its memory");
+    let maps: String = pids.iter().map(read).collect();
     let paths = maps
         .lines()
         .filter_map(|line| line.split_whitespace().nth(5));
     let shared = paths.filter(|path| path.starts_with("/dev/shm/"));
     shared.map(PathBuf::from).collect()
-}
-
-/// The names of the instance's services that iceoryx2 still knows.
-fn services(instance: &Instance) -> Vec<String> {
-    let mut names = Vec::new();
-    let config = node_config().expect("the configuration");
-    let list = Ipc::list(&config, |details| {
-        let name = details.static_details.name().to_string();
-        if name.contains(&format!("/{}/", instance.name())) {
-            names.push(name);
-        }
-        CallbackProgression::Continue
-    });
-    list.expect("list the services");
-    names
 }

@@ -1,27 +1,34 @@
 //! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
 
+use crate::commands::check;
 use emberwatch_protocol::Client;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Observation;
-use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::observer::Observer;
-use emberwatch_sim::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
+use emberwatch_sim::snapshot::{self, Durability, SnapshotWorld, decode, encode};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
 use std::path::{Path, PathBuf};
-use tempfile::TempDir;
 use tests::harness::{
-    ENDLESS, PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, reset,
-    small_spec,
+    ENDLESS, Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly, fly_on, frames_until,
+    new_instance, reset, small_spec,
 };
 use tests::wire::{RawClient, Wire, control_header};
 
 const N_MOVES: usize = 6;
 
-/// The next few observations of a client's world, on paths of its own.
-fn future(client: &mut Client, seed: u64) -> Vec<Observation> {
-    let paths = Paths::new(seed).take(N_MOVES, 5);
-    paths.into_iter().map(|path| fly(client, path)).collect()
+/// The next few observations of a client's worlds, on paths of its own.
+fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
+    let (mut paths, robots) = (Paths::new(seed), client.robots());
+    let mut step = || {
+        client
+            .step(robots.clone(), &paths.take(N_MOVES, robots.len()))
+            .expect("step")
+    };
+    (0..5).map(|_| step()).collect()
 }
 
 /// Runs a command of the program that the server refuses.
@@ -29,25 +36,29 @@ fn refused(server: &Server, command: &str, words: &str) {
     server.command(command).check(1).check_says(words);
 }
 
+/// The snapshots in a folder, by name.
+fn snapshots_in(folder: &Folder) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder.path(""))
+        .expect("the folder")
+        .flatten();
+    let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
+    paths.retain(|path| path.extension() == Some("snapshot".as_ref()));
+    paths.sort();
+    paths
+}
+
 #[test]
 fn a_restored_world_and_its_memory_continue_bit_for_bit() {
-    let folder = TempDir::new().expect("a folder");
-    let file = folder.path().join("lab.snapshot");
-    let file = file.display();
+    let folder = Folder::default();
+    let file = folder.word("lab.snapshot");
     let server = Server::start(&format!("{SMALL} --worlds 2 --seed 5 --start random"));
     let mut client = server.acquire(0..2);
     reset(&mut client, 70);
-    let fly_both = |client: &mut Client, seed| {
-        let paths = Paths::new(seed).take(N_MOVES, 2);
-        client.step(0..2, &paths).expect("step")
-    };
-    let future = |client: &mut Client| (9..14).map(|seed| fly_both(client, seed)).collect();
-    fly_both(&mut client, 1);
-    fly_both(&mut client, 2);
+    future(&mut client, 1);
     let before = client.observe(0..2).expect("observe");
     let past = client.recall(0..2, 1).expect("recall");
     server.command(&format!("snapshot {file}")).check(0);
-    let went_on: Vec<_> = future(&mut client);
+    let went_on = future(&mut client, 2);
     let busy = format!("busy: held by pid {}", std::process::id());
     refused(&server, &format!("restore {file}"), &busy);
     let restore = format!("restore {file} --takeover");
@@ -56,7 +67,7 @@ fn a_restored_world_and_its_memory_continue_bit_for_bit() {
         let mut client = server.acquire(0..2);
         assert_eq!(client.observe(0..2).expect("observe"), before);
         assert_eq!(client.recall(0..2, 1).expect("recall"), past);
-        assert_eq!(future(&mut client), went_on);
+        assert_eq!(future(&mut client, 2), went_on);
         // Another reset to the seed that it began with gives what that gave.
         reset(&mut client, 70);
         client.observe(0..2).expect("observe")
@@ -68,10 +79,9 @@ fn a_restored_world_and_its_memory_continue_bit_for_bit() {
 
 #[test]
 fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
-    let folder = TempDir::new().expect("a folder");
-    let file = folder.path().join("lab.snapshot");
-    let file = file.display();
-    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let folder = Folder::default();
+    let file = folder.word("lab.snapshot");
+    let server = Server::start(&format!("{SMALL} --worlds 3 --lease-millis 86400000"));
     let mut second = server.acquire(1..2);
     fly(&mut second, Paths::new(3).next(N_MOVES));
     let part = format!("snapshot {file} --first-world 1");
@@ -85,9 +95,34 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
         .expect("receive")
         .expect("a frame");
     assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
-    assert_eq!(server.observe(0), server.observe(1));
-    let mut first = server.acquire(0..1);
-    assert_eq!(future(&mut first, 4), future(&mut second, 4));
+    let at = |robot: u32| server.observe(robot);
+    assert_eq!(at(0), at(1));
+    // A fork has the future of its world, and a life of its own.
+    server.command("fork 1 2").check(0);
+    refused(&server, "fork 7 2", "no such world");
+    assert_eq!(at(2), at(1));
+    let mut copies = [0, 2].map(|robot| server.acquire(robot..robot + 1));
+    let of_second = shown_of(future(&mut second, 4));
+    for copy in &mut copies {
+        assert_eq!(shown_of(future(copy, 4)), of_second);
+    }
+    assert_ne!(
+        shown_of(future(&mut copies[0], 6)),
+        shown_of(future(&mut second, 7))
+    );
+    for (fork, words) in [
+        ("fork 0 2", "busy: held by pid"),
+        ("fork 0 3", "no such robot"),
+    ] {
+        refused(&server, fork, words);
+    }
+    let lease = copies[0].lease();
+    let stolen = Wire::open(&server.instance).ask(&Request::Fork {
+        lease,
+        from: 1,
+        to: 0,
+    });
+    assert_eq!(stolen.status(), Status::NoLease, "{stolen:?}");
     for (flags, words) in [
         ("--from 2", "--from: expected a world below 2"),
         (
@@ -100,177 +135,144 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     }
 }
 
-#[test]
-fn a_fork_has_the_future_of_its_world_and_a_life_of_its_own() {
-    let server = Server::start(&format!("{SMALL} --worlds 3"));
-    let mut original = server.acquire(0..1);
-    fly(&mut original, Paths::new(1).next(N_MOVES));
-    server.command("fork 0 2").check(0);
-    let mut copy = server.acquire(2..3);
-    assert_eq!(future(&mut copy, 5), future(&mut original, 5));
-    let elsewhere = future(&mut copy, 6);
-    let original = future(&mut original, 7);
-    assert_ne!(elsewhere, original, "their robots fly on their own");
-    refused(&server, "fork 0 2", "busy: held by pid");
-    refused(&server, "fork 0 3", "no such robot");
-    refused(&server, "fork 7 1", "no such world");
-    let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1..2).lease;
-    let stolen = wire.ask(&Request::Fork {
-        lease,
-        from: 1,
-        to: 0,
-    });
-    assert_eq!(stolen.status(), Status::NoLease, "{stolen:?}");
+/// What a client with one robot saw.
+fn shown_of(seen: Vec<Vec<Observation>>) -> Vec<Observation> {
+    seen.into_iter().flatten().collect()
 }
 
 #[test]
 fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
-    let folder = TempDir::new().expect("a folder");
-    let file = folder.path().join("lab.snapshot");
+    let folder = Folder::default();
+    let file = folder.word("lab.snapshot");
     let server = Server::start(SMALL);
-    let mut client = server.acquire(0..1);
-    fly(&mut client, Paths::new(1).next(N_MOVES));
-    server
-        .command(&format!("snapshot {}", file.display()))
-        .check(0);
-    let whole = std::fs::read(&file).expect("the snapshot");
-    let before = server.observe(0);
-    let check = |bytes: &[u8], words: &str| {
-        let other = folder.path().join("other");
-        std::fs::write(&other, bytes).expect("write");
-        let restore = format!("restore {} --takeover", other.display());
-        refused(&server, &restore, words);
-        let mut client = server.take_over(0..1);
-        let request = Request::Restore {
-            lease: client.lease(),
-            first_world: 0,
-            n_worlds: 1,
-            from: 0,
-            path: other.display().to_string(),
-        };
-        let Err(ConnectionError::Refused {
-            status, message, ..
-        }) = client.backend().control(&request, PATIENCE)
-        else {
-            panic!("expected a refusal of {words:?}");
-        };
-        assert_eq!(status, Status::BadFile);
-        assert!(message.contains(words), "{words:?}: {message}");
-        assert_eq!(server.observe(0), before);
-    };
-    check(b"", "another kind of file");
-    check(
-        b"PNG and so on, long enough to be a file",
-        "another kind of file",
-    );
-    check(&whole[..whole.len() - 1], "damaged: expected");
-    let mut version = whole.clone();
+    fly(&mut server.acquire(0..1), Paths::new(1).next(N_MOVES));
+    server.command(&format!("snapshot {file}")).check(0);
+    let (whole, before) = (folder.bytes("lab.snapshot"), server.observe(0));
+    let (mut version, mut damaged) = (whole.clone(), whole.clone());
     version[8] = 3;
-    check(&version, "expected a snapshot of version 2, got version 3");
-    let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
-    check(&damaged, "damaged: expected the checksum");
+    for (bytes, words) in [
+        (&b"PNG and so on"[..], "another kind of file"),
+        (&whole[..whole.len() - 1], "damaged: expected"),
+        (&version, "expected a snapshot of version 2, got version 3"),
+        (&damaged, "damaged: expected the checksum"),
+    ] {
+        let path = folder.write("other", bytes);
+        refused(&server, &format!("restore {path} --takeover"), words);
+        assert_eq!(server.observe(0), before);
+    }
     for (path, words) in [
         ("/no/such/file", "snapshot file /no/such/file"),
         ("/dev/zero", "expected a regular file"),
-        ("/dev/null", "expected a regular file"),
         ("relative", "path: expected an absolute one"),
     ] {
-        let wire = Wire::open(&server.instance);
         let request = Request::Snapshot {
             first_world: 0,
             n_worlds: 1,
             path: path.into(),
         };
-        let reply = format!("{:?}", wire.ask(&request));
+        let reply = format!("{:?}", Wire::open(&server.instance).ask(&request));
         assert!(reply.contains(words), "{reply}");
         server
             .command(&format!("restore {path} --takeover"))
             .check(1);
     }
-    let other = Server::start("--height 5 --width 8 --moves 6 --burn-in 20");
-    let file = file.display();
-    let words = "width: expected 8 as this server's, got 7";
-    refused(&other, &format!("restore {file}"), words);
-    let flags = format!("{SMALL} --worlds 2 --restore {file}");
-    let server = Server::start_without_waiting(&new_instance(), &flags);
-    let ended = server.program.ends(1);
-    ended.check_says("worlds: expected 2, got 1");
+    for (flags, words) in [
+        ("--width 8", "width: expected 8 as this server's, got 7"),
+        ("--width 7 --worlds 2", "worlds: expected 2, got 1"),
+    ] {
+        let flags = format!("--height 5 {flags} --moves 6 --burn-in 20 --restore {file}");
+        check(SERVER, &flags, words);
+    }
 }
 
 #[test]
 fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
-    let folder = TempDir::new().expect("a folder");
+    let folder = Folder::default();
     let flags = format!(
         "{SMALL} --worlds 2 --snapshot-every 10 --snapshot-keep 2 --snapshot-dir {0} --restore {0}",
-        folder.path().display()
+        folder.word("")
     );
     let instance = new_instance();
     let undisturbed = Server::start(&format!("{SMALL} --worlds 2"));
     let mut expected = undisturbed.acquire(0..2);
     let path = |k: u64| Paths::new(k).take(N_MOVES, 2);
-    let expected: Vec<_> = (0..100)
+    let expected: Vec<_> = (0..75)
         .map(|k| expected.step(0..2, &path(k)).expect("step"))
         .collect();
+    let files = || snapshots_in(&folder);
     let mut at = 0;
     for round in 1..=3 {
         let server = Server::start_on(&instance, &flags);
         let mut client = server.take_over(0..2);
         let stands = client.observe(0..2).expect("observe")[0].world.step;
         assert!(stands <= at && stands + 20 > at, "{stands} after {at}");
-        for k in stands..25 * round {
+        at = 25 * round;
+        for k in stands..at {
             let seen = client.step(0..2, &path(k)).expect("step");
             assert_eq!(seen, expected[k as usize], "step {k}");
         }
-        at = 25 * round;
         // At least two a round: after 10 steps, and when that was written or 10 steps later.
-        let files = || snapshots_in(folder.path());
-        let least = format!("{}-{:012}.snapshot", instance.name(), 2 * round);
-        let least = folder.path().join(least);
-        let written = || files().last().is_some_and(|newest| *newest >= least);
-        assert!(eventually(PATIENCE, written), "{:?}", files());
+        let least = folder.path(&format!("{}-{:012}.snapshot", instance.name(), 2 * round));
+        server
+            .program
+            .until(|| files().last().is_some_and(|newest| *newest >= least));
         // The last two, and the first of the round, which outlives a loss of power.
-        let tidied_up = || matches!(files().len(), 2 | 3);
-        assert!(eventually(PATIENCE, tidied_up), "{:?}", files());
+        server.program.until(|| matches!(files().len(), 2 | 3));
         server.kill();
     }
     let server = Server::start_on(&instance, &flags);
     let stands = server.step_of(0);
     server.program.finish();
     // The newest file is damaged: the one before it serves.
-    let files = snapshots_in(folder.path());
-    std::fs::write(files.last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
+    std::fs::write(files().last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
     let server = Server::start_on(&instance, &flags);
     assert_eq!(server.step_of(0), stands, "{}", server.program.stderr());
     server.program.wait_for_words("another kind of file");
 }
 
-/// The snapshots in a folder, by name.
-fn snapshots_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).expect("the folder").flatten();
-    let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
-    paths.retain(|path| path.extension() == Some("snapshot".as_ref()));
-    paths.sort();
-    paths
+#[test]
+#[ignore = "takes minutes"]
+fn servers_killed_at_any_moment_come_back_to_a_step_that_was() {
+    let folder = Folder::default();
+    let place = folder.word("");
+    let flags = format!("--snapshot-every 10 --snapshot-dir {place} --restore {place}");
+    let (instance, undisturbed) = (new_instance(), Server::start(SMALL));
+    let mut undisturbed = undisturbed.acquire(0..1);
+    let path = |k: usize| Paths::new(k as u64).next(N_MOVES);
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let mut expected = vec![undisturbed.observe(0..1).expect("observe").remove(0)];
+    for _ in 0..200 {
+        let server = Server::start_on(&instance, &format!("{SMALL} {flags}"));
+        let mut client = server.take_over(0..1);
+        let mut seen = client.observe(0..1).expect("observe").remove(0);
+        for _ in 0..rng.random_range(1..200) {
+            let k = seen.world.step as usize;
+            assert_eq!(expected.get(k), Some(&seen), "step {k}");
+            seen = fly(&mut client, path(k));
+            if expected.len() == k + 1 {
+                expected.push(fly(&mut undisturbed, path(k)));
+            }
+        }
+        server.kill();
+    }
 }
 
 #[test]
 fn the_last_few_are_kept_and_one_that_is_spared() {
-    let folder = TempDir::new().expect("a folder");
+    let folder = Folder::default();
     let instance = Instance::new("lab").expect("a plain name");
-    let files = Folder::new(folder.path(), &instance);
+    let files = snapshot::Folder::new(&folder.path(""), &instance);
     let save = |outlives, spared: Option<&Path>| {
-        let saved = files.save(b"EMBRSNAP", outlives, 2, spared);
-        saved.expect("written")
+        files
+            .save(b"EMBRSNAP", outlives, 2, spared)
+            .expect("written")
     };
     let safe = save(Durability::PowerLoss, None);
     for number in 2..6 {
         let path = save(Durability::Kill, Some(&safe));
-        let kept = files.files().expect("a list").into_iter();
-        let kept: Vec<PathBuf> = kept.map(|(_, path)| path).collect();
-        assert_eq!(kept.first(), Some(&safe));
-        assert_eq!(kept.last(), Some(&path));
+        let kept = snapshots_in(&folder);
+        assert_eq!((kept.first(), kept.last()), (Some(&safe), Some(&path)));
         assert_eq!(kept.len(), number.min(3));
     }
     save(Durability::Kill, None);
@@ -279,65 +281,66 @@ fn the_last_few_are_kept_and_one_that_is_spared() {
 
 #[test]
 fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
-    let folder = TempDir::new().expect("a folder");
-    let (notes, link) = (folder.path().join("notes"), folder.path().join("link"));
-    std::fs::write(&notes, "kept").expect("write");
-    std::os::unix::fs::symlink(&notes, &link).expect("a link");
+    let folder = Folder::default();
+    folder.write("notes", "kept");
+    let link = |name: &str| {
+        std::os::unix::fs::symlink(folder.path("notes"), folder.path(name)).expect("a link");
+    };
+    link("link");
     let server = Server::start(SMALL);
-    for path in [&notes, &link, &folder.path().to_path_buf()] {
-        refused(&server, &format!("snapshot {}", path.display()), "expected");
+    for path in ["notes", "link", ""] {
+        refused(
+            &server,
+            &format!("snapshot {}", folder.word(path)),
+            "expected",
+        );
     }
-    assert_eq!(std::fs::read_to_string(&notes).expect("read"), "kept");
     // A link where the file is written at first leads nowhere else.
-    let file = folder.path().join("lab.snapshot");
-    let part = format!("lab.snapshot.{}.part", server.program.pid());
-    std::os::unix::fs::symlink(&notes, folder.path().join(part)).expect("a link");
+    link(&format!("lab.snapshot.{}.part", server.program.pid()));
     for _ in 0..2 {
         server
-            .command(&format!("snapshot {}", file.display()))
+            .command(&format!("snapshot {}", folder.word("lab.snapshot")))
             .check(0);
     }
-    assert_eq!(std::fs::read_to_string(&notes).expect("read"), "kept");
-    let folder = folder.path().display();
-    let flags = format!("{SMALL} --snapshot-every 10 --snapshot-dir {folder}");
+    assert_eq!(folder.text("notes"), "kept");
+    let flags = format!(
+        "{SMALL} --snapshot-every 10 --snapshot-dir {}",
+        folder.word("")
+    );
     let instance = new_instance();
     Server::start_on(&instance, &flags).program.finish();
     let second = Server::start_without_waiting(&instance, &flags);
-    let ended = second.program.ends(1);
-    ended.check_says("or --restore, got 1 of another run");
+    second
+        .program
+        .ends(1)
+        .check_says("or --restore, got 1 of another run");
 }
 
 #[test]
 fn snapshots_of_other_instances_alone_are_told_of() {
-    let folder = TempDir::new().expect("a folder");
-    let flags = format!("{SMALL} --restore {}", folder.path().display());
+    let folder = Folder::default();
+    let flags = format!("{SMALL} --restore {}", folder.word(""));
     let first = Server::start(&flags);
     first.program.wait_for_words("nothing to restore");
-    let other = folder.path().join("other-000000000001.snapshot");
-    first
-        .command(&format!("snapshot {}", other.display()))
-        .check(0);
+    let other = folder.word("other-000000000001.snapshot");
+    first.command(&format!("snapshot {other}")).check(0);
     let second = Server::start(&flags);
     let name = second.instance.name();
     let words = format!("this instance, {name}-<12 digits>.snapshot, got others, such as other-0");
-    second.program.wait_for_words(&words);
-    for words in ["WARN", "new worlds start"] {
+    for words in [&words, "WARN", "new worlds start"] {
         second.program.wait_for_words(words);
     }
 }
 
 #[test]
 fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
-    let folder = TempDir::new().expect("a folder");
-    let place = folder.path().join("snaps");
-    let flags = format!("--snapshot-every 1 --snapshot-dir {}", place.display());
+    let folder = Folder::default();
+    let flags = format!("--snapshot-every 1 --snapshot-dir {}", folder.word("snaps"));
     let server = Server::start(&format!("{SMALL} {flags}"));
-    std::fs::remove_dir(&place).expect("remove");
-    std::fs::write(&place, "no folder").expect("write");
+    std::fs::remove_dir(folder.path("snaps")).expect("remove");
+    folder.write("snaps", "no folder");
     let mut client = server.acquire(0..1);
-    for k in 0..300 {
-        fly(&mut client, Paths::new(k).next(N_MOVES));
-    }
+    fly_on(&mut client, 0, 300);
     server.program.wait_for_words("not saved");
     let log = server.program.stderr();
     assert!(log.matches("not saved").count() < 30, "{log}");
@@ -345,48 +348,32 @@ fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
 
 #[test]
 fn a_world_in_its_burn_in_begins_again_after_a_restart() {
-    let folder = TempDir::new().expect("a folder");
-    let flags = format!(
-        "--snapshot-every 10 --snapshot-dir {}",
-        folder.path().display()
-    );
+    let folder = Folder::default();
+    let flags = format!("--snapshot-every 10 --snapshot-dir {}", folder.word(""));
     let server = Server::start_with_endless_resets(&flags);
-    let mut stepping = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1..2).lease;
     let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1,"seed":77}}]}}"#);
     let pending = wire.send_control(control_header(1), reset.as_bytes());
     server.program.until(|| server.status().worlds[1].resetting);
-    for k in 0..20 {
-        fly(&mut stepping, Paths::new(k).next(N_MOVES));
-    }
-    let snapshots = || snapshots_in(folder.path());
-    server.program.until(|| !snapshots().is_empty());
+    fly_on(&mut server.acquire(0..1), 0, 20);
+    server.program.until(|| !snapshots_in(&folder).is_empty());
     server.kill();
     drop(pending);
-    let copy = with_short_burn_in(&snapshots()[0]);
-    let flags = format!("{SMALL} --worlds 2 --restore {}", copy.display());
-    let worlds = Server::start(&flags).status().worlds;
+    // A copy as if it were of a server with short resets.
+    let bytes = std::fs::read(&snapshots_in(&folder)[0]).expect("the snapshot");
+    let restored = decode(&bytes).and_then(|file| file.restore(&small_spec(ENDLESS)));
+    let restored = restored.expect("of that server");
+    let worlds = restored.iter().map(|world| match world {
+        SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
+        SnapshotWorld::New(new) => SnapshotWorld::New(*new),
+    });
+    let bytes = encode(&small_spec(20).settings, &worlds.collect::<Vec<_>>()).expect("small");
+    let copy = folder.write("copy", bytes);
+    let worlds = Server::start(&format!("{SMALL} --worlds 2 --restore {copy}"))
+        .status()
+        .worlds;
     assert!((10..=20).contains(&worlds[0].info.step), "{worlds:?}");
     let begun = &worlds[1].info;
     assert_eq!((begun.seed, begun.episode, begun.step), (77, 1, 0));
-}
-
-/// A copy of a snapshot of a server with endless resets, as if that had been a [`SMALL`] one.
-fn with_short_burn_in(file: &Path) -> PathBuf {
-    let bytes = std::fs::read(file).expect("the snapshot");
-    let spec = small_spec(ENDLESS);
-    let snapshot = decode(&bytes).expect("a snapshot");
-    let restored = snapshot.restore(&spec).expect("of that server");
-    let worlds: Vec<_> = restored
-        .iter()
-        .map(|world| match world {
-            SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
-            SnapshotWorld::New(new) => SnapshotWorld::New(*new),
-        })
-        .collect();
-    let copy = file.with_extension("copy");
-    let bytes = encode(&small_spec(20).settings, &worlds).expect("small");
-    std::fs::write(&copy, bytes).expect("write");
-    copy
 }

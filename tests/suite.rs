@@ -1,10 +1,10 @@
 //! `emberwatch-agent suite` and `leaderboard`: results that go on, one score, a page of entries.
 
 use crate::commands::{agent, check, check_table};
+use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use std::path::Path;
-use tempfile::TempDir;
-use tests::harness::{AGENT, LIMIT, Program, program_path, repository};
+use tests::harness::{AGENT, Ended, Folder, LIMIT, Program, program_path};
 
 const TASK: &str = "name = \"tiny\"
 model = \"wildfire-small\"
@@ -18,376 +18,188 @@ test_seeds = { start = 0, end = 3 }
 
 const PAGE: &str = "# Leaderboard\n\n<!-- made by `emberwatch-agent leaderboard` -->\n";
 
-fn read(path: &Path) -> String {
-    std::fs::read_to_string(path).expect("a file")
+/// A folder with the task, results and entries.
+struct Place(Folder);
+
+impl Place {
+    fn new() -> Self {
+        let folder = Folder::default();
+        folder.write("tiny.toml", TASK);
+        folder.write("page.md", PAGE);
+        std::fs::create_dir(folder.path("entries")).expect("a folder");
+        Self(folder)
+    }
+
+    fn suite(&self, flags: &str) -> Ended {
+        let [task, out] = ["tiny.toml", "out"].map(|name| self.0.word(name));
+        agent(&format!("suite --tasks {task} --out {out} {flags}"))
+    }
+
+    fn rows(&self) -> Vec<PolicyRun> {
+        read_runs(&self.0.path("out/tiny.csv")).expect("rows")
+    }
+
+    fn board(&self) -> String {
+        let [entries, page] = ["entries", "page.md"].map(|name| self.0.word(name));
+        format!("leaderboard --entries {entries} --page {page}")
+    }
+
+    fn entry(&self, policy: &str) -> String {
+        let (board, out) = (self.board(), self.0.word("out"));
+        format!("{board} --add {out} --policy {policy} --by us --code here --commit abcdef0")
+    }
+}
+
+fn rewards(rows: &[PolicyRun], policy: &str) -> Vec<f64> {
+    let rows = rows.iter().filter(|run| run.policy == policy);
+    rows.map(|run| run.mean_reward).collect()
 }
 
 #[test]
 fn a_suite_goes_on_and_its_results_make_a_page() {
-    let folder = TempDir::new().expect("a folder");
-    let path = |name: &str| folder.path().join(name);
-    std::fs::write(path("tiny.toml"), TASK).expect("write");
-    let [task, out] = ["tiny.toml", "out"].map(|name| path(name).display().to_string());
-    let suite = format!("suite --tasks {task} --out {out} --policies");
-    let first = agent(&format!("{suite} coverage")).check(0);
+    let place = Place::new();
+    let first = place.suite("--policies coverage");
     first.check_prints("| oracle_ahead | 1.000 |");
-    let rows = read(&path("out/tiny.csv"));
+    let csv = || place.0.text("out/tiny.csv");
+    let rows = csv();
     assert_eq!(rows.lines().count(), 1 + 3 * 3, "{rows}");
     // What is there is not run again: its plans took as long as before.
-    let more = agent(&format!("{suite} coverage,beam_exploit,learned_beam")).check(0);
+    let more = place.suite("--policies coverage,beam_exploit,learned_beam");
     more.check_prints("| beam_exploit |");
-    let all = read(&path("out/tiny.csv"));
-    assert_eq!(
-        all.lines().count(),
-        1 + 4 * 3,
-        "a learned policy needs a checkpoint: {all}"
-    );
-    assert!(rows.lines().all(|row| all.contains(row)));
     more.check_says("3 rows of coverage kept");
-    assert!(
-        all.lines()
-            .filter(|row| row.starts_with("beam"))
-            .all(|row| !row.ends_with(',')),
-        "likelihoods"
-    );
-    let fewer = agent(&format!("{suite} coverage --worlds 1")).check(0);
-    fewer.check_prints("| coverage ");
-    // Other settings give other rows.
-    agent(&format!("{suite} coverage,beam_exploit --beam-width 2")).check(0);
-    let narrow = read(&path("out/tiny.csv"));
-    assert_ne!(
-        of_policy(&narrow, "beam_exploit"),
-        of_policy(&all, "beam_exploit")
-    );
-    agent(&format!("{suite} coverage,beam_exploit")).check(0);
+    assert_eq!(csv().lines().count(), 1 + 4 * 3, "learned_beam is left out");
+    assert!(rows.lines().all(|row| csv().contains(row)));
+    let all = place.rows();
+    place.suite("--policies coverage,beam_exploit --beam-width 2");
+    let narrow = rewards(&place.rows(), "beam_exploit");
+    assert_ne!(narrow, rewards(&all, "beam_exploit"));
 
-    std::fs::create_dir(path("entries")).expect("a folder");
-    std::fs::write(path("page.md"), PAGE).expect("write");
-    let [entries, page] = ["entries", "page.md"].map(|name| path(name).display().to_string());
-    let board = format!("leaderboard --entries {entries} --page {page}");
-    let about = "--by us --code here --commit abcdef0 --training-seconds 5";
-    let entry = |policy: &str| format!("{board} --add {out} --policy {policy} {about}");
-    check(
-        AGENT,
-        &entry("coverage"),
-        "expected an entry of random_walk",
-    );
+    let early = place.entry("coverage");
+    check(AGENT, &early, "expected an entry of random_walk");
     for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
-        agent(&entry(policy)).check(0);
+        agent(&place.entry(policy));
     }
-    let text = read(&path("page.md"));
+    let text = place.0.text("page.md");
     assert!(
         text.starts_with(PAGE) && text.contains("| us | here |"),
         "{text}"
     );
-    assert!(read(&path("page.svg")).contains("beam exploit"));
-    agent(&board).check(0);
-    assert_eq!(read(&path("page.md")), text, "the same digits");
-    check(
-        AGENT,
-        &entry("mine"),
-        "--add | expected results of \"mine\", got none",
+    assert!(place.0.text("page.svg").contains(">beam exploit"));
+    agent(&place.board());
+    assert_eq!(place.0.text("page.md"), text, "the same digits");
+    let none = "--add | expected results of \"mine\", got none";
+    check(AGENT, &place.entry("mine"), none);
+    let named = place.entry("coverage").replace("--by us", "--by <svg>");
+    check(AGENT, &named, "by: expected 1 to 200 letters");
+    for (name, from, to, words) in [
+        (
+            "coverage",
+            ",40,",
+            ",41,",
+            "world 0: steps: expected 40, got 41",
+        ),
+        ("coverage", ",none,", ",<b>none</b>,", "estimator: expected"),
+        (
+            "oracle_ahead",
+            ",alone,",
+            ",shared,",
+            "task tiny: expected team alone, as in the entry of random_walk, got shared",
+        ),
+    ] {
+        let file = format!("entries/{name}.csv");
+        let entry = place.0.text(&file);
+        let changed = entry.replacen(from, to, if name == "coverage" { 1 } else { 9 });
+        assert_ne!(changed, entry, "{words}");
+        place.0.write(&file, changed);
+        check(AGENT, &place.board(), &format!("{name} | {words}"));
+        place.0.write(&file, entry);
+    }
+    // A limit of file sizes stands for a full disk.
+    let (program, board) = (program_path(AGENT), place.board());
+    let script = format!(
+        "trap '' XFSZ; ulimit -f 1; exec {} {board}",
+        program.display()
     );
-    let damaged = read(&path("entries/coverage.csv")).replacen(",40,", ",41,", 1);
-    std::fs::write(path("entries/coverage.csv"), damaged).expect("write");
-    check(
-        AGENT,
-        &board,
-        "entry coverage, task tiny: policy \"coverage\" on world 0: steps: expected 40, got 41",
-    );
+    let full = Program::start_at(Path::new("/bin/sh"), &["-c", &script]).wait(LIMIT);
+    full.check(1).check_says("page.md: File too large");
+    assert_eq!(place.0.text("page.md"), text, "as it was");
 }
 
 #[test]
 fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
-    let folder = TempDir::new().expect("a folder");
-    let path = |name: &str| folder.path().join(name);
-    let [task, out, others] =
-        ["tiny.toml", "out", "others.csv"].map(|name| path(name).display().to_string());
-    std::fs::write(&task, TASK).expect("write");
-    let suite = format!("suite --tasks {task} --out {out} --policies coverage");
-    agent(&suite);
+    let place = Place::new();
+    place.suite("--policies coverage");
     // Rows that Python wrote on the same worlds.
-    let rows = read(&path("out/tiny.csv"));
+    let rows = place.0.text("out/tiny.csv");
     let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
     let python: Vec<String> = of_coverage
         .map(|row| row.replace("coverage", "python"))
         .collect();
     let header = rows.lines().next().expect("a header");
-    std::fs::write(&others, format!("{header}\n{}\n", python.join("\n"))).expect("write");
-    std::fs::write(
-        path("out/tiny.csv"),
-        format!("{rows}{}\n", python.join("\n")),
-    )
-    .expect("write");
-    let same = agent(&suite).check(0);
-    same.check_says("3 rows of coverage kept");
-    same.check_prints("| python ");
+    let text = python.join("\n");
+    let others = place.0.write("others.csv", format!("{header}\n{text}\n"));
+    place.0.write("out/tiny.csv", format!("{rows}{text}\n"));
+    place.suite("--policies coverage").check_prints("| python ");
     let compare = format!(
-        "compare --task {task} --policies random_walk --baseline random_walk --add {others}"
+        "compare --task {} --policies random_walk --baseline random_walk --add {others}",
+        place.0.word("tiny.toml")
     );
     agent(&compare).check_prints("| python ");
-    let entries = path("entries");
-    std::fs::create_dir(&entries).expect("a folder");
-    std::fs::write(path("page.md"), PAGE).expect("write");
-    let board = |policy: &str| {
-        let [entries, page] = ["entries", "page.md"].map(|name| path(name).display().to_string());
-        let about = "--by us --code here --commit abcdef0";
-        format!(
-            "leaderboard --entries {entries} --page {page} --add {out} --policy {policy} {about}"
-        )
-    };
     for policy in ["random_walk", "oracle_ahead", "python"] {
-        agent(&board(policy));
+        agent(&place.entry(policy));
     }
-    let page = read(&path("page.md"));
+    let page = place.0.text("page.md");
     for (from, to, what) in [
         ("burn_in = 300", "burn_in = 50", "worlds_fingerprint"),
-        ("moves = 5", "moves = 20", "moves: expected 20, got 5"),
-        (
-            "max_steps",
-            "robots = 4\nmax_steps",
-            "robots: expected 4, got 1",
-        ),
-        (
-            "max_steps",
-            "sensor_radius = 1\nmax_steps",
-            "worlds_fingerprint",
-        ),
-        (
-            "max_steps",
-            "start = \"random\"\nmax_steps",
-            "worlds_fingerprint",
-        ),
         (
             "max_steps = 40",
             "max_steps = 41",
             "steps: expected 41, got 40",
         ),
     ] {
-        std::fs::write(&task, TASK.replacen(from, to, 1)).expect("write");
-        let changed = agent(&suite);
+        place.0.write("tiny.toml", TASK.replacen(from, to, 1));
+        let changed = place.suite("--policies coverage");
         changed.check_says("3 rows of coverage are run again");
-        changed.check_says(&format!(
-            "python is left out: policy \"python\" on world 0: {what}"
-        ));
+        let of_python = format!("policy \"python\" on world 0: {what}");
+        changed.check_says(&format!("python is left out: {of_python}"));
         assert!(!changed.stdout.contains("python"), "{}", changed.stdout);
-        let rows = read(&path("out/tiny.csv"));
+        let rows = place.0.text("out/tiny.csv");
         assert!(python.iter().all(|row| rows.contains(row)), "none are lost");
-        check(
-            AGENT,
-            &compare,
-            &format!("--add: policy \"python\" on world 0: {what}"),
-        );
-        let refused = Program::start(AGENT, &board("coverage")).wait(LIMIT);
-        assert_ne!(refused.code, Some(0));
-        refused.check_says("entry coverage, task tiny");
-        assert!(!entries.join("coverage.csv").exists());
-        assert_eq!(read(&path("page.md")), page);
+        check(AGENT, &compare, &format!("--add: {of_python}"));
+        check(AGENT, &place.entry("coverage"), "entry coverage, task tiny");
+        assert!(!place.0.path("entries/coverage.csv").exists());
+        assert_eq!(place.0.text("page.md"), page);
     }
 }
 
 #[test]
 fn two_suites_that_fill_one_folder_at_once_lose_no_rows() {
-    let folder = TempDir::new().expect("a folder");
-    let [task, out] = ["tiny.toml", "out"].map(|name| folder.path().join(name));
-    std::fs::write(&task, TASK).expect("write");
-    let both = ["coverage", "beam_exploit"].map(|policy| {
-        let (task, out) = (task.display(), out.display());
-        let suite = format!("suite --tasks {task} --out {out} --policies {policy}");
-        Program::start(AGENT, &suite)
-    });
-    both.into_iter().for_each(|suite| {
-        suite.wait(LIMIT).check(0);
-    });
-    let runs = read_runs(&out.join("tiny.csv")).expect("rows");
-    for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
-        let n_rows = runs.iter().filter(|run| run.policy == policy).count();
-        assert_eq!(n_rows, 3, "{policy}");
-    }
-}
-
-/// A copy of this repository's leaderboard in a folder.
-struct Board(TempDir);
-
-impl Board {
-    fn new() -> Self {
-        let folder = TempDir::new().expect("a folder");
-        let docs = repository().join("docs");
-        for name in ["random_walk", "oracle_ahead", "coverage"] {
-            let name = format!("{name}.csv");
-            let copied = std::fs::copy(
-                docs.join("leaderboard").join(&name),
-                folder.path().join(&name),
-            );
-            copied.expect("copied");
+    let place = &Place::new();
+    std::thread::scope(|scope| {
+        for policy in ["coverage", "beam_exploit"] {
+            scope.spawn(move || place.suite(&format!("--policies {policy}")));
         }
-        std::fs::write(folder.path().join("page.md"), PAGE).expect("write");
-        Self(folder)
+    });
+    let rows = place.rows();
+    for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
+        assert_eq!(rewards(&rows, policy).len(), 3, "{policy}");
     }
-
-    fn command(&self) -> String {
-        let folder = self.0.path().display();
-        format!("leaderboard --entries {folder} --page {folder}/page.md")
-    }
-
-    /// Checks that a changed entry is refused with these words, and leaves the page as it was.
-    fn check(&self, change: impl Fn(&str) -> String, words: &str) {
-        let path = self.0.path().join("coverage.csv");
-        let entry = read(&path);
-        let changed = change(&entry);
-        assert_ne!(changed, entry, "{words}");
-        std::fs::write(&path, changed).expect("write");
-        check(AGENT, &self.command(), &format!("coverage | {words}"));
-        assert_eq!(read(&self.0.path().join("page.md")), PAGE);
-        std::fs::write(&path, entry).expect("write");
-    }
-}
-
-#[test]
-fn html_and_markdown_in_an_entry_are_refused_by_their_column() {
-    let board = Board::new();
-    let replace = |from: &'static str, to: &'static str| move |entry: &str| entry.replace(from, to);
-    let by = ",Emberwatch,";
-    board.check(
-        replace(by, ",<svg onload=alert(2)>,"),
-        "by: expected 1 to 200 letters",
-    );
-    board.check(replace(by, ",[us](javascript:alert(1)),"), "by: expected");
-    board.check(
-        replace(by, ",![us](https://example.org/us.png),"),
-        "by: expected",
-    );
-    board.check(
-        replace("agent/learning/src/policy/names.rs", "`code`"),
-        "code: expected",
-    );
-    board.check(
-        replace("agent/learning/src/policy/names.rs", "javascript:alert(1)"),
-        "code: expected",
-    );
-    board.check(replace(",none,", ",<b>none</b>,"), "estimator: expected");
-    board.check(
-        replace(",small,", ",<img src=x>,"),
-        "task: expected 1 to 64 letters",
-    );
-    board.check(
-        replace("e82395e7", "<i>e82395e7"),
-        "commit: expected 7 to 40",
-    );
-    let about = "--policy mine --by <svg> --code here --commit abcdef0 --training-seconds 0";
-    let out = board.0.path().join("out");
-    std::fs::create_dir(&out).expect("a folder");
-    let rows = read(&repository().join("docs/learning/rows.csv"));
-    let first = rows.lines().nth(1).and_then(|row| row.split(',').next());
-    let rows = rows.replace(&format!("{},", first.expect("a policy")), "mine,");
-    std::fs::write(out.join("small.csv"), rows).expect("write");
-    let add = format!("{} --add {} {about}", board.command(), out.display());
-    check(AGENT, &add, "by: expected 1 to 200 letters | got \"<svg>\"");
-}
-
-#[test]
-fn an_entry_without_the_worlds_fingerprint_is_refused() {
-    let board = Board::new();
-    let without = |entry: &str| {
-        let cut = |row: &str| row.rsplit_once(',').map(|(row, _)| row.to_owned());
-        entry.lines().filter_map(cut).collect::<Vec<_>>().join("\n")
-    };
-    board.check(without, "worlds_fingerprint | got none");
-    agent(&board.command()).check_prints("| coverage ");
-}
-
-#[test]
-fn the_ends_of_the_scale_have_one_kind_of_team() {
-    let board = Board::new();
-    let path = board.0.path().join("oracle_ahead.csv");
-    let entry = read(&path);
-    std::fs::write(&path, entry.replace(",joint,", ",shared,")).expect("write");
-    let words = "entry oracle_ahead, task team: expected team joint, as in the entry of random_walk, got shared";
-    check(AGENT, &board.command(), words);
-    std::fs::write(&path, entry.replace(",4,joint,", ",2,joint,")).expect("write");
-    check(AGENT, &board.command(), "robots: expected 4, got 2");
-}
-
-#[test]
-fn a_page_that_does_not_fit_on_the_disk_is_named() {
-    let board = Board::new();
-    // A limit of file sizes stands for a full disk.
-    let script = format!(
-        "trap '' XFSZ; ulimit -f 1; exec {} {}",
-        program_path(AGENT).display(),
-        board.command()
-    );
-    let ended = Program::start_at(Path::new("/bin/sh"), &["-c", &script]).wait(LIMIT);
-    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
-    ended.check_says("page.md: File too large");
-    assert_eq!(read(&board.0.path().join("page.md")), PAGE);
-}
-
-/// Rewards of a policy's rows.
-fn of_policy(rows: &str, policy: &str) -> Vec<String> {
-    let rows = rows.lines().filter(|row| row.starts_with(policy));
-    let reward = |row: &str| row.split(',').nth(4).map(str::to_owned);
-    rows.filter_map(reward).collect()
-}
-
-#[test]
-fn a_policy_runs_again_on_what_was_learned_since() {
-    let folder = TempDir::new().expect("a folder");
-    let path = |name: &str| folder.path().join(name).display().to_string();
-    std::fs::write(path("tiny.toml"), TASK).expect("write");
-    let task = path("tiny.toml");
-    let learn = |seed: u64, out: &str| {
-        let flags = format!("--task {task} --worlds 2 --steps 40 --agent-seed {seed}");
-        agent(&format!("train {flags} --out {out}/tiny")).check(0);
-    };
-    let (first, second, out) = (path("first"), path("second"), path("out"));
-    learn(1, &first);
-    learn(2, &second);
-    let suite = |learned: &str| {
-        let policies = "--policies learned_beam,coverage";
-        agent(&format!(
-            "suite --tasks {task} --out {out} --checkpoints {learned} {policies}"
-        ))
-        .check(0);
-        read(Path::new(&out).join("tiny.csv").as_path())
-    };
-    let rows = suite(&first);
-    assert_eq!(suite(&first), rows, "nothing ran again");
-    let others = suite(&second);
-    assert_ne!(
-        of_policy(&others, "learned_beam"),
-        of_policy(&rows, "learned_beam")
-    );
-    let of_coverage = |rows: &str| {
-        let rows = rows.lines().filter(|row| row.starts_with("coverage"));
-        rows.map(str::to_owned).collect::<Vec<_>>()
-    };
-    assert_eq!(
-        of_coverage(&others),
-        of_coverage(&rows),
-        "coverage learned nothing"
-    );
-    let others = "--policies coverage --beam-width 3";
-    let ended = agent(&format!("suite --tasks {task} --out {out} {others}"));
-    ended.check_says("learned_beam is left out");
-    assert!(!ended.stdout.contains("learned_beam"), "{}", ended.stdout);
 }
 
 #[test]
 fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
-    let folder = TempDir::new().expect("a folder");
-    let path = |name: &str| folder.path().join(name).display().to_string();
-    std::fs::write(path("tiny.toml"), TASK).expect("write");
+    let folder = Folder::default();
+    folder.write("tiny.toml", TASK);
     let recorded = "name = \"fires\"\nstates = \"jacksboro\"\nmoves = 8\nmax_steps = 10\n\
                     test_seeds = { start = 0, end = 2 }\n";
-    std::fs::write(path("fires.toml"), recorded).expect("write");
+    folder.write("fires.toml", recorded);
     let suite = |flags: &str| {
-        let [tiny, fires, out, runs] = ["tiny.toml", "fires.toml", "out", "runs"].map(path);
+        let [tiny, fires, out, runs] =
+            ["tiny.toml", "fires.toml", "out", "runs"].map(|name| folder.word(name));
         let policies = "learned_beam,learned_policy,neural_beam,beam_exploit,known/options/learned";
         agent(&format!(
             "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} {flags}"
         ))
-        .check(0)
     };
     let first = suite("--train --train-steps 64");
     first.check_says("task tiny: training filter for learned_beam, 0 of 64 world steps done");
@@ -396,69 +208,49 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
         let gap = "is not run: it needs a known model, and recorded worlds have none";
         first.check_says(&format!("task fires: {policy} {gap}"));
     }
-    let seconds = |task: &str, policy: &str| {
-        let runs = read_runs(&folder.path().join("out").join(task)).expect("rows");
-        let run = runs.into_iter().find(|run| run.policy == policy);
-        run.expect(policy).training_seconds.expect("kept")
-    };
-    for task in ["tiny.csv", "fires.csv"] {
-        assert!(seconds(task, "neural_beam") > 0.0);
-        assert!(seconds(task, "learned_policy") >= seconds(task, "learned_beam"));
-        assert_eq!(seconds(task, "random_walk"), 0.0);
+    for task in ["out/tiny.csv", "out/fires.csv"] {
+        let runs = read_runs(&folder.path(task)).expect("rows");
+        let seconds = |policy: &str| {
+            let run = runs.iter().find(|run| run.policy == policy);
+            run.expect(policy).training_seconds.expect("kept")
+        };
+        assert!(seconds("neural_beam") > 0.0);
+        assert!(seconds("learned_policy") >= seconds("learned_beam"));
+        assert_eq!(seconds("random_walk"), 0.0);
     }
-    let again = suite("--train --train-steps 64");
-    again.check_says("3 rows of learned_policy kept");
-    assert!(!again.stderr.contains("training"), "{}", again.stderr);
-    let narrow = suite("--train --train-steps 64 --beam-width 3");
-    narrow.check_says("runs/tiny/filter is kept, although it was trained with other settings");
-    let untrained = suite("");
-    untrained.check_says(
+    let again = suite("--train --train-steps 64 --beam-width 3");
+    again.check_says("runs/tiny/filter is kept, although it was trained with other settings");
+    assert!(
+        !again.stderr.contains("training filter"),
+        "{}",
+        again.stderr
+    );
+    suite("").check_says(
         "neural_beam acts on an unfinished training: 64 of 48000 world steps (--learner neural)",
     );
     let longer = suite("--train --train-steps 96");
-    longer.check_says("task tiny: training neural for neural_beam, 64 of 96 world steps done");
-    longer.check_says("3 rows of neural_beam are run again");
-    longer.check_says("tiny/decisions-learned_filter was learned on");
-    longer.check_says("remove it to train the belief further");
-    for policy in ["learned_beam", "learned_policy"] {
-        assert!(longer.stdout.contains(policy), "its rows are kept");
+    for words in [
+        "task tiny: training neural for neural_beam, 64 of 96 world steps done",
+        "3 rows of neural_beam are run again",
+        "3 rows of random_walk kept",
+        "tiny/decisions-learned_filter was learned on",
+        "remove it to train the belief further",
+    ] {
+        longer.check_says(words);
     }
-    let other = folder
-        .path()
-        .join("runs/tiny/filter/checkpoint.safetensors");
-    let of_fires = folder
-        .path()
-        .join("runs/fires/filter/checkpoint.safetensors");
-    std::fs::copy(of_fires, other).expect("another belief");
+    let checkpoint =
+        |task: &str| folder.path(&format!("runs/{task}/filter/checkpoint.safetensors"));
+    std::fs::copy(checkpoint("fires"), checkpoint("tiny")).expect("another belief");
     let mixed = suite("");
     mixed.check_says("tiny/decisions-learned_filter was learned on another belief than");
+    mixed.check_says("rows of learned_beam are run again");
 }
 
 #[test]
-fn all_names_are_checked_before_anything_runs() {
-    let folder = TempDir::new().expect("a folder");
-    std::fs::write(folder.path().join("tiny.toml"), TASK).expect("write");
-    let (task, out) = (folder.path().join("tiny.toml"), folder.path().join("out"));
-    for tasks in [
-        format!("{},jacksboro", task.display()),
-        task.display().to_string(),
-    ] {
-        let suite = format!(
-            "suite --tasks {tasks} --out {} --policies coverage,known/beam/xyz",
-            out.display()
-        );
-        check(
-            AGENT,
-            &suite,
-            "task tiny: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"",
-        );
-        assert!(!out.exists(), "nothing ran");
-    }
-}
-
-#[test]
-fn wrong_suites_and_entries_are_named() {
+fn wrong_suites_and_entries_are_named_before_anything_runs() {
+    let place = Place::new();
     let table = "suite --tasks ash => task ash: No such file | expected one, or wildfire, small
+suite --tasks TINY,jacksboro --out OUT --policies coverage,known/beam/xyz => task tiny: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"
 suite --policies bem => policy: expected one of | got \"bem\"
 suite --worlds 0 => --worlds
 suite --tasks small --checkpoints no/such => --checkpoints: expected a folder, got no/such
@@ -467,5 +259,7 @@ suite --checkpoints runs --train-steps 5 => --train
 leaderboard --entries no/such => expected a folder of entries at no/such
 leaderboard --policy mine => --add
 leaderboard --add x --policy mine => --by";
-    check_table(AGENT, table);
+    let table = table.replace("TINY", &place.0.word("tiny.toml"));
+    check_table(AGENT, &table.replace("OUT", &place.0.word("out")));
+    assert!(!place.0.path("out").exists(), "nothing ran");
 }

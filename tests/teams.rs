@@ -1,22 +1,27 @@
 //! Several robots in one world, flown by several clients: the same paths give the same bytes, and no client that dies,
 //! hangs, is replaced or is not allowed changes what the others fly and see.
 
+use crate::commands::check;
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
+use crate::trainings::on;
 use emberwatch_protocol::control::{Reply, Request};
 use emberwatch_protocol::message::{FLAG_TEAM_FRAMES, Status, StepReply, StepRequest, WorldResult};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::path::path_to_bytes;
 use emberwatch_protocol::payload::split_step_payload;
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
 use rustix::process::Signal;
 use std::ops::Range;
 use std::time::Instant;
 use tests::harness::{
-    PATIENCE, Paths, Program, Seen, Server, eventually, frames_until, robots_of, seed,
+    AGENT, PATIENCE, Paths, Program, Seen, Server, eventually, frames_until, robots_of,
 };
 use tests::mirror::{Mirror, PacedWorld};
 use tests::wire::{
-    Pending, RawClient, Wire, acquire_request, answer, observe_header, recall_header, step_body,
-    step_header,
+    Pending, RawClient, Wire, answer, observe_header, recall_header, step_body, step_header,
 };
 
 /// Robots of the world.
@@ -26,8 +31,7 @@ const N_MOVES: usize = 10;
 
 const FLAGS: &str = "--height 9 --width 14 --moves 10 --burn-in 2000 --robots 4";
 
-/// Steps: one for each order in which four clients can come.
-const N_STEPS: u64 = 24;
+const N_STEPS: u64 = 12;
 
 /// A client of some robots.
 struct Flyer {
@@ -76,13 +80,6 @@ impl Flyer {
         shown.collect()
     }
 
-    /// Waits for the refusal of a step.
-    fn refusal(&self, sent: &Sent) -> (Status, u64) {
-        let (reply, _) = answer(sent, PATIENCE).expect("an answer to a step");
-        let status = Status::try_from(reply.status).expect("a known status");
-        (status, reply.detail)
-    }
-
     /// Waits until so many robots of the world have a path for its next step.
     fn wait_for_paths(&self, n_paths: u32) {
         let has_come = || match self.wire.ask(&Request::Status {}) {
@@ -98,16 +95,16 @@ fn path(k: u64, robot: u32) -> Vec<u8> {
     path_to_bytes(&Paths::new(k * u64::from(TEAM) + u64::from(robot)).next(N_MOVES))
 }
 
-/// The steps of four robots, flown by clients that each hold some; in step k the clients send in the k-th order.
+/// The steps of four robots, flown by clients that each hold some; the clients send in another order in each step.
 fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
-    let flyers = shares.iter();
-    let flyers: Vec<_> = flyers
-        .map(|robots| Flyer::new(server, robots.clone()))
-        .collect();
+    let flyer = |robots: &Range<u32>| Flyer::new(server, robots.clone());
+    let flyers: Vec<_> = shares.iter().map(flyer).collect();
     let step = |k: u64| {
         let mut sent: Vec<Option<Sent>> = flyers.iter().map(|_| None).collect();
         let mut n_paths = 0;
-        for index in order(k as usize, flyers.len()) {
+        let mut order: Vec<usize> = (0..flyers.len()).collect();
+        order.shuffle(&mut ChaCha8Rng::seed_from_u64(k));
+        for index in order {
             sent[index] = Some(flyers[index].send(k));
             n_paths += flyers[index].robots.len() as u32;
             if n_paths < TEAM {
@@ -121,17 +118,6 @@ fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
     (0..N_STEPS).map(step).collect()
 }
 
-/// The `number`-th order of so many.
-fn order(mut number: usize, n: usize) -> Vec<usize> {
-    let mut left: Vec<usize> = (0..n).collect();
-    let mut order = Vec::new();
-    for n_left in (1..=n).rev() {
-        order.push(left.remove(number % n_left));
-        number /= n_left;
-    }
-    order
-}
-
 #[test]
 fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     let together = Server::start(&format!("{FLAGS} --threads 1"));
@@ -142,6 +128,25 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
         own > step[0].0.n_visited
     };
     assert!(expected.iter().any(has_shared), "no cell was visited twice");
+    // A team frame holds what all saw, and is open to all.
+    let last = expected.last().expect("steps");
+    let union = |cell: usize| last.iter().map(|(.., frame)| frame[cell]).min();
+    let union: Vec<u8> = (0..9 * 14).filter_map(union).collect();
+    let stranger = Wire::open(&together.instance);
+    for (mut header, body) in [
+        (observe_header(2..3), Vec::new()),
+        (recall_header(2..3), step_body(&[N_STEPS], &[])),
+    ] {
+        header.flags = FLAG_TEAM_FRAMES;
+        let (reply, payload) = stranger.step(header, &body);
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        let (world, robot, _) = &last[2];
+        assert_eq!(
+            (&parts.worlds[..], &parts.robots[..]),
+            (&[*world][..], &[*robot][..])
+        );
+        assert_eq!(parts.frames, union, "{header:?}");
+    }
     let apart = Server::start(&format!("{FLAGS} --threads 2"));
     let (_folder, file) = new_file();
     let recorder = start_recorder(&apart.instance, &file, "");
@@ -165,161 +170,20 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     }
 }
 
-/// Large enough that worlds are stepped by several threads.
-const LARGE: &str = "--height 128 --width 128 --moves 10 --burn-in 3 --robots 2 --worlds 8";
-
 #[test]
-fn many_worlds_at_once_are_as_each_alone_with_one_thread_and_two() {
-    let [together, alone] = [2, 1].map(|n| Server::start(&format!("{LARGE} --threads {n}")));
-    let (mut all, mut each) = (together.acquire(0..16), alone.acquire(0..16));
-    for k in 0..4 {
-        let paths = Paths::new(k).take(N_MOVES, 16);
-        let seen = all.step(0..16, &paths).expect("step");
-        for world in (0..8).rev() {
-            let robots = 2 * world..2 * world + 2;
-            let own = robots.start as usize..robots.end as usize;
-            let shown = each.step(robots, &paths[own.clone()]).expect("step");
-            assert!(shown == seen[own], "world {world}");
-        }
-    }
-}
-
-#[test]
-fn a_team_frame_holds_what_all_saw_and_is_open_to_all() {
-    let server = Server::start(FLAGS);
-    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
-    let sent = flyers.each_ref().map(|flyer| flyer.send(0));
-    let own = flyers.iter().zip(&sent);
-    let own: Vec<Seen> = own.flat_map(|(flyer, sent)| flyer.shown(sent)).collect();
-    drop(sent);
-    let union = |cell: usize| own.iter().map(|(.., frame)| frame[cell]).min();
-    let union: Vec<u8> = (0..9 * 14).filter_map(union).collect();
-    let stranger = Wire::open(&server.instance);
-    for (mut header, body) in [
-        (observe_header(2..3), Vec::new()),
-        (recall_header(2..3), step_body(&[1], &[])),
-    ] {
-        header.flags = FLAG_TEAM_FRAMES;
-        let (reply, payload) = stranger.step(header, &body);
-        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
-        assert_eq!(parts.worlds[..], [own[2].0]);
-        assert_eq!(parts.robots[..], [own[2].1]);
-        assert_eq!(parts.frames, union, "{header:?}");
-    }
-}
-
-#[test]
-fn a_path_that_is_withdrawn_is_never_flown() {
+fn a_path_that_is_given_up_is_never_flown() {
     let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
     let [first, second] = [0..2, 2..4].map(|robots| Flyer::new(&server, robots));
-    // Its client gives it up, and sends it again.
     let given_up = first.send(0);
     second.wait_for_paths(2);
     drop(given_up);
     second.wait_for_paths(0);
-    // Its client releases its robots, which hover from then on.
-    let waiting = first.send(0);
-    second.wait_for_paths(2);
-    let lease = first.lease;
-    assert_eq!(first.wire.ask(&Request::Release { lease }), Reply::Done);
-    assert_eq!(first.refusal(&waiting), (Status::LeaseLost, 0));
-    drop(waiting);
-    let sent = second.send(0);
-    let world = second.shown(&sent)[0].0;
-    assert_eq!((world.step, world.hovered, world.late), (1, 3, 0));
-    drop(sent);
-    // One of its robots is taken over: the path of the other is withdrawn with it.
-    let first = Flyer::new(&server, 0..2);
-    let waiting = first.send(1);
-    second.wait_for_paths(2);
-    let thief = server.take_over(1..2);
-    let us = u64::from(std::process::id());
-    assert_eq!(first.refusal(&waiting), (Status::LeaseLost, us));
-    second.wait_for_paths(0);
     // The connection of who waits is closed.
-    drop((waiting, thief));
-    let waiting = second.send(1);
+    let waiting = second.send(0);
     first.wait_for_paths(2);
     drop((waiting, second));
     first.wait_for_paths(0);
-    assert_eq!(server.step_of(0), 1, "nothing was flown");
-}
-
-#[test]
-fn a_late_path_is_refused_and_not_flown_in_a_later_step() {
-    let server = Server::start(&format!("{FLAGS} --lease-millis 86400000 --deadline-ms 50"));
-    let observer = Observer::frames(&server.instance).expect("observe");
-    let mut mirror = Mirror::of(&server.info());
-    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
-    let [quick, slow] = &flyers;
-    let (world, robot, _) = quick.shown(&quick.send(0)).remove(0);
-    assert_eq!((world.step, world.late, robot.n_moves), (1, 0b1110, 10));
-    assert_eq!(slow.refusal(&slow.send(0)), (Status::Late, 1));
-    assert_eq!(slow.refusal(&slow.send(2)), (Status::Early, 1));
-    // The next step has the paths that were meant for it, whichever come in time.
-    let sent = flyers.each_ref().map(|flyer| flyer.send(1));
-    let mut answers = flyers.iter().zip(&sent);
-    assert!(answers.any(|(flyer, sent)| flyer.refusal(sent).0 == Status::Ok));
-    for step in frames_until(&observer, 0, 2) {
-        mirror.follow(&step);
-        for (robot, sample) in (0..).zip(robots_of(&step)) {
-            let k = step.header.result.step.saturating_sub(1);
-            assert!(sample.path.is_empty() || sample.path == path(k, robot));
-        }
-    }
-}
-
-#[test]
-fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
-    let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
-    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
-    let frames = Observer::frames(&server.instance).expect("the channel");
-    let stranger = Wire::open(&server.instance);
-    let observe = || stranger.step(observe_header(0..TEAM), &[]).1;
-    for k in 0..5 {
-        let before = observe();
-        let first = flyers[0].send(k);
-        flyers[1].wait_for_paths(1);
-        assert!(observe() == before, "a path that waits is shown");
-        for (robot, lease) in [(0, flyers[0].lease), (1, flyers[1].lease), (1, 0)] {
-            let header = StepRequest {
-                first_robot: robot,
-                ..step_header(lease, N_MOVES as u32)
-            };
-            let body = step_body(&[k], &[3; N_MOVES]);
-            let refused = stranger.status_of(header, &body);
-            assert_eq!(refused, (Status::NoLease, robot.into()));
-        }
-        let ahead = stranger.status_of(recall_header(0..TEAM), &step_body(&[k + 1], &[]));
-        assert_eq!(ahead, (Status::NotKept, k));
-        let reset = |lease| Request::Reset {
-            lease,
-            worlds: vec![seed(0, None)],
-        };
-        let acquired = stranger.ask(&acquire_request(3..4));
-        assert_eq!(acquired.status(), Status::Busy);
-        let stolen = stranger.ask(&reset(flyers[0].lease));
-        assert_eq!(stolen.status(), Status::NoLease);
-        // Not even who holds some of its robots may reset the world.
-        let own = flyers[1].wire.ask(&reset(flyers[1].lease));
-        assert_eq!(own.status(), Status::Busy);
-        assert!(observe() == before);
-        flyers[1].wait_for_paths(1);
-        let second = flyers[1].send(k);
-        let shown = [flyers[0].shown(&first), flyers[1].shown(&second)].concat();
-        let mut worlds = shown.iter().map(|(world, ..)| world);
-        assert!(worlds.all(|world| (world.step, world.hovered) == (k + 1, 0)));
-    }
-    // What was refused is not published either: each step once, after the present state for a new observer.
-    let mut steps = Vec::new();
-    while steps.last() != Some(&5) {
-        let sample = frames.receive(PATIENCE).expect("the channel");
-        steps.push(sample.expect("a sample").header.result.step);
-    }
-    assert!(
-        steps.is_sorted_by(|before, after| before < after),
-        "{steps:?}"
-    );
+    assert_eq!(server.step_of(0), 0, "nothing was flown");
 }
 
 /// A world of agents, and of robot 0, which this process flies.
@@ -348,7 +212,7 @@ impl Lab {
     }
 
     /// Steps until a result is as wanted; every step on the way must be as its own paths make it.
-    fn until(&mut self, agents: &[&Program], wanted: impl Fn(&WorldResult) -> bool) {
+    fn until(&mut self, agents: &[&Program], mut wanted: impl FnMut(&WorldResult) -> bool) {
         let start = Instant::now();
         while !wanted(&self.step()) {
             let said: String = agents.iter().map(|agent| agent.stderr()).collect();
@@ -431,21 +295,90 @@ fn a_stopped_agent_is_late_and_flies_again_when_it_wakes() {
 }
 
 #[test]
-fn one_agent_flies_a_team_and_others_share_its_frames() {
-    let server = Server::start(FLAGS);
-    let observer = Observer::frames(&server.instance).expect("observe");
-    let mut mirror = Mirror::of(&server.info());
-    let run = |flags: &str| Program::agent(&server.instance, &format!("--steps 10 {flags}"));
-    run("--robots 0..4 --team").ends(0);
-    let mates = [0, 1, 2, 3].map(|robot| run(&format!("--robot {robot} --share")));
-    for mate in mates {
-        mate.ends(0);
+#[ignore = "takes minutes"]
+fn agents_disturbed_at_random_change_nothing_for_the_others() {
+    let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 100");
+    let mut agents = lab.start_agents();
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    for _ in 0..400 {
+        let robot: u32 = rng.random_range(1..TEAM);
+        let agent = &mut agents[robot as usize - 1];
+        let is = move |mask: u64| mask >> robot & 1 == 1;
+        match rng.random_range(0..4) {
+            0 => {
+                agent.signal(Signal::KILL);
+                lab.until(&[&*agent], |world| is(world.hovered));
+                *agent = lab.start_agent(robot, "");
+            }
+            1 => {
+                agent.signal(Signal::STOP);
+                lab.until(&[&*agent], |world| is(world.late));
+                agent.signal(Signal::CONT);
+            }
+            2 => {
+                let next = lab.start_agent(robot, "--takeover");
+                std::mem::replace(agent, next).signal(Signal::TERM);
+            }
+            _ => {
+                let next = lab.start_agent(robot, "--takeover");
+                lab.until(&[&next], |_| agent.has_ended());
+                std::mem::replace(agent, next).ends(3);
+            }
+        }
+        lab.until(&[&*agent], |world| !is(world.hovered | world.late));
     }
-    let steps = server.step_of(0);
-    let n_new = frames_until(&observer, 0, steps)
-        .iter()
-        .filter(|sample| mirror.follow(sample))
-        .count();
-    assert_eq!(n_new as u64, steps);
-    assert!(steps >= 20, "{steps}");
+}
+
+/// Flies a lively world of four robots by agents that hold some each; returns the paths by step, and the reward.
+fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
+    const N_STEPS: usize = 40;
+    let server = Server::start(
+        "--model wildfire-small --height 16 --width 14 --moves 8 --burn-in 300 --robots 4",
+    );
+    // Holds the world until each robot has its agent.
+    let _holder = server.acquire(0..4);
+    let frames = Observer::frames(&server.instance).expect("the channel");
+    let start = |robots: &Range<u32>| {
+        let robots = if company == "--team" {
+            format!("--robots {}..{}", robots.start, robots.end)
+        } else {
+            format!("--robot {}", robots.start)
+        };
+        let flags = format!("--steps {N_STEPS} --policy beam_exploit --takeover {company}");
+        Program::agent(&server.instance, &format!("{robots} {flags}"))
+    };
+    let agents: Vec<_> = parts.iter().map(start).collect();
+    agents.into_iter().for_each(|agent| drop(agent.ends(0)));
+    let (mut paths, mut reward) = (Vec::new(), 0.0);
+    for sample in frames_until(&frames, 0, N_STEPS as u64) {
+        if sample.header.result.step > paths.len() as u64 {
+            let robots = robots_of(&sample).into_iter();
+            paths.push(robots.map(|robot| robot.path.to_vec()).collect());
+            reward += sample.header.result.reward;
+        }
+    }
+    assert_eq!(paths.len(), N_STEPS);
+    (paths, reward)
+}
+
+#[test]
+fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
+    let single = [0..1, 1..2, 2..3, 3..4];
+    let all = 0..4;
+    let together = flown_by(std::slice::from_ref(&all), "--team");
+    assert_eq!(flown_by(&single, "--team"), together);
+    assert_eq!(flown_by(&[0..1, 1..4], "--team"), together);
+    // One that plans for itself flies where others fly too.
+    let (_, alone) = flown_by(&single, "");
+    assert!(together.1 > 1.2 * alone, "{} and {alone}", together.1);
+    flown_by(&single, "--share");
+    let server = Server::start(&format!("{FLAGS} --publish-truth"));
+    let check = |flags: &str, words: &str| check(AGENT, &format!("{flags} {}", on(&server)), words);
+    let robots = "expected some of the world's 0..4, got";
+    check("run --robot 4", &format!("{robots} 4..5"));
+    check("run --robots 2..6 --team", &format!("{robots} 2..6"));
+    check(
+        "compare --robots 2",
+        "expected the running server's 4, got 2",
+    );
 }

@@ -1,20 +1,23 @@
 //! Trainings, each in a folder of its own.
 
-use crate::commands::agent;
+use crate::commands::{agent, check};
+use emberwatch_learning::checkpoint::{self, Contents};
 use std::path::PathBuf;
-use tempfile::TempDir;
-use tests::harness::Ended;
+use tests::harness::{AGENT, Ended, Folder, Server};
+
+/// A private server with small worlds.
+pub const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
 
 /// A folder with settings, in which trainings write into folders of theirs.
 pub struct Place {
-    folder: TempDir,
+    pub folder: Folder,
     /// Columns of the metrics.
     header: &'static str,
 }
 
 impl Place {
     pub fn new(settings: &str, header: &'static str) -> Self {
-        let folder = TempDir::new().expect("a folder");
+        let folder = Folder::default();
         let place = Self { folder, header };
         place.set(settings);
         place
@@ -22,26 +25,48 @@ impl Place {
 
     /// Writes other settings.
     pub fn set(&self, settings: &str) {
-        std::fs::write(self.path("agent.toml"), settings).expect("settings");
-    }
-
-    pub fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
+        self.folder.write("agent.toml", settings);
     }
 
     pub fn checkpoint(&self, out: &str) -> PathBuf {
-        self.path(out).join("checkpoint.safetensors")
+        self.folder.path(out).join("checkpoint.safetensors")
+    }
+
+    /// The flag that names a checkpoint.
+    pub fn flag(&self, out: &str) -> String {
+        format!("--checkpoint {}", self.checkpoint(out).display())
+    }
+
+    pub fn bytes(&self, out: &str) -> Vec<u8> {
+        std::fs::read(self.checkpoint(out)).expect("a checkpoint")
+    }
+
+    pub fn contents(&self, out: &str) -> Contents {
+        checkpoint::read(&self.checkpoint(out))
+            .expect("a checkpoint")
+            .1
     }
 
     /// The command's words for training into a folder.
     pub fn words(&self, out: &str, flags: &str) -> String {
-        let (config, out) = (self.path("agent.toml"), self.path(out));
-        let (config, out) = (config.display(), out.display());
+        let [config, out] = ["agent.toml", out].map(|name| self.folder.word(name));
         format!("train --config {config} --out {out} {flags}")
     }
 
     pub fn train(&self, out: &str, flags: &str) -> Ended {
         agent(&self.words(out, flags))
+    }
+
+    pub fn refuse(&self, out: &str, flags: &str, words: &str) {
+        check(AGENT, &self.words(out, flags), words);
+    }
+
+    /// Each line of the table has flags, ` => ` and words of the refusal.
+    pub fn refuse_all(&self, out: &str, flags: &str, table: &str) {
+        for line in table.lines() {
+            let (more, words) = line.split_once(" => ").expect("flags and words");
+            self.refuse(out, &format!("{flags} {more}"), words);
+        }
     }
 
     /// Trains, and returns the rows of the metrics.
@@ -52,11 +77,24 @@ impl Place {
 
     /// The rows of the metrics.
     pub fn rows(&self, out: &str) -> Vec<Vec<String>> {
-        let text =
-            std::fs::read_to_string(self.path(out).join("metrics.csv")).expect("the metrics");
+        let text = self.folder.text(&format!("{out}/metrics.csv"));
         let mut lines = text.lines();
         assert_eq!(lines.next(), Some(self.header));
         let rows = lines.map(|line| line.split(',').map(String::from).collect());
         rows.collect()
     }
+
+    /// The policies that a comparison of small worlds prints, with a checkpoint.
+    pub fn compare(&self, out: &str, flags: &str) -> Ended {
+        agent(&format!("compare {COMPARED} {} {flags}", self.flag(out)))
+    }
+}
+
+/// Worlds of a comparison or an evaluation of a moment.
+pub const COMPARED: &str = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
+                            --beam-width 4 --shooting-samples 16";
+
+/// The flag that names a server.
+pub fn on(server: &Server) -> String {
+    format!("--instance {}", server.instance.name())
 }

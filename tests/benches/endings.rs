@@ -1,20 +1,13 @@
 //! How soon the death of a process is noticed: `cargo bench -p tests --bench endings`.
 //!
-//! Peer: this process's own notice of the same death, by a pidfd. Then, how much of a replay at full speed
-//! reaches an observer that reads.
+//! Peer: this process's own notice of the same death, by a pidfd.
 
 use emberwatch_protocol::control::Request;
-use emberwatch_protocol::observer::Observer;
-use emberwatch_protocol::recording::Reader;
 use emberwatch_protocol::wait::sleep_until_readable;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open};
-use std::fs::File;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
-use tempfile::TempDir;
-use tests::harness::{
-    AGENT, PATIENCE, Program, SERVER, SMALL, Server, eventually, new_instance, run,
-};
+use tests::harness::{PATIENCE, Program, SMALL, Server, eventually};
 use tests::report::{quantiles, say};
 use tests::wire::acquire_request;
 
@@ -23,7 +16,6 @@ const N_ROUNDS: usize = 30;
 fn main() {
     report("a killed agent's world is acquired", killed_agent);
     report("a client waits on a killed server", killed_server);
-    report_replay();
 }
 
 /// Prints the median and the longest time, and their ratio to the peer's median.
@@ -76,45 +68,4 @@ fn killed_server() -> (Duration, Duration) {
         let answer = connection.control(&Request::Status {}, PATIENCE);
         assert!(answer.is_err(), "{answer:?}");
     })
-}
-
-fn report_replay() {
-    let folder = TempDir::new().expect("a folder");
-    let path = folder.path().join("bench.recording");
-    let file = path.to_str().expect("a plain path");
-    record(file);
-    let mut reader = Reader::new(File::open(&path).expect("the file")).expect("a recording");
-    reader
-        .by_ref()
-        .for_each(|record| drop(record.expect("whole")));
-    let n_frames = reader.totals().n_frames;
-    let instance = new_instance();
-    let observer = Observer::frames(&instance).expect("observe");
-    let flags = format!("replay {file} --instance {} --speed max", instance.name());
-    let mut replay = Program::start(SERVER, &flags);
-    let (began, mut n_read) = (Instant::now(), 0);
-    let mut last = began;
-    // It stays a few seconds for those who read.
-    while !replay.has_ended() {
-        while observer.try_receive().expect("receive").is_some() {
-            (n_read, last) = (n_read + 1, Instant::now());
-        }
-        std::thread::sleep(Duration::from_micros(500));
-    }
-    say(&format!(
-        "replay at full speed: an observer reads {:.1} % of {n_frames} frames in {:.2} s",
-        100.0 * n_read as f64 / n_frames as f64,
-        (last - began).as_secs_f64()
-    ));
-}
-
-fn record(file: &str) {
-    let server = Server::start(SMALL);
-    let name = server.instance.name();
-    let recorder = Program::start(SERVER, &format!("record --instance {name} --out {file}"));
-    recorder.wait_for_words("recording");
-    let flags = format!("run --instance {name} --policy random_walk --steps 20000");
-    run(AGENT, &flags).check(0);
-    recorder.signal(Signal::INT);
-    recorder.ends(0);
 }

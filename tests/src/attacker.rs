@@ -13,7 +13,7 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// A control request of each kind but shutdown and takeover, which every client may do.
+/// A control request of each kind but shutdown, takeover and files, which every client may do.
 const TEMPLATES: [&str; 8] = [
     r#"{"op":"hello","protocol":2,"client":"x"}"#,
     r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
@@ -45,7 +45,7 @@ impl Attacker {
         Self {
             wire,
             rng: ChaCha8Rng::seed_from_u64(seed),
-            leases: vec![0, 1, own, own, own, stolen, u64::MAX],
+            leases: vec![0, own, own, own, stolen, u64::MAX],
             k: 0,
             n_refused: 0,
             n_accepted: 0,
@@ -71,7 +71,22 @@ impl Attacker {
 
     /// Returns the status, if it waits for the answer.
     fn strike_step(&mut self) -> Option<u32> {
-        let (header, payload) = (self.step_request(), self.step_payload());
+        let header = StepRequest {
+            version: self.number(VERSION),
+            operation: self.number(1),
+            lease: *self.leases.choose(&mut self.rng)?,
+            sequence: self.rng.random(),
+            first_robot: self.number(1),
+            n_robots: self.number(1),
+            n_moves: self.number(6),
+            flags: self.number(0),
+            listener_low: self.rng.random(),
+            listener_high: self.rng.random(),
+        };
+        let payload = match self.rng.random_range(0..4) {
+            0 => self.bytes(300),
+            _ => step_body(&[self.k], &[(self.k % 4) as u8; 6]),
+        };
         let pending = self.wire.send_step(header, &payload).expect("send");
         if self.rng.random_ratio(1, 8) {
             return None;
@@ -97,7 +112,17 @@ impl Attacker {
             listener_low: self.rng.random(),
             listener_high: self.rng.random(),
         };
-        let text = self.control_text();
+        let lease = self.leases.choose(&mut self.rng)?.to_string();
+        let text = TEMPLATES.choose(&mut self.rng)?;
+        let mut text = text.replace("LEASE", &lease).into_bytes();
+        for _ in 0..self.rng.random_range(0..3) {
+            let at = self.rng.random_range(0..text.len());
+            match self.rng.random_range(0..3) {
+                0 => text[at] = self.rng.random(),
+                1 => text.truncate(at.max(1)),
+                _ => text.insert(at, b"0123456789{}[]\",:-"[self.rng.random_range(0..18)]),
+            }
+        }
         let pending = self.wire.send_control(header, &text).expect("send");
         if self.rng.random_ratio(1, 8) {
             return None;
@@ -106,25 +131,10 @@ impl Attacker {
         assert_eq!(reply.sequence, header.sequence);
         let parsed: Reply = serde_json::from_slice(&payload).expect("a reply");
         if let Reply::Lease(lease) = &parsed {
-            self.leases[2..5].fill(lease.lease);
+            self.leases[1..4].fill(lease.lease);
         }
         assert_eq!(parsed.status() as u32, reply.status);
         Some(reply.status)
-    }
-
-    fn step_request(&mut self) -> StepRequest {
-        StepRequest {
-            version: self.number(VERSION),
-            operation: self.number(1),
-            lease: *self.leases.choose(&mut self.rng).expect("leases"),
-            sequence: self.rng.random(),
-            first_robot: self.number(1),
-            n_robots: self.number(1),
-            n_moves: self.number(6),
-            flags: self.number(0),
-            listener_low: self.rng.random(),
-            listener_high: self.rng.random(),
-        }
     }
 
     /// Mostly the right number; else one that is near, huge or random.
@@ -138,39 +148,6 @@ impl Attacker {
             5 => FLAG_TEAM_FRAMES,
             _ => right,
         }
-    }
-
-    fn step_payload(&mut self) -> Vec<u8> {
-        match self.rng.random_range(0..4) {
-            0 => self.bytes(300),
-            1 => Vec::new(),
-            _ => {
-                let path: Vec<u8> = (0..6).map(|_| self.rng.random_range(0..4)).collect();
-                step_body(&[self.k], &path)
-            }
-        }
-    }
-
-    fn control_text(&mut self) -> Vec<u8> {
-        if self.rng.random_ratio(1, 4) {
-            return self.bytes(200);
-        }
-        let lease = self
-            .leases
-            .choose(&mut self.rng)
-            .expect("leases")
-            .to_string();
-        let template = TEMPLATES.choose(&mut self.rng).expect("templates");
-        let mut text = template.replace("LEASE", &lease).into_bytes();
-        for _ in 0..self.rng.random_range(0..4) {
-            let at = self.rng.random_range(0..text.len());
-            match self.rng.random_range(0..3) {
-                0 => text[at] = self.rng.random(),
-                1 => text.truncate(at.max(1)),
-                _ => text.insert(at, b"0123456789{}[]\",:-"[self.rng.random_range(0..18)]),
-            }
-        }
-        text
     }
 
     fn bytes(&mut self, most: usize) -> Vec<u8> {

@@ -7,9 +7,132 @@ mod besieged;
 mod files;
 mod messages;
 mod requests;
-mod target;
-mod targets;
 mod worlds;
 
-pub use target::{Seed, Target};
-pub use targets::{TARGETS, decode, named};
+use std::path::{Path, PathBuf};
+
+/// A file of a corpus: name and bytes.
+pub type Seed = (&'static str, Vec<u8>);
+
+/// A decoder under attack.
+#[derive(Debug, Clone, Copy)]
+pub struct Target {
+    /// Also its folder in the corpus, and its program in `fuzz/`.
+    pub name: &'static str,
+    /// Decodes bytes and panics if something is wrong with the decoder; returns whether they were accepted.
+    pub body: fn(&[u8]) -> bool,
+    /// What the code makes of the corpus. Texts lie there as they were written.
+    pub seeds: fn() -> Vec<Seed>,
+}
+
+/// All of them.
+pub const TARGETS: [Target; 11] = [
+    target("step_request", requests::step, requests::step_seeds),
+    target("control_request", requests::control, Vec::new),
+    target(
+        "step_answer",
+        messages::step_answer,
+        messages::step_answer_seeds,
+    ),
+    target("frame", messages::frame, messages::frame_seeds),
+    target("outlook", messages::outlook, messages::outlook_seeds),
+    target("control_reply", messages::control_reply, Vec::new),
+    target("model", files::model, Vec::new),
+    target("checkpoint", files::checkpoint, files::checkpoint_seeds),
+    target("states", worlds::states, worlds::states_seeds),
+    target("snapshot", worlds::snapshot, worlds::snapshot_seeds),
+    target("recording", worlds::recording, worlds::recording_seeds),
+];
+
+const fn target(name: &'static str, body: fn(&[u8]) -> bool, seeds: fn() -> Vec<Seed>) -> Target {
+    Target { name, body, seeds }
+}
+
+/// Decodes bytes as a target of a name does.
+///
+/// # Panics
+/// If something is wrong with its decoder, or there is no such target.
+pub fn decode(name: &str, bytes: &[u8]) -> bool {
+    let target = TARGETS.iter().find(|target| target.name == name);
+    (target.expect("a target of this name").body)(bytes)
+}
+
+impl Target {
+    /// Its folder in the corpus.
+    pub fn folder(&self) -> PathBuf {
+        let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus");
+        corpus.join(self.name)
+    }
+
+    /// The files of its corpus, in the order of their names.
+    pub fn corpus(&self) -> std::io::Result<Vec<Vec<u8>>> {
+        let entries = std::fs::read_dir(self.folder())?;
+        let paths = entries.map(|entry| Ok(entry?.path()));
+        let mut paths = paths.collect::<std::io::Result<Vec<PathBuf>>>()?;
+        paths.sort();
+        paths.iter().map(std::fs::read).collect()
+    }
+
+    /// Writes its seeds into its corpus.
+    pub fn write_seeds(&self) -> std::io::Result<()> {
+        std::fs::create_dir_all(self.folder())?;
+        let mut seeds = (self.seeds)().into_iter();
+        seeds.try_for_each(|(name, bytes)| std::fs::write(self.folder().join(name), bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberwatch_protocol::Model;
+    use emberwatch_protocol::control::{Reply, Request, parse};
+
+    #[test]
+    fn every_target_has_a_program_and_the_seeds_of_this_release() {
+        let programs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/fuzz_targets");
+        for target in TARGETS {
+            for (name, bytes) in (target.seeds)() {
+                let path = target.folder().join(name);
+                let is_kept = std::fs::read(&path).is_ok_and(|kept| kept == bytes);
+                assert!(
+                    is_kept,
+                    "{path:?}: run `cargo run -p tests --example corpus`"
+                );
+            }
+            let program = std::fs::read_to_string(programs.join(format!("{}.rs", target.name)));
+            let program = program.expect("a program of libFuzzer");
+            assert!(program.contains(&format!("{:?}", target.name)), "{program}");
+        }
+        let n_programs = std::fs::read_dir(programs).expect("the programs").count();
+        assert_eq!(n_programs, TARGETS.len());
+    }
+
+    #[test]
+    fn the_texts_of_the_corpus_are_of_this_release() {
+        let reply: fn(&str) -> bool = |text| parse::<Reply>(text.as_bytes()).is_ok();
+        let model: fn(&str) -> bool = |text| Model::from_toml(text).is_ok();
+        // Behind the byte that says what happened before.
+        let request: fn(&str) -> bool =
+            |text| parse::<Request>(text[1..].replace("LEASE", "1").as_bytes()).is_ok();
+        for (folder, names, is_read) in [
+            ("control_reply", "hello land lease status error", reply),
+            (
+                "model",
+                "burnout.toml land.toml line.toml sparse.toml wildfire.toml",
+                model,
+            ),
+            (
+                "control_request",
+                "acquire belief fork hello leave_belief release renew reset reset_none \
+                 restore shutdown snapshot status takeover",
+                request,
+            ),
+        ] {
+            for name in names.split(' ') {
+                let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus");
+                let text = std::fs::read_to_string(corpus.join(folder).join(name)).expect(name);
+                assert!(is_read(&text), "{folder}/{name}: {text}");
+            }
+        }
+    }
+}

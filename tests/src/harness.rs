@@ -2,7 +2,7 @@
 
 use crate::wire::observe_header;
 use emberwatch_protocol::backend::Backend;
-use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::channels::{Instance, channel_directory};
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
@@ -18,13 +18,14 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 pub use crate::programs::{
-    AGENT, Ended, LIMIT, PATIENCE, Program, SERVER, eventually, program_path, python, repository,
-    run,
+    AGENT, Ended, Folder, LIMIT, PATIENCE, Program, SERVER, eventually, program_path, python,
+    repository, run,
 };
 
 /// How long a server that has just begun may take to answer, before it is asked again.
@@ -179,6 +180,28 @@ pub fn new_instance() -> Instance {
     Instance::new(&name).expect("a plain name")
 }
 
+/// What a server of one world of 2 x 3 cells says of itself in a recording.
+pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
+    let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
+        "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
+        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
+    let info = serde_json::from_str(text).expect("what a server says");
+    ServerInfo {
+        n_moves,
+        n_robots,
+        ..info
+    }
+}
+
+/// The files of an instance's services.
+pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
+    let files = std::fs::read_dir(channel_directory().join("services"));
+    let files = files.expect("services").flatten().map(|entry| entry.path());
+    let name = format!("emberwatch/v2/{}/", instance.name());
+    let text = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
+    files.filter(|path| text(path).contains(&name)).collect()
+}
+
 /// What snapshots of a server as a [`SMALL`] one say of it, and the rules of its worlds.
 pub fn small_spec(burn_in: u64) -> WorldSpec {
     let config = ServerConfig {
@@ -235,6 +258,14 @@ pub fn reset(client: &mut Client, first_seed: u64) {
 pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
     let robots = client.robots();
     client.step(robots, &[path]).expect("step").remove(0)
+}
+
+/// Flies so many random paths with a client's only robot.
+pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation> {
+    let paths = Paths::new(seed)
+        .take(client.info().n_moves, n_steps)
+        .into_iter();
+    paths.map(|path| fly(client, path)).collect()
 }
 
 /// The robots of a published step.

@@ -5,7 +5,6 @@
 pub mod attacker;
 pub mod fuzz;
 pub mod harness;
-pub mod kills;
 pub mod meter;
 pub mod mirror;
 mod programs;

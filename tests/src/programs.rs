@@ -23,6 +23,40 @@ pub struct Program {
     folder: TempDir,
 }
 
+/// A folder of a test's own, which is removed with it.
+pub struct Folder(TempDir);
+
+impl Default for Folder {
+    fn default() -> Self {
+        Self(TempDir::new().expect("a folder"))
+    }
+}
+
+impl Folder {
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// A file's path as a word of a command.
+    pub fn word(&self, name: &str) -> String {
+        self.path(name).display().to_string()
+    }
+
+    /// Writes a file; returns its path as a word of a command.
+    pub fn write(&self, name: &str, contents: impl AsRef<[u8]>) -> String {
+        std::fs::write(self.path(name), contents).expect("write a file");
+        self.word(name)
+    }
+
+    pub fn bytes(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.path(name)).expect("read a file")
+    }
+
+    pub fn text(&self, name: &str) -> String {
+        String::from_utf8(self.bytes(name)).expect("text")
+    }
+}
+
 #[derive(Debug)]
 pub struct Ended {
     /// Its exit code; `None` if a signal ended it.

@@ -18,7 +18,6 @@ use iceoryx2::port::client::{Client, RequestSendError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::AllocationStrategy;
 use std::convert::Infallible;
-use std::fmt::Debug;
 use std::ops::Range;
 use std::time::Duration;
 
@@ -199,25 +198,15 @@ pub fn answer<Q: Header, R: Header>(
     pending: &Pending<Q, R>,
     limit: Duration,
 ) -> Option<(R, Vec<u8>)> {
-    let block = |remaining: Duration| {
-        std::thread::sleep(remaining.min(Duration::from_micros(100)));
-        Ok::<_, Infallible>(())
-    };
-    answer_by(pending, limit, &Waiter::default(), block)
-}
-
-/// The same, where something else may tell of the answer.
-pub fn answer_by<Q: Header, R: Header, E: Debug>(
-    pending: &Pending<Q, R>,
-    limit: Duration,
-    waiter: &Waiter,
-    block: impl FnMut(Duration) -> Result<(), E>,
-) -> Option<(R, Vec<u8>)> {
     let poll = || {
         let response = pending.receive().expect("receive an answer");
         Ok(response.map(|response| (response.user_header().0, response.payload().to_vec())))
     };
-    waiter.wait(limit, poll, block).expect("wait")
+    let block = |remaining: Duration| {
+        std::thread::sleep(remaining.min(Duration::from_micros(100)));
+        Ok::<_, Infallible>(())
+    };
+    Waiter::default().wait(limit, poll, block).expect("wait")
 }
 
 /// A port of a service; nobody is greeted.

@@ -36,6 +36,7 @@ impl Audience {
         dashboard.until(|| dashboard.stdout().contains('\n'));
         let url = dashboard.stdout();
         let profile = TempDir::new().expect("a folder for the browser");
+        let began = Instant::now();
         let browser = with_browser.then(|| {
             let flags = [
                 "--headless=new",
@@ -49,11 +50,10 @@ impl Audience {
             ];
             Program::start_at("chromium".as_ref(), &flags)
         });
-        std::thread::sleep(std::time::Duration::from_secs(3));
         Self {
             dashboard,
             browser,
-            began: Instant::now(),
+            began,
             _profile: profile,
         }
     }
@@ -62,7 +62,7 @@ impl Audience {
 impl Drop for Audience {
     fn drop(&mut self) {
         let pid = self.dashboard.pid();
-        let share = processor_seconds(pid) / (self.began.elapsed().as_secs_f64() + 3.0);
+        let share = processor_seconds(pid) / self.began.elapsed().as_secs_f64();
         let drawn = if self.browser.is_some() {
             "drawn"
         } else {

@@ -53,7 +53,6 @@ where
 fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let server = Server::start(flags);
     let _audience = attend(&server);
-    std::thread::sleep(Duration::from_millis(500));
     let mut stepper = Stepper::new(server.connect(), 0..1);
     let info = stepper.connection.info().clone();
     let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
@@ -96,8 +95,9 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
 
 fn start(server: &Server, is_stopped: bool) -> Program {
     let program = std::env::current_exe().expect("this program");
+    let before = server.status().n_observers;
     let observer = Program::start_at(&program, &["observe", server.instance.name()]);
-    std::thread::sleep(Duration::from_millis(50));
+    observer.until(|| server.status().n_observers > before);
     if is_stopped {
         observer.signal(Signal::STOP);
     }

@@ -50,12 +50,13 @@ pub fn soak(seconds: u64, folder: &Path) {
     let tenth = &rows[rows.len() / 10];
     say(&format!("after a tenth: {}", tenth.1));
     drop(guests);
-    std::thread::sleep(Duration::from_secs(5)); // The cleaner looks each two.
-    rows.push((
+    server.program.until(|| server.status().n_clients == 1);
+    let end = (
         started.elapsed().as_secs_f64(),
         Use::of(server.program.pid()),
-    ));
-    say(&format!("at the end:    {}", rows[rows.len() - 1].1));
+    );
+    rows.push(end);
+    say(&format!("at the end:    {}", end.1));
     write(folder, &rows);
 }
 

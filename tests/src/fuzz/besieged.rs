@@ -16,27 +16,21 @@ use emberwatch_sim::results::{robot_result, world_result};
 use emberwatch_sim::simulator::{
     ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
 };
-use emberwatch_sim::world::Episode;
+use emberwatch_sim::world::{Episode, Robot};
 use rayon::ThreadPoolBuilder;
 use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
-/// Moves of a path.
+
 pub const N_MOVES: usize = 4;
-
-/// Robots of a world.
 pub const N_ROBOTS: usize = 2;
-
-/// Worlds: the attackers' two, the shared one, the victim's.
+/// The attackers' two, the shared one, the victim's.
 pub const N_WORLDS: u32 = 4;
-
 /// The shared world: its first robot is the attacker's, its second the victim's.
 pub const SHARED: usize = 2;
-
 /// The victim's world.
 const HOME: usize = 3;
-
 /// Robots that are the attackers', from 0 on.
 pub const N_THEIRS: u32 = (SHARED * N_ROBOTS + 1) as u32;
 
@@ -106,25 +100,18 @@ impl Siege {
             coverage: CoverageRule::Client,
             ..ServerConfig::default()
         };
-        let threads = ThreadPoolBuilder::new()
-            .num_threads(1)
-            .build()
-            .expect("a thread");
-        let mut token = 10;
-        let next_token = Box::new(move || {
-            token += 1;
-            token
-        });
+        let threads = ThreadPoolBuilder::new().num_threads(1).build();
+        let mut tokens = 11..;
+        let next_token = Box::new(move || tokens.next().expect("numbers"));
         let checked = config.check().expect("valid settings");
-        let (simulator, jobs) =
-            Simulator::new(checked, threads, next_token).expect("valid settings");
-        let (now, pending) = (Instant::now(), Vec::new());
+        let simulator = Simulator::new(checked, threads.expect("a thread"), next_token);
+        let (simulator, jobs) = simulator.expect("valid settings");
         let mirror = Episode::new(&simulator.spec().rules, SHARED as u64);
         let mut siege = Self {
             simulator,
-            now,
+            now: Instant::now(),
             jobs,
-            pending,
+            pending: Vec::new(),
             leases: [0; 4],
             attackers_step: None,
             shared_step: None,
@@ -137,9 +124,8 @@ impl Siege {
             (3, SHARER, N_THEIRS as usize, 1),
             (1, ATTACKERS[0], 0, N_THEIRS as usize),
         ] {
-            let text = format!(
-                r#"{{"op":"acquire","first_robot":{first_robot},"n_robots":{n_robots},"ttl_millis":86400000}}"#
-            );
+            let robots = format!(r#""first_robot":{first_robot},"n_robots":{n_robots}"#);
+            let text = format!(r#"{{"op":"acquire",{robots},"ttl_millis":86400000}}"#);
             let Outcome::Pending(_, pending) = siege.ask(client, VERSION, text.as_bytes()) else {
                 panic!("the robots are free");
             };
@@ -212,9 +198,8 @@ impl Siege {
         let request = step_request(self.leases[0], robots);
         let paths = [0, 1, 2, 3, 4, 5, 6, 7].map(|turn| ((number * 7 + turn * 5) % 4) as u8);
         let (body, mut payload) = (step_body(&[number as u64], &paths), Vec::new());
-        let stepped = self
-            .simulator
-            .step(self.now, VICTIM, &request, &body, &mut payload);
+        let simulator = &mut self.simulator;
+        let stepped = simulator.step(self.now, VICTIM, &request, &body, &mut payload);
         let Stepped::Reply(reply) = stepped else {
             panic!("the victim holds all robots of its world");
         };
@@ -233,11 +218,8 @@ impl Siege {
             .collect();
         let request = step_request(self.leases[3], N_THEIRS..N_THEIRS + 1);
         let body = step_body(&[k], &path);
-        let mut payload = Vec::new();
-        let stepped = self
-            .simulator
-            .step(self.now, SHARER, &request, &body, &mut payload);
-        match stepped {
+        let (simulator, mut payload) = (&mut self.simulator, Vec::new());
+        match simulator.step(self.now, SHARER, &request, &body, &mut payload) {
             Stepped::Waits(ticket) => self.shared_step = Some((ticket, path)),
             Stepped::Reply(reply) => {
                 assert_eq!(check_answer(&reply, &payload), Status::Ok);
@@ -296,13 +278,11 @@ impl Siege {
 }
 
 fn seen(episode: &Episode) -> WorldSeen {
-    let robots = episode.robots().iter();
-    let robots = robots.map(|robot| {
-        (
-            robot_result(robot.outcome()),
-            robot.frame().as_bytes().to_vec(),
-        )
-    });
+    let seen = |robot: &Robot| {
+        let frame = robot.frame().as_bytes().to_vec();
+        (robot_result(robot.outcome()), frame)
+    };
+    let robots = episode.robots().iter().map(seen);
     (world_result(episode.outcome()), robots.collect())
 }
 

@@ -1,6 +1,6 @@
 //! What the programs read from files: models, checkpoints.
 
-use super::target::Seed;
+use super::Seed;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_learning::beliefs::LEARNED;
@@ -62,10 +62,7 @@ fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<
         });
         transition.apply(&belief, &mut next);
         let sums = next.sum_axis(Axis(0));
-        assert!(
-            sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
-            "beliefs sum to {sums}"
-        );
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
         assert!(next.iter().all(|p| (0.0..=1.001).contains(p)), "{next}");
     }
 }
@@ -88,15 +85,11 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     for step in 0..N_STEPS {
         dynamics.step(1, step, &mut states);
     }
-    assert!(
-        states
-            .iter()
-            .all(|state| usize::from(*state) < model.n_states())
-    );
-    let reward: f64 = states
+    // Panics where there is no such state.
+    let rewards = states
         .iter()
-        .map(|state| model.reward()[usize::from(*state)])
-        .sum();
+        .map(|state| model.reward()[usize::from(*state)]);
+    let reward: f64 = rewards.sum();
     assert!(reward.is_finite(), "the reward sums to {reward}");
 }
 
@@ -121,10 +114,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let likelihood = filter.tables.likelihood_array();
         let n_matrices = filter.tables.dimensions.n_matrices as f64;
         let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
-        assert!(
-            sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
-            "likelihoods sum to {sums}"
-        );
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
         // That of decisions is no learner's.
         if learners::filter::FILTER.checkpoints.contains(&&*kind) {
             learn(&contents, filter.tables.dimensions.sees_own_state);
@@ -203,33 +193,22 @@ fn dqn() -> Dqn {
 }
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
-    let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
-    let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));
-    vec![
-        (
-            "filter",
-            encoded("learned_filter", filter(dimensions(false))),
-        ),
-        (
-            "own_filter",
-            encoded("learned_own_filter", filter(dimensions(true))),
-        ),
-        ("autoencoder", encoded("autoencoder", small)),
-        (
-            "filter_of_rings",
-            encoded("learned_filter", filter(of_rings())),
-        ),
-        // Asked for 30 GiB once.
-        ("autoencoder_large", encoded("autoencoder", large)),
-        ("decisions", encoded("decisions", decisions())),
-    ]
-}
-
-fn of_rings() -> Dimensions {
-    Dimensions {
+    let encoded = |kind, contents: Contents| encode(kind, &contents).expect("they serialise");
+    let of_rings = Dimensions {
         n_matrices: 2,
         ..dimensions(false)
-    }
+    };
+    // The large autoencoder asked for 30 GiB once.
+    [
+        ("filter", "learned_filter", filter(dimensions(false))),
+        ("own_filter", "learned_own_filter", filter(dimensions(true))),
+        ("filter_of_rings", "learned_filter", filter(of_rings)),
+        ("autoencoder", "autoencoder", autoencoder(8, 4)),
+        ("autoencoder_large", "autoencoder", autoencoder(4096, 256)),
+        ("decisions", "decisions", decisions()),
+    ]
+    .map(|(name, kind, contents)| (name, encoded(kind, contents)))
+    .into()
 }
 
 /// A learner that has seen some frames.

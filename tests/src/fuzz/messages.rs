@@ -1,6 +1,6 @@
 //! What a client, an observer or a learner reads: answers, frames, replies.
 
-use super::target::Seed;
+use super::Seed;
 use bytemuck::{Pod, bytes_of};
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
 use emberwatch_protocol::control::{Reply, parse};
@@ -144,24 +144,12 @@ pub fn step_answer_seeds() -> Vec<Seed> {
         width: 3,
         ..StepReply::default()
     };
-    let team = StepReply {
-        flags: FLAG_TEAM_FRAMES,
-        ..header
-    };
-    let world = WorldResult {
-        step: 1,
-        reward: 2.0,
-        late: 2,
-        ..WorldResult::default()
-    };
+    let (mut team, mut refusal, mut world) = (header, header, WorldResult::default());
+    team.flags = FLAG_TEAM_FRAMES;
+    (world.step, world.reward, world.late) = (1, 2.0, 2);
     let results = [bytes_of(&world), bytes_of(&flew(4)), bytes_of(&flew(0))].concat();
-    let refusal = StepReply {
-        status: Status::NoLease as u32,
-        n_worlds: 0,
-        n_robots: 0,
-        detail: 1,
-        ..header
-    };
+    (refusal.status, refusal.detail) = (Status::NoLease as u32, 1);
+    (refusal.n_worlds, refusal.n_robots) = (0, 0);
     let answer = |header: &StepReply, frames: &[u8]| [bytes_of(header), &results, frames].concat();
     vec![
         ("two_robots", answer(&header, &[0, 255, 2, 255, 255, 255])),
@@ -194,14 +182,8 @@ pub fn frame_seeds() -> Vec<Seed> {
         [bytes_of(header), bytemuck::cast_slice(&robots), behind].concat()
     };
     let reset = sample(&header, [0, 0], &[unseen, unseen].concat());
-    header.result.step = 1;
-    header.result.hovered = 1;
-    let seen = [
-        [255; 6].as_slice(),
-        &[255, 1, 2, 0, 255, 255],
-        &[3, 3, 1, 0],
-    ]
-    .concat();
+    (header.result.step, header.result.hovered) = (1, 1);
+    let seen = [&unseen[..], &[255, 1, 2, 0, 255, 255], &[3, 3, 1, 0]].concat();
     let step = sample(&header, [0, 4], &seen);
     vec![("step", step), ("reset", reset)]
 }

@@ -1,11 +1,11 @@
 //! What the server reads: requests of attackers.
 
+use super::Seed;
 use super::besieged::{
     ATTACKERS, N_MOVES, N_ROBOTS, N_THEIRS, N_WORLDS, SHARED, Siege, WorldSeen, check_answer,
     on_siege, step_request,
 };
 use super::messages::{split_header, survives};
-use super::target::Seed;
 use crate::wire::step_body;
 use bytemuck::bytes_of;
 use emberwatch_protocol::control::{Reply, Request, parse};
@@ -57,25 +57,23 @@ impl Siege {
             return false;
         }
         let robots = request.first_robot as usize..(request.first_robot + reply.n_robots) as usize;
-        let stepped = if request.operation == Operation::Step as u32 {
-            self.simulator.worlds_of(&robots)
+        let is_step = request.operation == Operation::Step as u32;
+        let mut stepped = self.simulator.worlds_of(&robots);
+        if is_step {
+            assert!(
+                robots.end <= N_THEIRS as usize,
+                "a step with the victim's robot"
+            );
+            assert_eq!(request.lease, self.leases[1], "a step without a lease");
         } else {
-            0..0
-        };
-        assert!(
-            stepped.is_empty() || robots.end <= N_THEIRS as usize,
-            "a step with the victim's robot"
-        );
-        assert!(
-            stepped.is_empty() || request.lease == self.leases[1],
-            "a step without a lease"
-        );
+            stepped = 0..0;
+        }
+        let k = |seen: &Option<WorldSeen>| seen.as_ref().map(|(result, _)| result.step);
         for (world, (before, after)) in before.iter().zip(&after).enumerate() {
-            let k = |seen: &Option<WorldSeen>| seen.as_ref().map(|(result, _)| result.step);
             if stepped.contains(&world) {
-                assert_eq!(k(after), k(before).map(|k| k + 1))
+                assert_eq!(k(after), k(before).map(|k| k + 1));
             } else {
-                assert!(before == after, "world {world} changed")
+                assert!(before == after, "world {world} changed");
             }
         }
         true
@@ -175,11 +173,8 @@ impl Siege {
     /// Keeps what a client waits for in place of what it waited for before: one request at a time.
     fn wait_for(&mut self, who: usize, pending: PendingReply) {
         let client = ATTACKERS[who];
-        let given_up = self
-            .pending
-            .iter()
-            .position(|(waiting, _)| *waiting == client);
-        if let Some(index) = given_up {
+        let mut waiting = self.pending.iter();
+        if let Some(index) = waiting.position(|(other, _)| *other == client) {
             let (_, given_up) = self.pending.swap_remove(index);
             self.simulator.cancel_reply(self.now, &given_up);
         }
@@ -189,13 +184,11 @@ impl Siege {
 
 /// A text with the lease in its place.
 fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
-    match text
-        .windows(LEASE.len())
-        .position(|word| word == LEASE.as_bytes())
-    {
-        Some(at) => [&text[..at], lease.as_bytes(), &text[at + LEASE.len()..]].concat(),
-        None => text.to_vec(),
-    }
+    let mut words = text.windows(LEASE.len());
+    let Some(at) = words.position(|word| word == LEASE.as_bytes()) else {
+        return text.to_vec();
+    };
+    [&text[..at], lease.as_bytes(), &text[at + LEASE.len()..]].concat()
 }
 
 pub fn step_seeds() -> Vec<Seed> {

@@ -1,8 +1,8 @@
 //! Files of worlds: snapshots, recordings and recorded states.
 
-use super::target::Seed;
+use super::Seed;
+use crate::harness::recorded_info;
 use emberwatch_protocol::Move;
-use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::{FrameHeader, RobotResult, VERSION};
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::recording::{Event, Reader, Record, Writer};
@@ -139,10 +139,7 @@ pub fn snapshot_seeds() -> Vec<Seed> {
 }
 
 pub fn recording_seeds() -> Vec<Seed> {
-    let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":2,"n_worlds":1,"n_robots":2,
-        "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
-        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
-    let info: ServerInfo = serde_json::from_str(text).expect("what a server says");
+    let info = recorded_info(2, 2);
     let mut header = FrameHeader {
         version: VERSION,
         n_robots: 2,
