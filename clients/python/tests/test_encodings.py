@@ -35,10 +35,6 @@ def of_states(file: Path) -> Any:
 #: What reads a file, and the file's text in UTF-8.
 READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "task": (Task.named, TASK),
-    "environment of a task": (
-        lambda file: closed_later(gymnasium.make(WILDFIRE, task=file)).reset(seed=1000),
-        TASK,
-    ),
     "model": (Model.named, Path(LIVELY).read_text("utf-8")),
     "states": (of_states, RECORDED.read_text("utf-8")),
     "embedded worlds": (

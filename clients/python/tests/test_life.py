@@ -22,7 +22,7 @@ from environments import (
 )
 from failures import fails
 from gymnasium.vector import VectorEnv
-from processes import Server, stopped
+from processes import Server
 
 from emberwatch.errors import RequestTimeoutError, ServerGoneError
 
@@ -99,12 +99,10 @@ def test_worlds_that_are_gone_are_not_gone_on_with(attached: Any, started: Serve
 
 
 def test_a_stopped_server_times_out_and_resume_goes_on(attached: Any, started: Server) -> None:
-    with (
-        stopped(started.program.pid),
-        impatient(attached),
-        pytest.raises(RequestTimeoutError),
-    ):
+    started.stop()
+    with impatient(attached), pytest.raises(RequestTimeoutError):
         fly(attached)
+    started.wake_up()
     with fails("closed", match="an earlier step or reset timed out"):
         # The first move, as that which timed out was the last of its path.
         attached.step(np.zeros(attached.action_space.shape, int))

@@ -38,12 +38,6 @@ def states(tmp_path: Path, sequences: list[States]) -> Path:
     return path
 
 
-def test_a_recorded_world_passes_the_checker(states: Path) -> None:
-    for name in (WILDFIRE, MOVES):
-        env: Any = gymnasium.make(name, states=states, n_moves=3, states_symmetries=True)
-        check_env(env.unwrapped, skip_render_check=True)
-
-
 def test_symmetries_and_offsets_are_those_asked_for(states: Path, sequences: list[States]) -> None:
     def first_states(**keywords: Any) -> set[bytes]:
         env: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3, truth=True, **keywords)
@@ -107,6 +101,8 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
     env: Any = gymnasium.make(MOVES, states=states, n_moves=3, reward="move")
     paths: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3)
     path = [3, 1, 2]
+    for one in (env, paths):
+        check_env(one.unwrapped, skip_render_check=True)
     for seed in range(4):
         env.reset(seed=seed)
         paths.reset(seed=seed)
