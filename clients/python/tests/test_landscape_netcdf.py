@@ -328,6 +328,8 @@ REFUSED: list[tuple[Any, ...]] = [
     ("flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes say",
         grid(TIMES.told(flag_values=np.array([0, 1, 2], "u1"),
         flag_meanings="burnt fire unburnt")), ("--kind=states",)),
+    ("flag_meanings: expected 0 to mean unburnt, got 'burned'; --kind and --codes say",
+        grid(TIMES.told(flag_values=np.array([0, 1], "u1"), flag_meanings="burned unburned"))),
 ]  # fmt: skip
 
 
