@@ -32,7 +32,6 @@ AGENTS = [f"robot_{robot}" for robot in range(4)]
 
 
 def team(**keywords: Any) -> WildfireParallelEnv:
-    """Robots of a small world, or with `instance` of a running server's."""
     if keywords.get("instance") is not None:
         return emberwatch.parallel_env(**keywords)
     return emberwatch.parallel_env(**{**SMALL, "robots": 4, **keywords})
@@ -49,6 +48,8 @@ def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
 def test_pettingzoo_finds_no_fault_in_paths() -> None:
     with no_warnings():
         parallel_api_test(team(action="path", max_episode_steps=20), num_cycles=50)
+        for action in ("move", "path"):
+            parallel_seed_test(lambda action=action: team(action=action), num_cycles=20)
     env = parallel_to_aec(team(action="path", max_episode_steps=20))
     with pytest.warns(UserWarning) as warned:
         api_test(env, num_cycles=20)
@@ -63,12 +64,6 @@ def test_without_pettingzoo_an_error_says_what_to_install(monkeypatch: pytest.Mo
     told = r"pip install emberwatch\[teams\]; got: .*pettingzoo"
     with pytest.raises(ModuleNotFoundError, match=told):
         emberwatch.parallel_env(robots=4)
-
-
-@pytest.mark.parametrize("action", ["move", "path"])
-def test_seeds_begin_the_same_episodes(action: str) -> None:
-    with no_warnings():
-        parallel_seed_test(lambda: team(action=action), num_cycles=20)
 
 
 def rollout(env: WildfireParallelEnv, actions: list[dict[str, Any]], seed: int) -> list[Any]:
@@ -180,10 +175,11 @@ def test_actions_of_other_agents_are_refused() -> None:
         env.step({"robot_0": 1, "robot_1": [1, 2]})
     with refuses("action: expected 0 to 3, got 4"):
         env.step({"robot_0": 1, "robot_1": 4})
+    drawn = [[env.action_space(it).sample() for _ in range(30)] for it in env.possible_agents]
+    assert drawn[0] != drawn[1], "each draws its own"
 
 
 def alone(instance: str, robot: int, **keywords: Any) -> Any:
-    """An environment of one robot of a running server."""
     return make(instance=instance, robot=robot, **keywords)
 
 
