@@ -8,7 +8,7 @@ from http.client import HTTPConnection, HTTPResponse
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from running import PATIENCE, Dashboard
+from running import PATIENCE, Dashboard, unused_instance
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 3, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 720}}
@@ -33,7 +33,6 @@ def handshake(connection: HTTPConnection, path: str, **headers: str) -> int:
 
 
 def connect(dashboard: Dashboard) -> HTTPConnection:
-    """A connection to a dashboard."""
     return HTTPConnection("127.0.0.1", dashboard.port, timeout=PATIENCE)
 
 
@@ -70,12 +69,14 @@ def serious(look) -> list[str]:
 @pytest.mark.parametrize(("theme", "screen"), [("light", DESK), ("dark", PHONE)], ids=str)
 def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, theme, screen):
     """A picture of it is kept for people to look at."""
-    server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
-    look = open_page(programs.dashboard(server.instance), color_scheme=theme, **screen)
+    instance = unused_instance()
+    look = open_page(programs.dashboard(instance), color_scheme=theme, **screen)
     look.eventually(lambda: look.text("state") == "waiting", "waiting")
     assert serious(look) == []
+    world = {"height": 64, "width": 64, "moves": 64, "burn_in": 12000}
+    server = programs.server(instance, publish_truth=True, **world)
     look.eventually(lambda: look.picture(".shown"), "the world before its first step")
-    programs.agent(server.instance)
+    programs.agent(instance)
     look.wait_for_steps()
     look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
     assert look.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
@@ -92,7 +93,7 @@ def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, the
     assert serious(look) == []
 
 
-def test_every_control_is_reached_by_tab_and_canvases_tell_what_they_show(watched):
+def test_tab_reaches_every_control_and_canvases_tell_what_they_show(watched):
     look = watched.look
     truth, chart = look.at("panel-truth"), look.at("chart-reward")
     # Descriptions follow what is drawn, now and then.

@@ -37,19 +37,16 @@ class Proxy:
     """nginx in front of a dashboard."""
 
     def __init__(self, command: list[str], port: int) -> None:
-        """Starts it."""
         self.port, self._command = port, command
         #: Where browsers see the page.
         self.url = f"https://localhost:{port}/fire/"
         self.start()
 
     def start(self) -> None:
-        """Begins, or begins again."""
         self._process = subprocess.Popen(self._command)
         eventually(lambda: is_open(self.port), "nginx")
 
     def stop(self) -> None:
-        """Ends it."""
         self._process.terminate()
         self._process.wait(PATIENCE)
 
@@ -61,7 +58,6 @@ class Proxy:
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return listener.getsockname()[1]
@@ -101,7 +97,6 @@ def proxy(tmp_path: Path) -> Iterator[Callable[[Dashboard], Proxy]]:
 
 
 def is_open(port: int) -> bool:
-    """Whether somebody listens."""
     with socket.socket() as client:
         return client.connect_ex(("127.0.0.1", port)) == 0
 

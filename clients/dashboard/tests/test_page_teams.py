@@ -11,12 +11,10 @@ COLORS = ["#5ee6c8", "#ff9ad5", "#b9f04a"]
 
 
 def states(look) -> list[str]:
-    """What the robots did, as the picture says."""
     return [robot["state"] for robot in look.picture(".shown.robots") or []]
 
 
 def lines(look) -> list[str]:
-    """What the page says of each robot."""
     return look.at("robots").locator("li").all_text_contents()
 
 

@@ -99,10 +99,10 @@ def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
     look.slow_down(10)
     look.page.reload()
     look.eventually(lambda: look.picture(".shown"), "the world before its first step")
-    agent = programs.agent(server.instance, steps=1000, steps_per_second=200)
+    agent = programs.agent(server.instance, steps=400, steps_per_second=200)
     assert agent.wait() == 0
-    look.eventually(lambda: look.picture(".shown.step") == 1000, "the newest step")
-    assert look.drawn() < 1000
+    look.eventually(lambda: look.picture(".shown.step") == 400, "the newest step")
+    assert look.drawn() < 400
     assert set(waiting) <= {0, 1, 2}, "no pictures were queued"
 
 

@@ -40,14 +40,12 @@ at_the_end = ExitStack()
 
 
 def find(name: str) -> str:
-    """The path of one of our programs."""
     path = shutil.which(name)
     assert path is not None, f"expected {name} on the PATH"
     return path
 
 
 def unused_instance() -> str:
-    """An instance name that no other program uses."""
     return f"test-{secrets.token_hex(8)}"
 
 
@@ -77,7 +75,6 @@ class Program:
         return self.output()
 
     def stop(self) -> None:
-        """Stops it, if it still runs, and waits for its end."""
         self.process.terminate()
         self.process.wait(PATIENCE)
         self._output.close()
@@ -89,7 +86,6 @@ def server(instance: str | None = None, *, ready: bool = True, **flags: object) 
 
 
 def script(code: str, *arguments: object) -> Script:
-    """Runs Python code in a process of its own, which ends with the test."""
     return at_the_end.enter_context(closing(Script(code, *arguments)))
 
 
@@ -127,19 +123,15 @@ class Server:
             self._client.shutdown(timeout=1.0)
 
     def connect(self) -> Client:
-        """A connection that the end of the test closes."""
         return self._held.enter_context(Client(self.instance))
 
     def status(self) -> ServerStatus:
-        """What is going on at it; over a connection of its own, which counts as a client."""
         return self._client.status(timeout=PATIENCE)
 
     def signal(self, number: int) -> None:
-        """Sends it a signal."""
         os.kill(self.program.pid, number)
 
     def stop(self) -> None:
-        """Pauses it; returns when it no longer runs."""
         self.signal(signal.SIGSTOP)
         assert eventually(lambda: _state(self.program.pid) == "T")
 
@@ -149,12 +141,10 @@ class Server:
             self.signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """Ends it as no handler can prevent; returns when it has ended."""
         self.signal(signal.SIGKILL)
         self.program.process.wait(PATIENCE)
 
     def close(self) -> None:
-        """Closes the connections and stops it."""
         self._held.close()
 
 
@@ -183,12 +173,10 @@ class Script:
         return line.strip()
 
     def say(self, text: str = "") -> None:
-        """Sends it a line."""
         self._process.stdin.write(f"{text}\n")
         self._process.stdin.flush()
 
     def signal(self, number: int) -> None:
-        """Sends a signal to it and its process group, as a terminal does."""
         os.killpg(self.pid, number)
 
     def end(self) -> tuple[int, str, str]:
@@ -197,7 +185,6 @@ class Script:
         return self._process.returncode, out, err
 
     def close(self) -> None:
-        """Kills it."""
         self._process.kill()
         self._process.communicate()
 
@@ -271,7 +258,6 @@ def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo
 
 
 def services(instance: str) -> list[Path]:
-    """The files of an instance's services."""
     found = []
     for path in (CHANNELS / "services").iterdir():
         with suppress(FileNotFoundError):  # of a program that ends now

@@ -117,7 +117,7 @@ def test_beliefs_are_the_oracle_s_on_the_simplex(
         assert_near(filter.entropy(), entropy(filter.belief.astype(np.float64)), 1e-6)
 
 
-def test_beliefs_of_another_shape_and_models_that_can_vanish_are_refused() -> None:
+def test_other_shapes_and_models_that_can_vanish_are_refused() -> None:
     with refuses(r"belief: expected shape \(3, 2, 2\)"):
         Transition(WILDFIRE, height=2, width=2).apply(np.ones((3, 2, 3)))
     model = model_of(kernel=np.zeros((2, 2, 1, 1)), bias=np.zeros(2), matrix=np.ones((2, 1)))

@@ -170,7 +170,7 @@ SAME = {
 }
 
 
-def test_what_acts_otherwise_has_another_digest_and_what_acts_alike_one() -> None:
+def test_policies_have_one_digest_only_if_they_act_alike() -> None:
     for name, pair in DIFFERENT.items():
         assert digest(pair[0]) != digest(pair[1]), name
         assert [digest(each) for each in pair] == [digest(each) for each in pair], name
@@ -210,17 +210,13 @@ def test_a_digest_is_the_same_in_another_process(tmp_path: Path) -> None:
     assert len(set(runs)) == 1 and len(runs[0].strip()) == 16
 
 
-def test_tensors_count_by_their_values() -> None:
+def test_tensors_count_by_values_and_networks_by_code_too() -> None:
     torch = pytest.importorskip("torch")
     for kind in (torch.float32, torch.bfloat16):
         weights = torch.ones(3, dtype=kind, requires_grad=True)
         other = torch.full((3,), 2, dtype=kind)
         assert digest(closing(weights)) == digest(closing(weights.detach().clone()))
         assert digest(closing(weights)) != digest(closing(other))
-
-
-def test_networks_count_by_weights_code_and_settings() -> None:
-    torch = pytest.importorskip("torch")
 
     class Net(torch.nn.Module):
         def __init__(self, temperature: float = 1.0) -> None:

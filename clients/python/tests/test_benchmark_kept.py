@@ -84,12 +84,10 @@ def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
         assert read(file) == rows
     _, said = go(file, **change)
     assert f"mine: 3 rows kept in {file}, not run again. What a policy reads from else" in said
-
-
-def test_defaults_that_are_named_are_other_worlds_only_if_they_differ(file: Path) -> None:
+    file.unlink()
     rows, _ = go(file)
     again, said = go(file, env=MOVES, start="corner", sensor_radius=0, batch=2)
-    assert again == rows and "3 rows kept" in said
+    assert again == rows and "3 rows kept" in said, "defaults that are named"
 
 
 def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
@@ -131,17 +129,13 @@ def without_fingerprints(path: Path) -> None:
     path.write_text("".join(",".join(line.split(",")[:-3]) + "\n" for line in lines))
 
 
-def test_own_rows_of_an_older_release_are_refused(file: Path) -> None:
+def test_own_rows_of_an_older_release_are_refused_and_others_stay(file: Path) -> None:
     go(file)
     without_fingerprints(file)
     assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
     with refuses("has rows of 'mine' without a fingerprint of their worlds, as older releases"):
         go(file)
-
-
-def test_rows_of_an_older_release_stay_if_worlds_burn_alike(file: Path) -> None:
-    go(file)
-    without_fingerprints(file)
+    # Those of others stay if worlds burn alike.
     old = read(file)
     with refuses(r"burning cells of world 3 \('mine'\), got"):
         go(file, name="other", burn_in=61)
@@ -169,8 +163,9 @@ def test_a_file_that_spreadsheets_have_saved_is_read(file: Path) -> None:
 def test_a_row_of_other_values_is_refused(file: Path) -> None:
     go(file)
     text = file.read_text()
-    for line in ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20):
-        file.write_text(f"{text}{line}\n")
+    bad = ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20)
+    for content in (*(f"{text}{line}\n" for line in bad), "policy,steps\nmine,3\n", "\x00\xff"):
+        file.write_text(content, "latin-1")
         with refuses("csv: expected .*mine.csv to have the columns policy,"):
             go(file)
 

@@ -63,8 +63,6 @@ class Short(Counter):
 
 
 class Forwarding(Recurrent):
-    """Hands on what it does not know."""
-
     def predict(self, seen: Any, **others: Any) -> Any:  # type: ignore[override]
         assert others.keys() == {"state", "episode_start", "deterministic"}
         return super().predict(seen, **others)
@@ -173,9 +171,6 @@ def test_models_and_functions_get_masks(walled: Path) -> None:
     masks.clear()
     go(act, model=walled, robots=2)
     assert {mask.shape for mask in masks} == {(6, 4)}
-
-
-def test_masks_of_whole_paths_are_refused_only_if_they_are_needed() -> None:
     go(Masked(), env=WILDFIRE)
     with refuses("env: expected one with action masks, which the policy takes, got one without"):
         go(lambda frames, action_masks: 0, env=WILDFIRE)

@@ -36,7 +36,6 @@ Wrap = Callable[[Any], Any]
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Worlds with a wall, so that masks matter."""
     return {**WORLDS, "model": wall(tmp_path_factory.mktemp("model"))}
 
 
@@ -129,7 +128,7 @@ def normalized(worlds: Any) -> Any:
 
 
 @pytest.mark.parametrize("parts", ["local", ("frame", "local")], ids=str)
-def test_a_model_behind_vec_normalize_scores_as_in_its_own_evaluation(
+def test_a_model_behind_vec_normalize_scores_as_in_its_own(
     world: dict[str, Any], parts: Any, tmp_path: Path
 ) -> None:
     policy = "MlpPolicy" if isinstance(parts, str) else "MultiInputPolicy"

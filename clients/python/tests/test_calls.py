@@ -34,12 +34,7 @@ def test_every_call_has_a_timeout() -> None:
         assert started.instance in str(raised.value)
     started.wake_up()
     assert client.observe().result().world.step == 0
-
-
-def test_a_timeout_that_is_no_time_has_passed_already() -> None:
-    started = server()
-    client = started.connect()
-    started.stop()
+    started.stop()  # a timeout that is no time has passed already
     for timeout in (0, -1, float("nan"), -float("inf")):
         with pytest.raises(errors.RequestTimeoutError):
             client.observe(timeout=timeout)

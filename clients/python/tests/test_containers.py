@@ -42,8 +42,6 @@ def tell(what, call):
 
 @pytest.fixture
 def apart() -> Run:
-    """Runs Python code where `/dev/shm` is its own."""
-
     def python(code: str, options: str = "size=64m") -> subprocess.CompletedProcess[str]:
         run = isolated(options, pids=True)
         return run(sys.executable, "-W", "ignore", "-c", HEAD + code)

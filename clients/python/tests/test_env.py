@@ -302,16 +302,14 @@ def test_keywords_beside_an_instance_agree_with_the_server() -> None:
         assert env.render()
 
 
-def test_a_model_in_which_no_state_pays_is_warned_of(tmp_path: Path) -> None:
+def test_worlds_without_rewards_are_warned_of(tmp_path: Path) -> None:
     model = tmp_path / "model.toml"
     model.write_text(Path(LIVELY).read_text().replace("reward = 1.0", "reward = 0.0"))
     for making in (gymnasium.make, gymnasium.make_vec):
         with pytest.warns(UserWarning, match="no state pays: every reward will be 0") as caught:
             making(WILDFIRE, **SMALL | {"model": str(model)})
         assert caught[0].filename == __file__
-
-
-def test_worlds_in_which_nothing_burns_are_warned_of_once() -> None:
+    # Worlds in which nothing burns are warned of once.
     worlds = {"model": "wildfire-small", "burn_in": 0}
     env, envs = make(**worlds), gymnasium.make_vec(WILDFIRE, num_envs=2, **SMALL | worlds)
     for one in (env, envs):

@@ -67,8 +67,6 @@ def test_a_server_killed_during_a_call_is_gone() -> None:
 
 
 class Remains:
-    """What processes have in shared memory, and whether it is gone."""
-
     def __init__(self, *pids: int) -> None:
         maps = "".join(Path(f"/proc/{pid}/maps").read_text() for pid in pids)
         words = [line.split(maxsplit=5)[-1] for line in maps.splitlines()]

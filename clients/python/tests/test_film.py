@@ -92,7 +92,6 @@ class Studio:
         return self._capsys.readouterr().err
 
     def still(self, records: list[bytes], *flags: object) -> NDArray[np.uint8]:
-        """A picture of step 1."""
         self.film(records, "--step", 1, *flags)
         return np.asarray(Image.open(self.png))
 
@@ -118,7 +117,6 @@ def cells(image: NDArray[np.uint8], panel: int) -> NDArray[np.uint8]:
 
 
 def believed() -> Belief:
-    """After two frames."""
     kept = known(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
     kept.correct(SEEN)
     kept.predict()

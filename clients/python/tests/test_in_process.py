@@ -44,7 +44,6 @@ MAKERS: dict[str, Callable[[], Any]] = {
 
 @pytest.fixture
 def client() -> Iterator[emberwatch.Client]:
-    """Two small worlds."""
     with emberwatch.embed(worlds=2, seed=None, **FLAGS) as client:
         yield client
 
@@ -54,7 +53,6 @@ def threads() -> set[str]:
 
 
 def opened() -> tuple[str, set[str], set[str]]:
-    """Child processes, open files, and files of this process in shared memory."""
     us = os.getpid()
     files = [path for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
     return (
@@ -130,7 +128,6 @@ def in_child(call: Callable[[], object]) -> Any:
 
 
 def action(env: Any) -> Any:
-    """The same for all robots."""
     agents: dict[str, Any] = getattr(env, "action_spaces", {})
     zero = {agent: np.zeros(space.shape, int) for agent, space in agents.items()}
     return zero or np.zeros(env.action_space.shape, int)
@@ -138,7 +135,7 @@ def action(env: Any) -> Any:
 
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-def test_a_forked_child_is_refused_what_was_reset_and_may_reset_again(kind: str) -> None:
+def test_a_forked_child_is_refused_the_episode_and_may_reset(kind: str) -> None:
     env, unopened = MAKERS[kind](), MAKERS[kind]()
     n_moves = SMALL["n_moves"] if kind in ("moves", "team") else 1  # until the worlds move
     first = env.reset(seed=4)

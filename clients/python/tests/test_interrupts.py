@@ -73,7 +73,6 @@ class Signal:
 
 
 def places(call: Callable[[], object]) -> int:
-    """At how many places a signal may interrupt a call."""
     watched = Signal(0, Alarm)
     sys.setprofile(watched)
     try:
@@ -97,7 +96,6 @@ def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
 
 
 def action(env: Any, seed: int) -> Any:
-    """A random action, or one of each robot."""
     agents: dict[str, Any] = getattr(env, "action_spaces", {})
     for space in agents.values() or [env.action_space]:
         space.seed(seed)
@@ -115,7 +113,6 @@ def no_garbage() -> Generator[None]:
 
 @pytest.fixture(params=KINDS)
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
-    """Two environments of one kind: one to be interrupted, one to compare with."""
     return KINDS[request.param](), KINDS[request.param]()
 
 

@@ -30,7 +30,6 @@ FIRE = np.array([(BEGIN <= k) + (BEGIN + 2 <= k).astype(int) for k in range(6)],
 
 
 def imported(out: Path, *flags: object) -> list[NDArray[np.uint8]]:
-    """The sequences that the command makes."""
     main([str(flag) for flag in (*flags, "--out", out, "--force")])
     with np.load(out) as file:
         assert list(file) == [f"states_{number:03}" for number in range(len(file))]
@@ -49,7 +48,6 @@ def out(tmp_path: Path) -> Path:
 
 
 def changed(file: Path, **properties: object) -> Path:
-    """A GeoTIFF with other properties."""
     with rasterio.open(file, "r+") as opened:
         for name, value in properties.items():
             setattr(opened, name, value)
@@ -57,12 +55,10 @@ def changed(file: Path, **properties: object) -> Path:
 
 
 def with_never(value: float, scale: float = 1) -> NDArray[np.float64]:
-    """The arrival times with something else for never."""
     return np.where(ARRIVAL == NEVER, value, ARRIVAL * scale)
 
 
 def same_arrivals(f: Path) -> list[tuple[object, ...]]:
-    """Files of the one fire, and flags."""
     np.save(f / "fire.npy", with_never(np.nan))
     minutes = ("--unit", "min")
     scaled = geotiff(f / "scaled.tif", with_never(NEVER, 0.2) + 2 * (ARRIVAL != NEVER))

@@ -1,6 +1,5 @@
 """Model files with zones from elevation, wind and other rasters."""
 
-import io
 import math
 import subprocess
 import sys
@@ -213,7 +212,6 @@ FUEL = np.array([[1, 2], [3, 4]])
 
 
 def refusals(f: Path) -> dict[str, tuple[object, ...]]:
-    """Flags by what is said of them."""
     dem, npy = geotiff(f / DEM, EASTWARD), array(f / "dem.npy", EASTWARD)
     fuel = array(f / "fuel.npy", FUEL)
     hole = EASTWARD.copy()
@@ -304,27 +302,16 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
     }  # fmt: skip
 
 
-def test_refusals_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out" / "land.toml"
-    for words, flags in refusals(tmp_path).items():
-        said = io.StringIO()
-        monkeypatch.setattr(sys, "stderr", said)
+def test_refusals_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, mine = ["--out", tmp_path / "out" / "land.toml"], tmp_path / "mine.toml"
+    mine.write_text("mine")
+    rows = {words: (*flags, *out) for words, flags in refusals(tmp_path).items()}
+    rows["one; --force replaces it"] = (tmp_path / DEM, "--out", mine)
+    rows["a .toml"] = (tmp_path / DEM, "--out", tmp_path / "a.txt")
+    for words, flags in rows.items():
         with pytest.raises(SystemExit) as stopped:
-            main(["land", *map(str, flags), "--out", str(out)])
+            main(["land", *map(str, flags)])
         assert stopped.value.code == 2
-        lines = said.getvalue().splitlines()
-        assert len(lines) == 1 and words in lines[0], (words, lines)
-        assert lines[0].startswith("python -m emberwatch.landscape land: ")
-        assert not out.parent.exists()
-
-
-def test_nothing_is_replaced_unless_asked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    dem, out = geotiff(tmp_path / DEM, EASTWARD), tmp_path / "land.toml"
-    out.write_text("mine")
-    for wrong, words in ((out, "one; --force replaces it"), (tmp_path / "a.txt", "a .toml")):
-        with pytest.raises(SystemExit):
-            main(["land", str(dem), "--out", str(wrong)])
-        assert words in capsys.readouterr().err
-    assert out.read_text() == "mine"
+        (line,) = capsys.readouterr().err.splitlines()
+        assert words in line and line.startswith("python -m emberwatch.landscape land: ")
+        assert not out[1].parent.exists() and mine.read_text() == "mine"

@@ -19,8 +19,6 @@ KIND = {2: ("--kind=arrival",), 3: ("--kind=mask",)}
 
 
 class Variable(NamedTuple):
-    """What is written of a variable."""
-
     values: ArrayLike
     kind: str
     over: tuple[str, ...] = ()
@@ -218,7 +216,6 @@ def test_variables_have_colons_and_groups(tmp_path: Path) -> None:
 
 
 def layer_files(folder: Path, first: Variables, second: Variables) -> NDArray[np.uint8]:
-    """Two masks of one sequence, each in a file of its own."""
     (folder / "fire").mkdir()
     for k, variables in enumerate((first, second)):
         mask = Variable(MASKS[2 * k], "u1", ("y", "x"), variables.pop("v").given)

@@ -24,7 +24,6 @@ Flags = tuple[object, ...]
 
 
 def two(folder: Path, **second: object) -> Flags:
-    """Two masks, the second with a property of its own."""
     first = geotiff(folder / "a.tif", masks()[0], nodata=None)
     return first, geotiff(folder / "b.tif", masks()[1], **({"nodata": None} | second)), *MASKS  # type: ignore
 
@@ -74,7 +73,6 @@ def packed(path: Path, member: Path) -> Path:
 
 
 def days(folder: Path, *units: str | None) -> list[Path]:
-    """Two layers a file, at 0 and 1 of each unit."""
     return [
         netcdf(folder / f"{k}.nc", times=[0, 1], time_unit=unit, mask=masks()[2 * k : 2 * k + 2])
         for k, unit in enumerate(units)
@@ -82,7 +80,6 @@ def days(folder: Path, *units: str | None) -> list[Path]:
 
 
 def large(folder: Path) -> Path:
-    """A raster of more rows than the server takes."""
     values = np.zeros((4097, 1), np.uint8)
     return geotiff(folder / "large.tif", values, values + 1, nodata=None, dtype="uint8")
 
@@ -93,12 +90,10 @@ Case = Callable[[Path], Flags]
 
 
 def arrivals(*flags: object, bands: object = (), **properties: object) -> Case:
-    """A file of arrival times, and flags."""
     return lambda f: (geotiff(f / "a.tif", *bands, **properties), *ARRIVALS, *flags)  # type: ignore
 
 
 def layers(kind: Flags, *bands: object, flags: Flags = ()) -> Case:
-    """Layers of one file, and flags."""
     return lambda f: (stack(f, *bands), *kind, *flags)
 
 
@@ -108,7 +103,6 @@ def ascii_file(old: str, new: str) -> Case:
 
 
 def at(*times: float) -> Case:
-    """Four masks of these times."""
     return lambda f: (netcdf(f / "a.nc", times=times, mask=masks()), *MASKS)
 
 
@@ -267,7 +261,6 @@ def rotated(path: Path, *numbers: float) -> Path:
 
 
 def refused(flags: Flags, capsys: pytest.CaptureFixture[str]) -> str:
-    """The last line of what the command says as it ends."""
     with pytest.raises(SystemExit) as ended:
         main([str(flag) for flag in flags])
     assert ended.value.code == 2

@@ -23,12 +23,12 @@ FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
 DEGREE = 111_200.0
 SECOND = 1 / 3600
 LAT_60 = math.cos(math.radians(60))
+SAY = "got none; say --height-unit ft"
+MAY_BE_DEGREES = "no projection, and numbers that may be degrees; say --cell METRES, or its project"
 SINUSOIDAL = "+proj=sinu +R=6371007.181 +units=m"
 
 
 class Map(NamedTuple):
-    """A raster of a slope of 10 degrees."""
-
     crs: str | None
     cell: float
     """Side in units of the map."""
@@ -148,54 +148,45 @@ def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert words in notes(capsys)
 
 
-def test_cells_in_feet_with_heights_in_no_unit_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = "expected a unit of heights, as cells are in feet, got none; say --height-unit ft"
-    plane = geotiff(tmp_path / "plane.tif", EASTWARD, crs="EPSG:2263", cell=(100, 100))
-    assert words in refused(capsys, tmp_path, plane)
-    local = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'
-    local = geotiff(tmp_path / "local.tif", EASTWARD, crs=local, cell=(100, 100))
-    assert words in refused(capsys, tmp_path, local)
-    bare = geotiff(tmp_path / "bare.tif", EASTWARD, crs=None, cell=(100, 100))
-    assert words in refused(capsys, tmp_path, bare, "--cell=100 ft")
+#: Places of rasters, flags, and words of the refusal.
+NO_PLACE: list[tuple[dict[str, Any], str, str]] = [
+    *(
+        ({"crs": crs, "cell": (100, 100)}, flags, f"a unit of heights, as cells are in feet, {SAY}")
+        for crs, flags in (
+            ("EPSG:2263", ""),
+            ('LOCAL_CS["mine",UNIT["foot",0.3048]]', ""),
+            (None, "--cell=100ft"),
+        )
+    ),
+    *(
+        ({"crs": None, "corner": corner, "cell": (cell, cell)}, "", MAY_BE_DEGREES)
+        for corner, cell in (((-120, 38), SECOND), ((179.9, -16), 0.1), ((0, 91), 0.5))
+    ),
+    # Far from its meridian, as MODIS tiles of California are, rows and columns are askew.
+    ({"crs": SINUSOIDAL, "corner": (-1e7, 4e6)}, "",
+        "dem.tif: expected square cells, got rows and columns at 139 degrees; reproject it"),
+    ({"crs": "EPSG:4326", "corner": (0, 900), "cell": (1, 1)}, "",
+        "projection WGS 84: expected cells on the Earth, got one at 2.5, 898"),
+]  # fmt: skip
 
 
-def test_numbers_that_may_be_degrees_are_not_taken_as_metres(
+def test_cells_of_no_known_size_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for corner, cell in (
-        ((-120, 38), SECOND),
-        ((179.9, -16), 0.1),
-        ((0, 91), 0.5),
-        ((2, 54), 1e-3),
-    ):
-        place = {"crs": None, "corner": corner, "cell": (cell, cell)}
+    for place, flags, words in NO_PLACE:
         dem = geotiff(tmp_path / "dem.tif", EASTWARD, **place)
-        words = "no projection, and numbers that may be degrees; say --cell METRES, or its project"
-        assert words in refused(capsys, tmp_path, dem)
-    fire = geotiff(tmp_path / "fire.tif", **place)
+        assert words in refused(capsys, tmp_path, dem, *flags.split())
+    degrees = {"crs": None, "corner": (-120, 38), "cell": (SECOND, SECOND)}
+    fire = geotiff(tmp_path / "fire.tif", **degrees)
     flags = "--kind=arrival --unit=min --burning=2 --cell=60".split()
     with pytest.raises(SystemExit):
         main([str(fire), *flags, "--step=10 min", "--out", str(tmp_path / "fire.npz")])
     assert "numbers that may be degrees; use --height" in capsys.readouterr().err
-
-
-def test_cells_that_differ_on_the_ground_are_refused_by_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    big, flat = (20_000, 20_000), np.zeros((40, 40))
-    mercator = geotiff(tmp_path / "web.tif", flat, crs="EPSG:3857", corner=(0, 9e6), cell=big)
+    place = {"crs": "EPSG:3857", "corner": (0, 9e6), "cell": (20_000, 20_000)}
+    mercator = geotiff(tmp_path / "web.tif", np.zeros((40, 40)), **place)
     words = "web.tif: expected cells of one size on the ground, got "
     assert words in refused(capsys, tmp_path, mercator)
     made(tmp_path, mercator, "--oblong")
-    # Far from its meridian, as MODIS tiles of California are, rows and columns are askew.
-    modis = geotiff(tmp_path / "modis.tif", EASTWARD, crs=SINUSOIDAL, corner=(-1e7, 4e6))
-    words = "modis.tif: expected square cells, got rows and columns at 139 degrees; reproject it"
-    assert words in refused(capsys, tmp_path, modis)
-    nowhere = geotiff(tmp_path / "no.tif", EASTWARD, crs="EPSG:4326", corner=(0, 900), cell=(1, 1))
-    words = "projection WGS 84: expected cells on the Earth, got one at 2.5, 898"
-    assert words in refused(capsys, tmp_path, nowhere)
 
 
 def test_a_grid_turned_from_true_north_is_told(

@@ -38,7 +38,6 @@ Make = Callable[..., Any]
     ids=[f"{kind} {many}" for many in ("alone", "vector") for kind in ("path", "move", "option")],
 )
 def making(request: pytest.FixtureRequest) -> Make:
-    """Makes an environment of each kind."""
     return request.param
 
 
@@ -49,7 +48,6 @@ def started() -> Server:
 
 @pytest.fixture
 def attached(making: Make, started: Server) -> Any:
-    """An environment at a running server, after a step of its worlds."""
     env = making(instance=started.instance)
     env.reset(seed=1)
     fly(env)

@@ -46,14 +46,12 @@ on_x86 = pytest.mark.skipif(platform.machine() != "x86_64", reason="numbers of x
 
 
 def run(*command: str | Path, limit: str = "true") -> subprocess.CompletedProcess[str]:
-    """Runs a program in a shell that first sets a limit on itself."""
     shell = ["bash", "-c", f'ulimit -c 0; {limit} && exec "$@"', "bash", *map(str, command)]
     few = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run(shell, capture_output=True, text=True, timeout=60, env=few)
 
 
 def python(code: str, *arguments: object, limit: str = "true") -> str:
-    """What Python code prints; it ends well."""
     words = [sys.executable, "-W", "ignore", "-c", HEAD + code, *map(str, arguments)]
     ended = run(*words, limit=limit)
     assert ended.returncode == 0, ended
@@ -206,7 +204,7 @@ tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
 
 
 @on_x86
-def test_threads_and_processes_that_a_seccomp_profile_hides_are_called_so() -> None:
+def test_what_a_seccomp_profile_hides_is_called_so() -> None:
     code = """
 refuse(435, 1)
 tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())

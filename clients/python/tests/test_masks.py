@@ -27,7 +27,6 @@ def world(tmp_path: Path) -> dict[str, Any]:
 
 
 def is_mask(mask: Any, expected: Any = EXPECTED) -> bool:
-    """Whether it is as spaces of Gymnasium take it, and has these values."""
     return mask.dtype == np.int8 and mask.tolist() == expected
 
 
@@ -63,9 +62,7 @@ def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
         env = wrap(make(MOVES, **world))
         assert is_mask(env.reset(seed=1000)[1]["action_mask"])
         assert is_mask(env.get_wrapper_attr("action_masks")())
-
-
-def test_a_mask_in_the_observation_is_that_of_the_info(world: dict[str, Any]) -> None:
+    # A mask in the observation is that of the info.
     with no_warnings():
         env = make(MOVES, observation=("robot", "action_mask"), **world)
         assert env.observation_space["action_mask"] == gymnasium.spaces.Box(0, 1, (4,), np.int8)
@@ -88,9 +85,7 @@ def test_vectors_have_a_mask_for_each_robot(world: dict[str, Any]) -> None:
         actions = envs.action_space.sample(tuple(infos["action_mask"]))
         seen, *_, infos = envs.step(actions)
         assert all(map(list.__ne__, seen["robot"].tolist(), before))
-
-
-def test_rows_that_a_reset_leaves_alone_have_no_mask(world: dict[str, Any]) -> None:
+    # Rows that a reset leaves alone have none.
     envs = make_vec(2, MOVES, autoreset_mode="Disabled", **world)
     envs.reset(seed=1000)
     _, infos = envs.reset(options={"reset_mask": np.array([False, True])})
@@ -102,6 +97,8 @@ def test_rows_that_a_reset_leaves_alone_have_no_mask(world: dict[str, Any]) -> N
 def test_teams_have_them_where_pettingzoo_looks(world: dict[str, Any], observation: Any) -> None:
     env = closed_later(emberwatch.parallel_env(observation=observation, **world))
     seen, infos = env.reset(seed=1000)
+    for number, agent in enumerate(env.agents):
+        env.action_space(agent).seed(number)
     for step in range(10):
         places = seen if observation != "local" else infos
         masks = {agent: places[agent]["action_mask"] for agent in env.agents}

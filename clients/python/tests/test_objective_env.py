@@ -93,7 +93,6 @@ def test_the_former_version_is_named() -> None:
 
 
 def trained(folder: Path, **world: object) -> Path:
-    """The checkpoint of a filter that learned a little."""
     settings = folder / "agent.toml"
     settings.write_text("[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n")
     flags = {"worlds": 2, "steps": 40, "config": settings, "out": folder / "out", "moves": 4}
@@ -106,7 +105,6 @@ def trained(folder: Path, **world: object) -> Path:
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the checkpoints of the golden episodes, by what they are of."""
     folder = tmp_path_factory.mktemp("checkpoints")
     for name in ("learned_filter", "own_kernels", "neural_belief"):
         (folder / name).write_bytes(GOLDEN[f"checkpoint {name}"].tobytes())
@@ -114,7 +112,6 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def believing(name: str, checkpoints: Path) -> dict[str, Any]:
-    """The keywords of golden episodes."""
     keywords = dict(golden_options.BELIEFS[name])
     if "checkpoint" in keywords:
         keywords["checkpoint"] = checkpoints / keywords["checkpoint"]

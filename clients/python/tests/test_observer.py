@@ -111,7 +111,7 @@ def test_an_agent_s_beliefs_are_read() -> None:
             agent.kill()
 
 
-def test_one_reader_too_many_is_told_the_limit() -> None:
+def test_readers_beyond_limits_and_impossible_ones_are_refused() -> None:
     kinds = observe, TruthReader, OutlookReader
     names = "MAX_OBSERVERS", "MAX_TRUTH_READERS", "MAX_AGENT_READERS"
     started = server(publish_truth=True)
@@ -125,9 +125,6 @@ def test_one_reader_too_many_is_told_the_limit() -> None:
             assert make is OutlookReader or reader.receive(PATIENCE) is not None
             reader.close()
         make(started.instance).close()
-
-
-def test_impossible_arguments_of_observers_are_named() -> None:
     for timeout in (-1, -0.001, float("nan")):
         with refuses("timeout: expected seconds"):
             observe(timeout=timeout)

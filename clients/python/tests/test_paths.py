@@ -53,7 +53,6 @@ except emberwatch.EmberwatchError as error:
 
 
 def run(locale: dict[str, str], *arguments: object) -> tuple[int, str, str]:
-    """What a Python of this locale returns and says."""
     command = [sys.executable, *map(os.fsencode, map(str, arguments))]
     done = subprocess.run(command, env=os.environ | locale, capture_output=True)
     return done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr)
@@ -94,7 +93,6 @@ FLAGS = ("--kind=arrival", "--unit=min", "--step=10 min", "--burning=2", "--forc
 
 
 def imported(locale: dict[str, str], *files: tuple[Path, Path]) -> list[tuple[int, str, str]]:
-    """What the importer returns and says of inputs and outputs, one after the other."""
     calls = [word for file, out in files for word in (file, *FLAGS, out, "//")]
     code, out, err = run(locale, "-c", IMPORT, *calls)
     assert code == 0, err

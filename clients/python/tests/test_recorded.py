@@ -31,7 +31,6 @@ def sequences() -> list[States]:
 
 @pytest.fixture
 def states(tmp_path: Path, sequences: list[States]) -> Path:
-    """A states file with a description beside it."""
     path = tmp_path / "lab.npz"
     np.savez_compressed(path, states_000=sequences[0], states_001=sequences[1])
     path.with_suffix(".toml").write_bytes(RECORDED.read_bytes())

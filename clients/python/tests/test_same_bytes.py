@@ -62,7 +62,6 @@ def told(value: Any) -> Iterator[bytes]:
 
 
 def digests(outcomes: Outcomes) -> list[str]:
-    """One for each `N_PER_DIGEST` outcomes, and for the rest."""
     found = list[str]()
     while batch := list(itertools.islice(outcomes, N_PER_DIGEST)):
         digest = hashlib.sha256()
@@ -74,7 +73,6 @@ def digests(outcomes: Outcomes) -> list[str]:
 
 
 def actions(high: int, *shape: int) -> Iterator[Any]:
-    """Random ones of each step."""
     rng = np.random.default_rng(3)
     return (rng.integers(0, high, shape) for _ in range(N_STEPS))
 
@@ -140,7 +138,6 @@ def vector(
 
 
 def team(action: str, high: int, *shape: int, attaches: bool, **keywords: Any) -> Outcomes:
-    """All robots of a world through PettingZoo."""
     keywords = {**WORLD, "robots": 3, "max_episode_steps": 70, **keywords}
     env = closed_later(emberwatch.parallel_env(action=action, **placed(attaches, 1, keywords)))
     yield env.reset(seed=31)

@@ -27,7 +27,6 @@ def draw(*, truth: bool = False, scale: int = SCALE, **scenery: Any) -> NDArray[
 
 
 def cell(image: NDArray[np.uint8], row: int, col: int, left: int = 0) -> NDArray[np.uint8]:
-    """The pixels of a cell, `(n, 3)`."""
     top, left = SCALE * row, left + SCALE * col
     return image[top : top + SCALE, left : left + SCALE].reshape(-1, 3)
 

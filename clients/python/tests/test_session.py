@@ -20,7 +20,6 @@ def interrupt(*_: object, **__: object) -> None:
 
 
 def interrupted(owner: object, name: str, call: Callable[[], object]) -> None:
-    """Ctrl-C where a call calls a method."""
     with pytest.MonkeyPatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(owner, name, interrupt)
         call()
@@ -63,7 +62,6 @@ OUTCOMES: dict[State, tuple[str | int, str | int]] = {
 
 @pytest.fixture
 def env() -> Any:
-    """Two steps into an episode, in this process."""
     made = make().unwrapped
     rollout(made, 2, seed=1)
     return made

@@ -50,14 +50,12 @@ def each(names: Iterable[str]) -> pytest.MarkDecorator:
 
 
 def warns_of_tests(name: str) -> Any:
-    """A context in which an episode begins on a test world."""
     return pytest.warns(
         emberwatch.TrainingOnTestWorldsWarning, match=f"task '{name}': .* test world"
     )
 
 
 def by_hand(name: str) -> dict[str, Any]:
-    """The keywords that a task stands for."""
     file = tomllib.loads((CONFIG / f"tasks/{name}.toml").read_text("utf-8"))
     renamed = {"n_moves" if key == "moves" else key: value for key, value in file.items()}
     not_keywords = ("name", "test_seeds", "max_steps", "listing")
@@ -83,7 +81,6 @@ def test_the_package_has_the_files_of_the_programs() -> None:
 
 
 def are_same(makers: list[Any], steps: int) -> None:
-    """Both make environments whose episodes are the same."""
     worlds = [maker() for maker in makers]
     assert_same(*(rollout(one, steps, seed=1005) for one in worlds))
     for one in worlds:
@@ -224,7 +221,6 @@ ON_TEST_WORLDS: list[Any] = [
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A task with the test seeds 5 and 6."""
     file = tmp_path / "own.toml"
     text = (CONFIG / "tasks/small.toml").read_text("utf-8").replace('"small"', '"own"')
     for old, new in {"3000": "3", "start = 0": "start = 5", "end = 32": "end = 7"}.items():

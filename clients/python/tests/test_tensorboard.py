@@ -49,7 +49,6 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def averages(folder: Path, name: str) -> dict[int, float]:
-    """Means over the CSV's rows of a step."""
     values: dict[int, list[float]] = {}
     for row in rows(folder):
         if row[name]:

@@ -54,7 +54,6 @@ def pair(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> tuple[Vector, V
 
 
 def assert_same_resets(ours: Vector, theirs: Vector, mask: Any, seed: Any = None) -> None:
-    """Both return the same when some worlds are reset."""
     left, right = (
         envs.reset(seed=seed, options={"reset_mask": np.array(mask)}) for envs in (ours, theirs)
     )
@@ -62,7 +61,6 @@ def assert_same_resets(ours: Vector, theirs: Vector, mask: Any, seed: Any = None
 
 
 def assert_same_flight(ours: Vector, theirs: Vector, n_steps: int, seed: Any) -> None:
-    """Both return the same, in every field, from a reset on."""
     assert_same(ours.reset(seed=seed), theirs.reset(seed=seed), "reset")
     assert_same_steps(ours, theirs, n_steps)
 
@@ -183,7 +181,6 @@ def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
 
 
 def spoil(value: Any) -> None:
-    """Writes to all arrays of what was returned."""
     if isinstance(value, np.ndarray):
         value[:] = 1
     elif isinstance(value, dict | tuple | list):
@@ -197,7 +194,8 @@ def test_what_was_returned_is_never_changed_and_may_be_written_to(
     mode: AutoresetMode | None, name: str
 ) -> None:
     """Of vectors in each mode, or of single environments."""
-    keywords: dict[str, Any] = {**ALL[name], "max_episode_steps": 3, "render_mode": "rgb_array"}
+    keywords: dict[str, Any] = {**ALL[name], "max_episode_steps": 3, "truth": True}
+    keywords["render_mode"] = "rgb_array"
     many: dict[str, Any] = {"n_worlds": 3, "autoreset_mode": mode} if mode else {}
     spoilt, env = ((make_vec if mode else make)(name=name, **many, **keywords) for _ in range(2))
     kept: list[Any] = []

@@ -68,8 +68,6 @@ class Wire:
 
 
 class Wired:
-    """A client of a world of two robots on such a connection."""
-
     def __init__(self, **hello: Any) -> None:
         self.wire = Wire(HELLO | SIZES | hello)
         with patch.object(emberwatch.client.connection._native, "Server", lambda *_: self.wire):
@@ -150,7 +148,6 @@ def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
 
 
 def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnswer:
-    """An answer about worlds of two robots."""
     n_worlds = (n_robots + 1) // 2
     n_frames = n_worlds if flags & wire.TEAM_FRAMES else n_robots
     payload = bytearray(64 * n_worlds + 48 * n_robots) + b"\xff" * 15 * n_frames
@@ -158,18 +155,14 @@ def answered(n_robots: int = 2, first: int = 0, flags: int = 0) -> wire.StepAnsw
 
 
 def presented(*answer: Any) -> wire.StepAnswer:
-    """An answer from worlds of two robots on 3 x 5 cells."""
     return wire.StepAnswer(_native.Answer(2, 3, 5, *answer))
 
 
-def test_an_answer_can_be_copied_and_pickled() -> None:
+def test_an_answer_can_be_copied_pickled_and_shown_in_short() -> None:
     for answer in (answered(), answered(4, flags=wire.TEAM_FRAMES)):
         for other in (copy.deepcopy(answer), pickle.loads(pickle.dumps(answer))):
             assert repr(other) == repr(answer) and (other.frames == answer.frames).all()
             assert other.results.tobytes() == answer.results.tobytes()
-
-
-def test_an_answer_is_shown_in_short() -> None:
     answer = answered(1, 1)
     assert repr(answer) == (
         "StepAnswer(first_robot=1, simulation_nanos=0, "

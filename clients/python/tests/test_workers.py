@@ -20,7 +20,6 @@ PACKAGE = Path(emberwatch.__file__).parent
 
 
 def workers(**keywords: Any) -> AsyncVectorEnv:
-    """Two environments in processes of their own, each in its world."""
     made = AsyncVectorEnv([make_later(world=world, **keywords) for world in range(2)])
     return closed_later(made)
 
