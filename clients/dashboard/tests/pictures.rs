@@ -237,7 +237,7 @@ fn what_was_seen_is_remembered_with_its_age_and_how_far_it_reaches() {
             vec![(1, [NO, 0, 1, NO, NO, NO]), (4, [NO, 1, NO, NO, NO, NO])],
             [NO, 1, 1, NO, NO, NO],
             [NO, 0, 3, NO, NO, NO],
-            1,
+            0, // since the episode began
         ),
         // An episode that begins again, or another server's, remembers nothing.
         (
