@@ -30,8 +30,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(autouse=True)
 def deadline() -> Iterator[None]:
-    """A test that hangs fails."""
-
     def late(_number: int, _frame: object) -> None:
         raise TimeoutError(f"still running after {DEADLINE} s")
 
@@ -44,7 +42,6 @@ def deadline() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
-    """The system's browser."""
     path = request.config.getoption("--chromium")
     if path is None:
         pytest.fail("expected `chromium` on the PATH (apt-get install chromium), or --chromium")
@@ -101,7 +98,6 @@ class Watched(NamedTuple):
 
 @pytest.fixture
 def watched(programs: Programs, open_page: Callable[..., Look]) -> Watched:
-    """All that there is to see."""
     server = programs.server(publish_truth=True)
     dashboard = programs.dashboard(server.instance)
     agent = programs.agent(server.instance)

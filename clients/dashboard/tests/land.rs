@@ -1,22 +1,12 @@
 //! What pages are told of zones, no-fly cells and sensors.
 
+use crate::server_info;
 use emberwatch_dashboard::scene::Info;
 use emberwatch_protocol::Airspace;
-use emberwatch_protocol::control::ServerInfo;
 use serde_json::{Value, json};
 
-/// What a server of a 2 x 3 world says of itself, with some keys.
 fn info(keys: Value) -> Info {
-    let mut info = json!({
-        "protocol": 2, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,
-        "n_observations": 4, "observations": ["calm", "fire", "calm ring 1", "fire ring 1"], "model": null,
-        "burn_in": 0, "max_steps": 0, "max_clients": 16, "coverage": "path", "publish_truth": false,
-        "lease_millis": 30_000, "deadline_millis": 0,
-    });
-    let all = info.as_object_mut().expect("an object");
-    all.extend(keys.as_object().expect("an object").clone());
-    let info: ServerInfo = serde_json::from_value(info).expect("what a server says");
-    Info::new(&info)
+    Info::new(&server_info(keys))
 }
 
 #[test]

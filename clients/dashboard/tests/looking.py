@@ -66,7 +66,6 @@ class Look:
         ]
 
     def heard(self, pattern: str) -> int:
-        """How often something was said on the console."""
         return sum(bool(re.search(pattern, complaint)) for complaint in self._complaints)
 
     def alter(self, change: Callable[[bytes], bytes]) -> None:
@@ -80,16 +79,13 @@ class Look:
         self.page.reload()
 
     def slow_down(self, rate: float) -> None:
-        """Makes the page's scripts so many times slower."""
         client = self.page.context.new_cdp_session(self.page)
         client.send("Emulation.setCPUThrottlingRate", {"rate": rate})
 
     def at(self, testid: str) -> Locator:
-        """The element of a test hook."""
         return self.page.get_by_test_id(testid)
 
     def text(self, testid: str) -> str:
-        """Its text."""
         return self.at(testid).text_content().strip()
 
     def number(self, testid: str) -> float:
@@ -102,15 +98,12 @@ class Look:
         return self.page.evaluate(f"window.emberwatch?.picture{expression.replace('.', '?.')}")
 
     def drawn(self) -> int:
-        """How many pictures were drawn."""
         return self.page.evaluate("window.emberwatch?.drawn ?? 0")
 
     def has(self, *arrays: str) -> bool:
-        """Whether the picture has these arrays."""
         return all(self.picture(f".arrays.{name}.length") for name in arrays)
 
     def array(self, name: str) -> NDArray[np.uint8]:
-        """An array of bytes of the picture."""
         return self._bytes(f"window.emberwatch.picture.arrays.{name}")
 
     def pixels(self, testid: str) -> NDArray[np.uint8]:
@@ -125,7 +118,6 @@ class Look:
         return np.frombuffer(base64.b64decode(text), np.uint8)
 
     def eventually(self, holds: Callable[[], object], what: str) -> None:
-        """Waits until something holds."""
         try:
             eventually(holds, what)
         except AssertionError as error:
@@ -137,7 +129,6 @@ class Look:
             name === "path" || ArrayBuffer.isView(value) ? value.length : value)""")
 
     def wait_for_pictures(self, count: int = 2) -> None:
-        """Waits until so many further pictures were drawn."""
         first = self.drawn()
         self.eventually(lambda: self.drawn() >= first + count, f"{count} more pictures")
 

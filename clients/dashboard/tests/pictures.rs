@@ -124,28 +124,22 @@ fn read(album: Album, at: Option<u64>) -> (Value, impl Fn(&str) -> Vec<u8>) {
 }
 
 #[test]
-fn hidden_states_wait_for_their_frame() {
-    let mut album = Album::default();
-    album.add_truth(&truth(1, [1, 0, 0, 0, 0, 0]));
-    album.add_truth(&truth(2, [0, 1, 0, 0, 0, 0]));
-    for step in 1..=2 {
-        album.add_frame(&frame(step, [1, 0, 255, 255, 255, 255]), Instant::now());
-    }
-    let (_, arrays) = read(album, None);
-    assert_eq!(arrays("truth"), [0, 1, 0, 0, 0, 0]);
-}
-
-#[test]
 fn a_picture_joins_frame_truth_and_belief_of_a_step() {
     let mut album = Album::default();
     let now = Instant::now();
+    // Hidden states wait for their frame.
+    album.add_truth(&truth(1, [0; 6]));
+    album.add_truth(&truth(2, [1, 1, 0, 1, 0, 0]));
     album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), now);
     album.add_frame(&frame(2, [255, 1, 0, 255, 255, 255]), now);
-    album.add_truth(&truth(2, [1, 1, 0, 1, 0, 0]));
     album.add_belief(&agent_belief(2), Some(&states()));
     let (header, array) = read(album, None);
     assert_eq!(header["shown"]["step"], 2);
     assert_eq!(header["shown"]["seed"], u64::MAX.to_string());
+    assert_eq!(
+        (&header["shown"]["height"], &header["shown"]["width"]),
+        (&2.into(), &3.into())
+    );
     let path = [[0, 0], [0, 1], [0, 2]];
     let robot = serde_json::json!({"state": "flew", "cell": [0, 2], "path": path, "share": 0.25});
     assert_eq!(header["shown"]["robots"], serde_json::json!([robot]));
@@ -236,53 +230,45 @@ fn the_agent_with_the_first_robot_is_shown() {
 }
 
 #[test]
-fn what_was_seen_is_remembered_with_its_age() {
-    let mut album = Album::default();
-    album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), Instant::now());
-    album.add_frame(&frame(4, [255, 1, 255, 255, 255, 255]), Instant::now());
-    let (_, array) = read(album, None);
-    assert_eq!(array("seen"), [255, 1, 1, 255, 255, 255]);
-    assert_eq!(array("age"), [255, 0, 3, 255, 255, 255]);
-}
-
-#[test]
-fn what_another_server_showed_before_is_not_remembered() {
-    let mut album = Album::default();
-    album.add_frame(&frame(5, [255, 255, 255, 0, 0, 0]), Instant::now());
-    for step in 1..=6 {
-        album.add_frame(&frame(step, [255, 1, 255, 255, 255, 255]), Instant::now());
+fn what_was_seen_is_remembered_with_its_age_and_how_far_it_reaches() {
+    const NO: u8 = 255;
+    for (frames, seen, age, since) in [
+        (
+            vec![(1, [NO, 0, 1, NO, NO, NO]), (4, [NO, 1, NO, NO, NO, NO])],
+            [NO, 1, 1, NO, NO, NO],
+            [NO, 0, 3, NO, NO, NO],
+            0, // since the episode began
+        ),
+        // An episode that begins again, or another server's, remembers nothing.
+        (
+            vec![(5, [NO, 0, 1, NO, NO, NO]), (1, [NO; 6])],
+            [NO; 6],
+            [NO; 6],
+            0,
+        ),
+        (
+            [(5, [NO, NO, NO, 0, 0, 0])]
+                .into_iter()
+                .chain((1..=6).map(|k| (k, [NO, 1, NO, NO, NO, NO])))
+                .collect(),
+            [NO, 1, NO, NO, NO, NO],
+            [NO, 0, NO, NO, NO, NO],
+            0,
+        ),
+        (vec![(7, [NO; 6]), (8, [NO; 6])], [NO; 6], [NO; 6], 7),
+    ] {
+        let mut album = Album::default();
+        for &(step, values) in &frames {
+            album.add_frame(&frame(step, values), Instant::now());
+        }
+        let (header, array) = read(album, None);
+        assert_eq!(
+            (array("seen"), array("age")),
+            (seen.to_vec(), age.to_vec()),
+            "{frames:?}"
+        );
+        assert_eq!(header["shown"]["seen_since"], since, "{frames:?}");
     }
-    let (header, array) = read(album, None);
-    assert_eq!(array("seen"), [255, 1, 255, 255, 255, 255]);
-    assert_eq!(header["shown"]["seen_since"], 0);
-}
-
-#[test]
-fn a_memory_says_how_far_it_reaches() {
-    let mut album = Album::default();
-    album.add_frame(&frame(7, [255, 1, 255, 255, 255, 255]), Instant::now());
-    album.add_frame(&frame(8, [255, 1, 255, 255, 255, 255]), Instant::now());
-    let (header, _) = read(album, None);
-    assert_eq!(header["shown"]["seen_since"], 7);
-    let shape = (&header["shown"]["height"], &header["shown"]["width"]);
-    assert_eq!(shape, (&Value::from(2), &Value::from(3)));
-}
-
-#[test]
-fn a_belief_without_its_frame_is_not_taken() {
-    let mut album = Album::default();
-    assert!(!album.add_belief(&agent_belief(1), None));
-    album.add_frame(&frame(1, [255; 6]), Instant::now());
-    assert!(album.add_belief(&agent_belief(1), None));
-}
-
-#[test]
-fn an_episode_that_begins_again_remembers_nothing() {
-    let mut album = Album::default();
-    album.add_frame(&frame(5, [255, 0, 1, 255, 255, 255]), Instant::now());
-    album.add_frame(&frame(1, [255; 6]), Instant::now());
-    let (_, array) = read(album, None);
-    assert_eq!(array("seen"), [255; 6]);
 }
 
 #[test]
@@ -308,8 +294,12 @@ fn the_last_few_thousand_steps_are_kept() {
 fn a_step_with_a_belief_is_shown_rather_than_a_slightly_newer_one() {
     let mut album = Album::default();
     let now = Instant::now();
+    assert!(
+        !album.add_belief(&agent_belief(1), None),
+        "without its frame"
+    );
     album.add_frame(&frame(1, [255; 6]), now);
-    album.add_belief(&agent_belief(1), None);
+    assert!(album.add_belief(&agent_belief(1), None));
     album.add_frame(&frame(2, [255; 6]), now);
     let (header, _) = read(album, None);
     assert_eq!(header["shown"]["step"], 1);

@@ -20,7 +20,6 @@ _numbers = itertools.count()
 
 
 def unused_instance() -> str:
-    """A name that no other instance has."""
     return f"page-{os.getpid()}-{next(_numbers)}"
 
 
@@ -28,7 +27,6 @@ class Program:
     """A running program; killed with the test."""
 
     def __init__(self, path: Path, arguments: list[str], instance: str = "") -> None:
-        """Starts it. What it prints to standard output can be read with `line`."""
         assert path.is_file(), f"expected {path}: cargo build --workspace"
         self.instance = instance
         environment = {"RUST_LOG": "error"} | os.environ
@@ -51,7 +49,6 @@ class Program:
         return line.strip()
 
     def interrupt(self) -> None:
-        """Asks it to end; returns when it has."""
         self._process.send_signal(signal.SIGINT)
         self.wait()
 
@@ -60,7 +57,6 @@ class Program:
         self._process.send_signal(signal.SIGSTOP)
 
     def wait(self) -> int:
-        """Waits for its end: the exit code."""
         return self._process.wait(PATIENCE)
 
     def kill(self) -> None:
@@ -71,20 +67,14 @@ class Program:
 
 
 class Dashboard(Program):
-    """A running dashboard."""
-
     def __init__(self, path: Path, arguments: list[str], port: int) -> None:
-        """Starts it and waits until it tells where its page is."""
         super().__init__(path, [*arguments, f"--listen=127.0.0.1:{port}"])
         self.url = self.line()
         self.port = int(self.url.rstrip("/").rpartition(":")[2])
 
 
 class Programs:
-    """Starts programs that end with a test."""
-
     def __init__(self, folder: Path, stack: ExitStack) -> None:
-        """They are in this folder."""
         self._folder = folder
         self._stack = stack
 
@@ -103,7 +93,6 @@ class Programs:
         )
 
     def is_serving(self, instance: str) -> bool:
-        """Whether a server answers there."""
         command = [self._path("server"), "status", f"--instance={instance}"]
         return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
 

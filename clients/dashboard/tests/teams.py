@@ -14,32 +14,30 @@ STATES = ("flew", "hovered", "late")
 #: Eight cells right and four down, and back.
 THERE, BACK = [3] * 8 + [1] * 4, [0] * 4 + [2] * 8
 
-#: Of a recording, and of each of its records (PROTOCOL.md).
-FILE_HEADER, RECORD_HEADER = struct.Struct("=8sII"), struct.Struct("=QIIII")
-
+#: Of each record of a recording (PROTOCOL.md).
+_RECORD = struct.Struct("=QIII")
 _FRAME = struct.Struct("=IIQIIIIQQQdQQIIIHH")
 _ROBOT = struct.Struct("=ddIIIIIIII")
 _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 
 
-def write_recording(file: Path, n_robots: int, n_steps: int) -> None:
-    """Writes steps of robots that begin seven rows and ten columns apart, round the grid."""
+def write_recording(file: Path, n_robots: int, n_steps: int, nanos: int = 0) -> None:
+    """Writes steps of robots that begin seven rows and ten columns apart, round the grid.
+
+    Frames come so many nanoseconds after what tells of the server.
+    """
     cells = np.array([(4 + 7 * robot, 5 + 10 * robot) for robot in range(n_robots)])
     cells %= (HEIGHT, WIDTH)
     frames = [(2, _frame(step, cells)) for step in range(1, n_steps + 1)]
     totals = dict.fromkeys(["n_servers", "n_truths", "n_lost_frames", "n_lost_truths"], 0)
     end = (4, json.dumps(totals | {"n_servers": 1, "n_frames": n_steps}).encode())
-    parts = [FILE_HEADER.pack(b"EMBERREC", 2, 0)]
+    parts = [struct.pack("=8sII", b"EMBERREC", 2, 0)]
     for kind, body in [(1, json.dumps(_server(n_robots)).encode()), *frames, end]:
         compress = zlib.compressobj(wbits=-15)
-        parts.append(sealed(kind, compress.compress(body) + compress.flush()))
+        stored = compress.compress(body) + compress.flush()
+        head = _RECORD.pack(nanos * (kind != 1), kind, len(stored), 0)
+        parts += [head, zlib.crc32(stored, zlib.crc32(head)).to_bytes(4, "little"), stored]
     file.write_bytes(b"".join(parts))
-
-
-def sealed(kind: int, stored: bytes, nanos: int = 0, n_lost: int = 0) -> bytes:
-    """A record with its checksum."""
-    head = RECORD_HEADER.pack(nanos, kind, len(stored), n_lost, 0)[:-4]
-    return head + zlib.crc32(stored, zlib.crc32(head)).to_bytes(4, "little") + stored
 
 
 def _server(n_robots: int) -> dict[str, object]:

@@ -8,7 +8,7 @@ from http.client import HTTPConnection, HTTPResponse
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from running import PATIENCE, Dashboard
+from running import PATIENCE, Dashboard, unused_instance
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 3, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 720}}
@@ -33,36 +33,26 @@ def handshake(connection: HTTPConnection, path: str, **headers: str) -> int:
 
 
 def connect(dashboard: Dashboard) -> HTTPConnection:
-    """A connection to a dashboard."""
     return HTTPConnection("127.0.0.1", dashboard.port, timeout=PATIENCE)
 
 
-def test_other_sites_are_refused(programs):
+def test_other_sites_are_refused_and_the_page_says_what_it_may_load(programs):
     dashboard = programs.dashboard("page-alone", name="fire.example")
     own = f"127.0.0.1:{dashboard.port}"
-
-    def page(host: str) -> int:
-        return answer(connect(dashboard), "/", Host=host).status
-
-    assert [page(own), page("fire.example"), page("evil.example")] == [200, 200, 403]
+    replies = [
+        answer(connect(dashboard), "/", Host=host) for host in (own, "fire.example", "evil.example")
+    ]
+    assert [reply.status for reply in replies] == [200, 200, 403]
+    policy = replies[0].headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy and "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy
 
     def socket(host: str, **origin: str) -> int:
         return handshake(connect(dashboard), "/socket", Host=host, **origin)
 
     assert [socket(own), socket(own, Origin=f"http://{own}")] == [101, 101]
     assert socket("fire.example", Origin="https://fire.example") == 101
-    assert [socket(host, Origin="http://evil.example") for host in (own, "evil.example")] == [
-        403
-    ] * 2
-
-
-def test_the_page_says_what_it_may_load(programs):
-    dashboard = programs.dashboard("page-alone")
-    reply = answer(connect(dashboard), "/", Host=f"127.0.0.1:{dashboard.port}")
-    policy = reply.headers["Content-Security-Policy"]
-    assert "default-src 'self'" in policy
-    assert "unsafe" not in policy
-    assert "frame-ancestors 'none'" in policy
+    assert socket(own, Origin="http://evil.example") == 403
 
 
 def serious(look) -> list[str]:
@@ -77,12 +67,25 @@ def serious(look) -> list[str]:
 
 
 @pytest.mark.parametrize(("theme", "screen"), [("light", DESK), ("dark", PHONE)], ids=str)
-def test_axe_finds_nothing_serious(programs, open_page, theme, screen):
-    server = programs.server(publish_truth=True)
-    dashboard = programs.dashboard(server.instance)
-    look = open_page(dashboard, color_scheme=theme, **screen)
-    programs.agent(server.instance)
+def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, theme, screen):
+    """A picture of it is kept for people to look at."""
+    instance = unused_instance()
+    look = open_page(programs.dashboard(instance), color_scheme=theme, **screen)
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    assert serious(look) == []
+    world = {"height": 64, "width": 64, "moves": 64, "burn_in": 12000}
+    server = programs.server(instance, publish_truth=True, **world)
+    look.eventually(lambda: look.picture(".shown"), "the world before its first step")
+    programs.agent(instance)
+    look.wait_for_steps()
     look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
+    assert look.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    if screen is DESK:
+        assert look.page.evaluate("document.documentElement.scrollHeight <= innerHeight")
+    folder = request.config.getoption("--screenshots")
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{'phone' if screen is PHONE else 'desk'}-{theme}.png"
+    look.page.screenshot(path=folder / name, full_page=screen is PHONE)
     assert serious(look) == []
     look.page.keyboard.press("Space")
     server.kill()
@@ -90,25 +93,7 @@ def test_axe_finds_nothing_serious(programs, open_page, theme, screen):
     assert serious(look) == []
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_axe_finds_nothing_serious_while_waiting(programs, open_page, theme):
-    look = open_page(programs.dashboard("page-alone"), color_scheme=theme)
-    look.eventually(lambda: look.text("state") == "waiting", "waiting")
-    assert serious(look) == []
-
-
-def test_every_control_is_reached_by_tab(watched):
-    look = watched.look
-    reached = set()
-    for _ in range(40):
-        look.page.keyboard.press("Tab")
-        reached.add(look.page.evaluate("document.activeElement.dataset.testid ?? ''"))
-        name = look.page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''")
-        reached.add(name.partition(":")[0])
-    assert {"world-select", "pause", "scrub", "cells of truth", "cells of entropy"} <= reached
-
-
-def test_canvases_tell_what_they_show(watched):
+def test_tab_reaches_every_control_and_canvases_tell_what_they_show(watched):
     look = watched.look
     truth, chart = look.at("panel-truth"), look.at("chart-reward")
     # Descriptions follow what is drawn, now and then.
@@ -118,25 +103,10 @@ def test_canvases_tell_what_they_show(watched):
     label = truth.get_attribute("aria-label")
     look.eventually(lambda: truth.get_attribute("aria-label") != label, "it is kept true")
     look.eventually(lambda: "mean" in chart.get_attribute("aria-label"), "the rewards")
-
-
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
-def test_it_fits(request, programs, open_page, theme, screen):
-    """A picture of it is kept for people to look at."""
-    server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
-    dashboard = programs.dashboard(server.instance)
-    look = open_page(dashboard, color_scheme=theme, **screen)
-    look.eventually(lambda: look.picture(".shown"), "the world before its first step")
-    assert programs.agent(server.instance, steps=300).wait() == 0
-    programs.agent(server.instance)
-    look.wait_for_steps()
-    look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
-    assert look.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    is_phone = screen is PHONE
-    if not is_phone:
-        assert look.page.evaluate("document.documentElement.scrollHeight <= innerHeight")
-    folder = request.config.getoption("--screenshots")
-    folder.mkdir(parents=True, exist_ok=True)
-    name = f"{'phone' if is_phone else 'desk'}-{theme}.png"
-    look.page.screenshot(path=folder / name, full_page=is_phone)
+    reached = set()
+    for _ in range(40):
+        look.page.keyboard.press("Tab")
+        reached.add(look.page.evaluate("document.activeElement.dataset.testid ?? ''"))
+        name = look.page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''")
+        reached.add(name.partition(":")[0])
+    assert {"world-select", "pause", "scrub", "cells of truth", "cells of entropy"} <= reached

@@ -1,7 +1,6 @@
 """Zones, no-fly cells, and what robots see beyond their path."""
 
 import numpy as np
-import pytest
 
 from conftest import ROOT
 from test_page_access import serious
@@ -31,8 +30,8 @@ def model_of_zones() -> str:
     return head + maps + sensor + zones + "[[states]]" + states + "".join(kernels)
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_land_is_drawn_and_told(programs, open_page, tmp_path, theme):
+def test_land_is_drawn_and_told(programs, open_page, tmp_path):
+    theme = "dark"
     model = tmp_path / "zones.toml"
     model.write_text(model_of_zones())
     shape = {"height": HEIGHT, "width": WIDTH, "moves": 6, "start": "8,3"}

@@ -46,25 +46,22 @@ def resting(programs, open_page):
     return server, look
 
 
-@pytest.mark.parametrize("chart", ["reward", "target", "log-loss", "objective"])
-def test_values_come_under_the_pointer(resting, programs, chart):
+def test_values_come_under_the_pointer(resting, programs):
     server, look = resting
-    canvas = look.at(f"chart-{chart}")
+    canvas = look.at("chart-target")
     canvas.hover(position={"x": canvas.bounding_box()["width"] - 1, "y": 20})
-    look.eventually(lambda: told(look, chart) == "at k 0", "all that there is")
+    look.eventually(lambda: told(look, "target") == "at k 0", "all that there is")
     assert programs.agent(server.instance, steps=40).wait() == 0
     # No step is lost: 40 are fewer than a reader's buffer holds.
-    look.eventually(lambda: told(look, chart) == "at k 40", "the step that came there")
+    look.eventually(lambda: told(look, "target") == "at k 40", "the step that came there")
     value = look.page.locator(".chart-target output")
     look.eventually(
         lambda: value.text_content() == str(look.picture(".shown.n_target_cells")), "its value"
     )
 
 
-def test_a_cell_that_moves_under_the_pointer_is_told(resting):
+def test_what_moves_under_the_pointer_is_told(resting):
     _, look = resting
-    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
-    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
     look.page.mouse.move(*middle(look, "panel-truth", 23, 31))
     look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell")
     look.page.set_viewport_size({"width": 1600, "height": 1100})
@@ -72,10 +69,24 @@ def test_a_cell_that_moves_under_the_pointer_is_told(resting):
     assert not is_at_robot(look)
     look.page.set_viewport_size({"width": 1280, "height": 720})
     look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell again")
-
-
-def test_a_page_that_scrolls_moves_under_the_pointer(resting):
-    _, look = resting
+    # Keys and the pointer take turns.
+    look.page.get_by_label("cells of seen so far").focus()
+    look.page.keyboard.press("ArrowDown")
+    look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")
+    look.page.mouse.move(*middle(look, "panel-truth", 6, 7))
+    look.eventually(lambda: is_at(look, "row 6, col 7"), "where the pointer went then")
+    # A pointer that leaves points at nothing.
+    look.page.get_by_label("cells of seen so far").blur()
+    look.page.mouse.move(2, 2)
+    look.eventually(lambda: is_at_robot(look), "it left the panel")
+    look.at("chart-target").hover()
+    look.eventually(lambda: told(look, "target") == "at k 0", "a value")
+    look.page.evaluate(
+        "document.documentElement.dispatchEvent("
+        "new PointerEvent('pointerleave', { isPrimary: true }))"
+    )
+    look.eventually(lambda: told(look, "target") == "", "it left the window")
+    # A page that scrolls moves under it.
     look.page.set_viewport_size({"width": 800, "height": 600})
     look.wait_for_pictures()
     x, y = middle(look, "panel-truth", 3, 4)
@@ -86,21 +97,6 @@ def test_a_page_that_scrolls_moves_under_the_pointer(resting):
     look.eventually(lambda: is_at(look, "row 5, col 4"), "two rows further down")
     look.page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
     look.eventually(lambda: is_at_robot(look), "no cell is there")
-
-
-def test_a_pointer_that_leaves_points_at_nothing(resting):
-    _, look = resting
-    look.page.mouse.move(*middle(look, "panel-seen", 3, 4))
-    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
-    look.page.mouse.move(2, 2)
-    look.eventually(lambda: is_at_robot(look), "it left the panel")
-    look.at("chart-target").hover()
-    look.eventually(lambda: told(look, "target") == "at k 0", "a value")
-    look.page.evaluate(
-        "document.documentElement.dispatchEvent("
-        "new PointerEvent('pointerleave', { isPrimary: true }))"
-    )
-    look.eventually(lambda: told(look, "target") == "", "it left the window")
 
 
 def test_a_panel_that_goes_is_pointed_at_no_more(programs, open_page):
@@ -149,14 +145,3 @@ def test_a_finger_points_while_it_touches(programs, open_page):
     touch("touchEnd")
     look.eventually(lambda: told(look, "reward") == "", "the finger was lifted")
     look.eventually(lambda: look.text("step") == step, "the tap went to that step")
-
-
-def test_a_pointer_does_not_hide_that_the_dashboard_is_gone(watched):
-    look = watched.look
-    look.allowed.append("WebSocket connection to .* failed")
-    watched.dashboard.kill()
-    look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
-    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
-    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
-    assert "dashboard gone" in look.text("state")
-    assert look.at("note").is_visible()

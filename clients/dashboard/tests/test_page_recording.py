@@ -1,6 +1,6 @@
 """A recording: it plays, waits, goes fast, ends, and begins again."""
 
-from teams import FILE_HEADER, RECORD_HEADER, sealed
+from teams import write_recording
 
 
 def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
@@ -48,22 +48,9 @@ def scrub_at_rest(look) -> None:
 
 def test_a_recording_that_begins_with_nothing_can_be_played_faster(programs, open_page, tmp_path):
     file = tmp_path / "late.recording"
-    programs.record(file, steps=20)
-    file.write_bytes(delayed(file.read_bytes(), nanos=3600 * 10**9))
+    write_recording(file, n_robots=1, n_steps=5, nanos=3600 * 10**9)
     look = open_page(programs.dashboard(recording=file))
     look.eventually(lambda: look.picture(".player.playing") is True, "it plays")
     assert look.picture(".shown") is None
     look.at("speed").select_option("0")
     look.eventually(lambda: look.text("clock") == "ended", "its end")
-
-
-def delayed(recording: bytes, *, nanos: int) -> bytes:
-    """A recording whose records come later, but for the first, which tells of the server."""
-    parts = [recording[: FILE_HEADER.size]]
-    rest = recording[FILE_HEADER.size :]
-    while rest:
-        time, kind, length, n_lost, _ = RECORD_HEADER.unpack_from(rest)
-        body = rest[RECORD_HEADER.size : RECORD_HEADER.size + length]
-        parts.append(sealed(kind, body, time + nanos * (len(parts) > 1), n_lost))
-        rest = rest[RECORD_HEADER.size + length :]
-    return b"".join(parts)

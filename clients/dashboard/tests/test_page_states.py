@@ -13,47 +13,22 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
     look.eventually(lambda: look.text("state") == "waiting", "waiting")
     command = look.page.get_by_text(f"emberwatch-server --instance {instance}", exact=True)
     assert command.is_visible()
-    programs.server(instance, publish_truth=True)
+    by_task = dict.fromkeys(("height", "width", "moves", "burn_in"))
+    programs.server(instance, task="small", **by_task)
     look.eventually(lambda: look.text("state") == "serving", "serving")
     programs.agent(instance)
     look.wait_for_steps()
+    task = look.page.locator("#task")
+    look.eventually(lambda: task.text_content() == "task small", "the task's name")
     look.eventually(lambda: look.text("policy") == "beam_exploit", "a policy")
     look.eventually(lambda: look.number("holder") > 0, "a holder")
     look.eventually(lambda: look.number("step") > 0, "a step")
     look.eventually(lambda: look.number("observers") >= 1, "an observer")
     assert not command.is_visible()
-
-
-def test_pause_scrub_and_live(watched, programs):
-    look = watched.look
-    # Its thousands of steps a second would push what is looked at out of what is kept.
-    watched.agent.interrupt()
-    look.at("pause").click()
-    paused = settled_serial(look)
-    drawn = look.drawn()
-    look.eventually(lambda: look.drawn() > drawn + 2, "pictures while paused")
-    assert look.picture(".shown.serial") == paused
-    look.at("scrub").focus()
-    look.page.keyboard.press("Home")
-    look.eventually(lambda: look.picture(".shown.serial") == look.picture(".kept.first"), "oldest")
-    programs.agent(watched.server.instance)
-    look.at("pause").click()
-    look.eventually(lambda: look.picture(".shown.serial") > paused, "live again")
-    look.wait_for_steps()
-
-
-def test_a_late_picture_does_not_hide_that_the_dashboard_is_gone(watched):
-    look = watched.look
-    look.allowed.append("WebSocket connection to .* failed")
-    look.page.evaluate("""() => {
-        window.held = [];
-        window.requestAnimationFrame = (draw) => held.push(draw);
-    }""")
-    look.eventually(lambda: look.page.evaluate("held.length > 0"), "a picture to draw")
-    watched.dashboard.kill()
-    look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
-    draw = "() => { held.splice(0).forEach(draw => draw()); return state.textContent; }"
-    assert "dashboard gone" in look.page.evaluate(draw)
+    look.eventually(lambda: look.has("belief"), "a belief is shown")
+    look.eventually(lambda: look.page.get_by_text("--publish-truth").is_visible(), "no truth")
+    assert look.page.get_by_text("needs the truth and a belief").is_visible()
+    assert not look.at("panel-truth").is_visible()
 
 
 def settled_serial(look) -> int:
@@ -82,6 +57,8 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     watched.agent.interrupt()
     look.page.keyboard.press("Space")
     at = settled_serial(look)
+    look.wait_for_pictures()
+    assert look.picture(".shown.serial") == at, "pictures while paused"
     for key, by in [("ArrowLeft", -1), ("Shift+ArrowLeft", -10), ("ArrowRight", 1)]:
         look.page.keyboard.press(key)
         at += by
@@ -91,7 +68,7 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     look.page.keyboard.press("End")
     look.eventually(lambda: look.picture(".shown.serial") > at, "the newest when it was pressed")
     programs.agent(watched.server.instance)
-    look.page.keyboard.press("Space")
+    look.at("pause").click()
     look.wait_for_steps()
 
 
@@ -129,23 +106,12 @@ def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_p
     assert look.text("objective") == "–"
 
 
-def test_a_server_that_is_killed_is_waited_for(watched, programs):
+def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, programs):
     server, look = watched.server, watched.look
     server.kill()
     look.eventually(lambda: look.text("state") == "waiting", "waiting")
     assert look.text("note") != ""
     assert look.at("panel-frame").is_visible(), "the last picture stays"
-    programs.server(server.instance, publish_truth=True, seed=9)
-    look.eventually(lambda: look.text("state") == "serving", "serving")
-    programs.agent(server.instance)
-    look.eventually(lambda: look.picture(".shown.seed") == "9", "the new server's world")
-    look.wait_for_steps()
-
-
-def test_a_server_with_another_grid_takes_over(watched, programs):
-    server, look = watched.server, watched.look
-    server.kill()
-    look.eventually(lambda: look.text("state") == "waiting", "waiting")
     look.wait_for_pictures()
     box = look.at("panel-seen").bounding_box()
     look.at("panel-seen").hover(position={"x": box["width"] - 2, "y": box["height"] - 2})
@@ -153,6 +119,7 @@ def test_a_server_with_another_grid_takes_over(watched, programs):
     programs.server(server.instance, height=20, width=36, publish_truth=True, seed=9)
     look.eventually(lambda: look.text("state") == "serving", "serving")
     programs.agent(server.instance)
+    look.eventually(lambda: look.picture(".shown.seed") == "9", "the new server's world")
     look.eventually(
         lambda: look.picture(".arrays.truth.length") == 20 * 36 and look.has("belief"),
         "the new grid with a belief",
@@ -177,19 +144,23 @@ def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     look.page.goto(dashboard.url)
     look.eventually(look.at("panel-frame").is_visible, "a world")
     look.allowed.append("WebSocket connection to .* failed")
+    look.page.evaluate("""() => {
+        window.held = [];
+        window.draws = window.requestAnimationFrame;
+        window.requestAnimationFrame = (draw) => held.push(draw);
+    }""")
+    look.eventually(lambda: look.page.evaluate("held.length > 0"), "a picture to draw")
     dashboard.kill()
     look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
+    draw = "() => { held.splice(0).forEach(draw => draw()); return state.textContent; }"
+    assert "dashboard gone" in look.page.evaluate(draw), "a late picture does not hide it"
+    look.page.evaluate("() => { window.requestAnimationFrame = window.draws; }")
+    look.at("panel-frame").hover(position={"x": 2, "y": 2})
+    look.eventually(lambda: look.page.get_by_text("row 0, col 0").is_visible(), "where it points")
+    assert "dashboard gone" in look.text("state"), "nor does a pointer"
+    assert look.at("note").is_visible()
     assert look.at("panel-frame").is_visible(), "the last picture stays"
     drawn = look.drawn()
     programs.dashboard(server.instance, port=dashboard.port)
     look.eventually(lambda: look.text("state") == "serving", "serving again")
     eventually(lambda: look.drawn() > drawn + 3, "pictures again")
-
-
-def test_the_task_is_named(programs, open_page):
-    by_task = dict.fromkeys(("height", "width", "moves", "burn_in"))
-    server = programs.server(task="small", **by_task)
-    look = open_page(programs.dashboard(server.instance))
-    look.eventually(
-        lambda: look.page.locator("#task").text_content() == "task small", "the task's name"
-    )

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 
 def told_again(message: bytes, change: Callable[[dict], None]) -> bytes:
-    """A picture whose words are changed."""
     end = 4 + int.from_bytes(message[:4], "little")
     words = json.loads(message[4:end])
     change(words)

@@ -46,12 +46,10 @@ def table(header: str) -> list[list[str]]:
 
 
 def limits() -> dict[str, int]:
-    """The numbers of section 1 by name."""
     return {name: int(value) for name, value, _ in table("| limit | value |")}
 
 
 def examples() -> list[dict[str, Any]]:
-    """The JSON messages of section 6 in their order."""
     blocks = re.findall(r"^```json\n(.*?)^```", PROTOCOL, re.MULTILINE | re.DOTALL)
     return [json.loads(line) for block in blocks for line in block.splitlines()]
 

@@ -36,12 +36,10 @@ def serving(**flags: object) -> Iterator[str]:
 
 
 def small_server(**flags: object) -> Server:
-    """A server of `SMALL` worlds, which ends with the test."""
     return server(**{**FLAGS, **flags}, ready=False)
 
 
 def closed_later(env: Any) -> Any:
-    """An environment that the end of the test closes."""
     at_the_end.callback(env.close)
     return env
 

@@ -6,10 +6,8 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError
 
 
 def fails(code: str, match: str | None = None) -> pytest.RaisesExc[EmberwatchError]:
-    """A context that expects an error with this code."""
     return pytest.raises(EmberwatchError, match=match, check=lambda error: error.code == code)
 
 
 def refuses(match: str) -> pytest.RaisesExc[InvalidArgumentError]:
-    """A context in which an impossible argument is named in these words."""
     return pytest.raises(InvalidArgumentError, match=match)

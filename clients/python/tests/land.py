@@ -64,7 +64,6 @@ def _rows(cells: NDArray[Any] | str) -> str:
 
 
 def cells_of(start: Sequence[int], moves: Sequence[int], no_fly: Cells) -> list[tuple[int, int]]:
-    """Start and the cell after each move."""
     cells = [(int(start[0]), int(start[1]))]
     for move in moves:
         down, right = ((-1, 0), (1, 0), (0, -1), (0, 1))[move]
@@ -93,5 +92,4 @@ def legal_moves(cell: tuple[int, int], no_fly: Cells) -> list[bool]:
 
 
 def stays(cells: Sequence[tuple[int, int]]) -> int:
-    """How often a robot stayed in place."""
     return sum(before == after for before, after in pairwise(cells))

@@ -10,8 +10,6 @@ Array = NDArray[np.float64]
 
 
 class Parameters(NamedTuple):
-    """What a model file says."""
-
     #: ``w[own, to, from, row, col]``; one kernel, or one by the cell's own state; as many by zone.
     kernels: Array
     bias: Array
@@ -23,7 +21,6 @@ class Parameters(NamedTuple):
 
 
 def parameters(text: str) -> Parameters:
-    """Reads a model file."""
     file: dict[str, Any] = tomllib.loads(text)
     states, entries = file["states"], file["kernel"]
     names = [state["name"] for state in states]

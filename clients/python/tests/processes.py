@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import secrets
-import select
 import shutil
 import signal
 import subprocess
@@ -36,22 +35,17 @@ SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 #: Where iceoryx2 keeps files of nodes and services.
 CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
-#: Imports of this module in a `script`.
-IMPORTS = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-
 #: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
 at_the_end = ExitStack()
 
 
 def find(name: str) -> str:
-    """The path of one of our programs."""
     path = shutil.which(name)
     assert path is not None, f"expected {name} on the PATH"
     return path
 
 
 def unused_instance() -> str:
-    """An instance name that no other program uses."""
     return f"test-{secrets.token_hex(8)}"
 
 
@@ -81,7 +75,6 @@ class Program:
         return self.output()
 
     def stop(self) -> None:
-        """Stops it, if it still runs, and waits for its end."""
         self.process.terminate()
         self.process.wait(PATIENCE)
         self._output.close()
@@ -93,7 +86,6 @@ def server(instance: str | None = None, *, ready: bool = True, **flags: object) 
 
 
 def script(code: str, *arguments: object) -> Script:
-    """Runs Python code in a process of its own, which ends with the test."""
     return at_the_end.enter_context(closing(Script(code, *arguments)))
 
 
@@ -101,10 +93,7 @@ class Server:
     """A running server and the connections to it."""
 
     def __init__(self, instance: str | None = None, *, ready: bool = True, **flags: object) -> None:
-        """Starts it and waits until it answers and, if asked, until its worlds are ready.
-
-        Flags that are None are left out.
-        """
+        """Waits until it answers and its worlds are ready; flags of None are left out."""
         self.instance = instance or unused_instance()
         arguments: list[str] = []
         for name, value in {"instance": self.instance, **flags}.items():
@@ -122,48 +111,40 @@ class Server:
             self._held.enter_context(self._client)
             self._held.callback(self._shut_down)
             self._held.callback(self.wake_up)
-            assert not ready or eventually(self._is_ready)
+            worlds = lambda: self.status().worlds  # noqa: E731
+            assert not ready or eventually(lambda: not any(it.resetting for it in worlds()))
         except BaseException:
             self.close()
             raise
-
-    def connect(self) -> Client:
-        """A connection that the end of the test closes."""
-        return self._held.enter_context(Client(self.instance))
-
-    def status(self) -> ServerStatus:
-        """What is going on at it; over a connection of its own, which counts as a client."""
-        return self._client.status(timeout=PATIENCE)
 
     def _shut_down(self) -> None:
         """Asks it to stop: quicker than a signal, which it hears when it next looks around."""
         with suppress(EmberwatchError):
             self._client.shutdown(timeout=1.0)
 
-    def _is_ready(self) -> bool:
-        return not any(world.resetting for world in self.status().worlds)
+    def connect(self) -> Client:
+        return self._held.enter_context(Client(self.instance))
+
+    def status(self) -> ServerStatus:
+        return self._client.status(timeout=PATIENCE)
 
     def signal(self, number: int) -> None:
-        """Sends it a signal."""
         os.kill(self.program.pid, number)
 
     def stop(self) -> None:
-        """Pauses it; returns when it no longer runs."""
         self.signal(signal.SIGSTOP)
         assert eventually(lambda: _state(self.program.pid) == "T")
 
     def wake_up(self) -> None:
         """Lets it go on, if it still runs."""
-        if is_running(self.program.pid):
+        if self.program.process.poll() is None:
             self.signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """Ends it as no handler can prevent; returns when it has ended."""
         self.signal(signal.SIGKILL)
         self.program.process.wait(PATIENCE)
 
     def close(self) -> None:
-        """Closes the connections and stops it."""
         self._held.close()
 
 
@@ -192,12 +173,10 @@ class Script:
         return line.strip()
 
     def say(self, text: str = "") -> None:
-        """Sends it a line."""
         self._process.stdin.write(f"{text}\n")
         self._process.stdin.flush()
 
     def signal(self, number: int) -> None:
-        """Sends a signal to it and its process group, as a terminal does."""
         os.killpg(self.pid, number)
 
     def end(self) -> tuple[int, str, str]:
@@ -206,7 +185,6 @@ class Script:
         return self._process.returncode, out, err
 
     def close(self) -> None:
-        """Kills it."""
         self._process.kill()
         self._process.communicate()
 
@@ -216,10 +194,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def isolated(options: str, *, pids: bool = False) -> Run:
-    """Runs commands with a `/dev/shm` of their own, mounted with these options.
-
-    Skips the test where no mount namespace, or with `pids` no PID namespace in it, may be made.
-    """
+    """Runs commands with a `/dev/shm` of their own; skips the test where none may be made."""
     unshare = ["unshare", "-m", *([] if os.getuid() == 0 else ["-r"]), "sh", "-c"]
 
     def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -243,27 +218,6 @@ def eventually(holds: Callable[[], bool], limit: float = PATIENCE) -> bool:
     return True
 
 
-@contextmanager
-def stopped(pid: int) -> Iterator[None]:
-    """A process that does not run meanwhile."""
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        assert eventually(lambda: _state(pid) == "T")
-        yield
-    finally:
-        os.kill(pid, signal.SIGCONT)
-
-
-def is_running(pid: int) -> bool:
-    """Whether any thread of a process runs; one that nobody has waited for yet has ended."""
-    try:
-        process = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return False
-    with os.fdopen(process):
-        return not select.select([process], [], [], 0)[0]
-
-
 def _state(pid: int) -> str:
     try:
         with open(f"/proc/{pid}/stat") as file:
@@ -273,11 +227,7 @@ def _state(pid: int) -> str:
 
 
 def asleep(thread: threading.Thread | int | None = None) -> None:
-    """Waits until a thread sleeps as on the answer of a stopped server.
-
-    Args:
-        thread: A thread of this process, the id of another process, or None: the main thread.
-    """
+    """Waits until the main thread, another, or a process sleeps, as on an answer."""
     thread = thread or threading.main_thread()
     number = thread if isinstance(thread, int) else thread.native_id
     place = Path(f"/proc/{number}/task/{number}/stat")
@@ -308,7 +258,6 @@ def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo
 
 
 def services(instance: str) -> list[Path]:
-    """The files of an instance's services."""
     found = []
     for path in (CHANNELS / "services").iterdir():
         with suppress(FileNotFoundError):  # of a program that ends now

@@ -22,7 +22,6 @@ EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
 
 
 def made(folder: Path, *flags: object) -> dict[str, Any]:
-    """The model file that the command writes."""
     out = folder / "new" / "land.toml"
     main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
     return tomllib.loads(out.read_text("utf-8"))
@@ -37,7 +36,6 @@ def geotiff(
     cell: tuple[float, float] = (30, 30),
     **profile: Any,
 ) -> Path:
-    """A GeoTIFF of these bands."""
     arrays = np.array(bands or [ARRIVAL], profile.pop("dtype", "float32"))
     place = {
         "transform": rasterio.Affine(cell[0], 0, corner[0], 0, -cell[1], corner[1]),
@@ -53,7 +51,6 @@ def geotiff(
 
 
 def ascii_grid(path: Path, values: NDArray[Any] = ARRIVAL, *, side: str = "cellsize 30") -> Path:
-    """An ESRI ASCII grid, as text."""
     rows = [" ".join(str(value) for value in row) for row in values.tolist()]
     head = f"ncols {values.shape[1]}\nnrows {len(values)}\nxllcorner 0\nyllcorner 0\n{side}\n"
     path.write_text(f"{head}NODATA_value {NEVER}\n" + "\n".join(rows) + "\n")

@@ -1,6 +1,7 @@
 """Which module imports which: no circles, and rooms use only those below them."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -14,8 +15,8 @@ ROOMS = (
 ).split()
 
 
+@cache
 def modules() -> dict[str, Path]:
-    """The package's modules by name."""
     names = {"emberwatch._native": PACKAGE / "_native.pyi"}
     for path in PACKAGE.rglob("*.py"):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
@@ -23,6 +24,7 @@ def modules() -> dict[str, Path]:
     return names
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """The modules that a file names in imports, wherever in it they stand."""
     found = set()
@@ -44,7 +46,6 @@ def test_no_module_imports_itself_through_others() -> None:
 
 
 def room(name: str) -> str:
-    """The room of a module."""
     return f"{name}.__init__".split(".")[1]
 
 

@@ -98,36 +98,21 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
 }
 
 
-@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize("kind", ENVIRONMENTS)
 def test_a_wrong_action_is_named_and_not_flown(kind: str) -> None:
     maker, action, given = ENVIRONMENTS[kind]
-    env = maker().unwrapped
+    env = getattr(made := maker(), "unwrapped", made)
     env.reset(seed=1)
-    for wrong, words in WRONG[kind]:
+    wrong = [*WRONG.get(kind, [])]
+    wrong += [(action(Elsewhere(it)), f"action.*: expected .*, got .*: {it}") for it in ELSEWHERE]
+    masked = action(np.ma.array(given, mask=True))
+    wrong += [(masked, r"action.*: expected .*, got (masked values|.*masked element.*)")]
+    for value, words in wrong:
         with refuses(words):
-            env.step(wrong)
-    seen, _, _, _, info = env.step(action(given))
-    assert np.all((seen["move"] if "move" in kind else info["step"]) == 1)
-
-
-@pytest.mark.parametrize("kind", ENVIRONMENTS)
-def test_an_array_that_cannot_be_read_is_named_in_its_own_words(kind: str) -> None:
-    maker, action, _ = ENVIRONMENTS[kind]
-    env = maker()
-    env.reset(seed=1)
-    for error in ELSEWHERE:
-        with refuses(f"action.*: expected .*, got .*: {error}"):
-            env.step(action(Elsewhere(error)))
-
-
-@pytest.mark.parametrize("kind", ENVIRONMENTS)
-def test_masked_values_are_not_flown(kind: str) -> None:
-    maker, action, given = ENVIRONMENTS[kind]
-    env = maker()
-    env.reset(seed=1)
-    with refuses(r"action.*: expected .*, got (masked values|.*masked element.*)"):
-        env.step(action(np.ma.array(given, mask=True)))
-    env.step(action(np.ma.array(given)))
+            env.step(value)
+    seen, _, _, _, info = env.step(action(np.ma.array(given)))
+    if kind != "team":
+        assert np.all((seen["move"] if "move" in kind else info["step"]) == 1)
 
 
 def test_seeds_of_any_library_are_alike() -> None:
@@ -156,19 +141,12 @@ def test_seeds_of_a_lease_are_one_for_each_world() -> None:
     assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
 
 
-def mask_of(*values: Any) -> dict[str, Any]:
-    return {"options": {"reset_mask": np.array(values)}}
-
-
 #: Arguments of a reset, and words of their refusals: of any environment, and of a vector.
 WRONG_RESETS: list[tuple[dict[str, Any], str]] = [
     *(({"seed": it}, rf"seed: expected an integer.*, got {it}") for it in (-1, 2**64)),
     *(
-        (
-            {"options": it},
-            r"options: expected a dictionary such as \{'resume': True\}, or None, got",
-        )
-        for it in ("resume", ["resume"], 5, {"resume"}, Elsewhere(ELSEWHERE[0]))
+        ({"options": it}, r"options: expected a dictionary such as \{'resume': True\}, or None, ")
+        for it in ("resume", 5, {"resume"}, Elsewhere(ELSEWHERE[0]))
     ),
 ]
 WRONG_SINGLE: list[tuple[dict[str, Any], str]] = [
@@ -177,12 +155,16 @@ WRONG_SINGLE: list[tuple[dict[str, Any], str]] = [
 ]
 WRONG_VECTOR: list[tuple[dict[str, Any], str]] = [
     *(({"seed": [1] * n}, "seed: expected an integer, None or 2 of them, got") for n in (0, 1, 3)),
-    ({"options": {"mask": np.ones(2, bool)}}, "options: expected 'resume', got 'mask'"),
-    ({"options": {"reset_mask": [True, False]}}, r"an array \(2,\) of bool .* got <class 'list'>"),
-    (mask_of(1, 0), r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
-    (mask_of(True), r"expected an array \(2,\) of bool .* got bool \(1,\)"),
-    (mask_of(False, False), "with at least one True"),
-]  # fmt: skip
+    *(
+        ({"options": {"reset_mask": it}}, words)
+        for it, words in (
+            ([True, False], r"an array \(2,\) of bool .* got <class 'list'>"),
+            (np.array([1, 0]), r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
+            (np.array([True]), r"expected an array \(2,\) of bool .* got bool \(1,\)"),
+            (np.array([False, False]), "with at least one True"),
+        )
+    ),
+]
 
 
 def test_wrong_arguments_of_a_reset_are_named() -> None:
@@ -228,9 +210,6 @@ def test_a_specification_is_json_that_makes_the_same_environment() -> None:
     again = closed_later(gymnasium.make_vec(EnvSpec.from_json(text)))
     assert again.num_envs == 2 and again.autoreset_mode is mode
     assert str(SMALL["height"]) in text and os.fspath(LIVELY) in text
-
-
-def test_that_of_a_wrapper_is_json_too() -> None:
     prior = np.full((3, 7, 5), 1 / 3, np.float32)
     for model in (Model.named(LIVELY), Path(LIVELY), LIVELY, None):
         wrapped = BeliefObservation(make(), prior=prior, model=model)

@@ -20,18 +20,14 @@ from emberwatch.client import recording
 
 WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 6, "model": LIVELY, "burn_in": 60}
 SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}
+PLAIN = "world_seed steps mean_reward mean_distinct_cells hit_rate mean_fire_cells moves".split()
 MERIT = (
-    "steps_to_detection",
-    "burning_cells_at_detection",
-    "recent_steps",
-    "burning_seen_share",
-    "front_distance",
-    "grid_seen_share",
-)
+    "steps_to_detection burning_cells_at_detection recent_steps burning_seen_share front_distance "
+    "grid_seen_share"
+).split()
 
 
 def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
-    """Random moves in as many worlds as are shown."""
     rng = np.random.default_rng(seed)
     return lambda frames: rng.integers(0, 4, len(frames))
 
@@ -45,7 +41,6 @@ def compare(
 
 
 def private(**changes: object) -> list[str]:
-    """The same worlds as flags."""
     flags = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn-in": 60, **changes}
     return [f"--{name}={value}" for name, value in flags.items()]
 
@@ -67,15 +62,10 @@ def states(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("robots", "recent_steps", "policy"),
-    [(1, 10, "beam_exploit"), (3, 2, "beam_exploit"), (1, 3, "coverage"), (2, 10, "coverage")],
+    ("robots", "recent_steps", "policy"), [(3, 2, "beam_exploit"), (1, 3, "coverage")]
 )
 def test_paths_flown_again_score_the_same_to_the_digit(
-    tmp_path: Path,
-    states: Path,
-    robots: int,
-    recent_steps: int,
-    policy: str,
+    tmp_path: Path, states: Path, robots: int, recent_steps: int, policy: str
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
     worlds = WORLDS
@@ -118,16 +108,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
     theirs = read(csv)
     assert len(rows) == len(theirs) == 4
     for mine, other in zip(rows, theirs, strict=True):
-        for value in (
-            "world_seed",
-            "steps",
-            "mean_reward",
-            "mean_distinct_cells",
-            "hit_rate",
-            "mean_fire_cells",
-            "moves",
-            *MERIT,
-        ):
+        for value in (*PLAIN, *MERIT):
             assert getattr(mine, value) == getattr(other, value), value
         assert None not in [getattr(mine, value) for value in MERIT]
 
@@ -148,16 +129,8 @@ def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        (
-            {"seeds": range(3, 6)},
-            "expected one row for each world, 4 from seed 3 to 6, got 3 from seed 3 to 5",
-        ),
-        ({"steps": 11}, "steps: expected 12, got 11"),
-        ({"n_moves": 5}, "moves: expected 6, got 5"),
         ({"recent_steps": 9}, "--recent-steps: expected 10, got 9"),
         ({"burn_in": 61}, "worlds_fingerprint (model, grid, sensor, start, burn-in): expected"),
-        ({"width": 8}, "worlds_fingerprint (model, grid, sensor, start, burn-in): expected"),
-        ({"name": "random_walk"}, 'policy "random_walk": expected a name that no policy compared'),
     ],
     ids=str,
 )
@@ -169,16 +142,6 @@ def test_rows_of_other_worlds_are_refused(
     done = compare("--policies=random_walk", f"--add={file}", *private())
     assert done.returncode == 1 and problem in done.stderr, done.stderr
     assert done.stderr.count("--add") == 1
-
-
-@pytest.mark.parametrize("text", ["policy,steps\nmine,3\n", "\x00\xff"], ids=repr)
-def test_what_is_no_file_of_rows_is_named(tmp_path: Path, text: str) -> None:
-    file = tmp_path / "mine.csv"
-    file.write_text(text, "latin-1")
-    done = compare("--policies=random_walk", f"--add={file}", *private())
-    assert done.returncode == 1 and f"--add: {file}: " in done.stderr, done.stderr
-    with refuses(r"csv: expected .* to have the columns policy,"):
-        score(file)
 
 
 def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -196,20 +159,16 @@ def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert list(file.parent.iterdir()) == [file]
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
+def test_a_row_says_where_the_belief_came_from() -> None:
+    for changes, expected in (
         ({"observation": "frame"}, "none"),
         ({"observation": "local"}, "known_model"),
         ({"observation": ["frame", "belief"]}, "known_model"),
         ({"observation": "local", "estimator": "mine"}, "mine"),
-    ],
-    ids=str,
-)
-def test_a_row_says_where_the_belief_came_from(changes: dict[str, Any], expected: str) -> None:
-    keywords = {**WORLDS, **SCALE, "seeds": [3], "steps": 1, **changes}
-    rows = evaluate(lambda _: np.zeros(1, int), name="mine", **keywords)
-    assert rows[0].estimator == expected
+    ):
+        keywords = {**WORLDS, **SCALE, "seeds": [3], "steps": 1, **changes}
+        (row,) = evaluate(lambda _: np.zeros(1, int), name="mine", **keywords)
+        assert row.estimator == expected
 
 
 def test_a_summary_says_which_worlds_are_for_tests() -> None:
@@ -253,37 +212,26 @@ def test_what_cannot_be_evaluated_is_named() -> None:
         evaluate(None, name="mine", **{**WORLDS, **SCALE})
 
 
-@pytest.mark.parametrize("flags", [{}, {"publish_truth": True, "reveal_model": False}], ids=str)
-def test_without_hidden_states_the_other_figures_are_there(
-    tmp_path: Path, flags: dict[str, bool]
-) -> None:
+def test_without_hidden_states_the_other_figures_are_there(tmp_path: Path) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
-    running = server(worlds=4, **settings, **flags)
-    keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
-    rows = evaluate(walk(0), name="mine", csv=tmp_path / "mine.csv", **keywords)
-    whole = score()
-    of_truth = ("burning_seen_share", "front_distance")
-    for row, other in zip(rows, whole, strict=True):
-        assert [getattr(row, value) for value in of_truth] == [None, None]
-        for value in set(MERIT) - {*of_truth}:
-            assert getattr(row, value) == getattr(other, value), value
-    assert read(tmp_path / "mine.csv") == rows
+    whole, of_truth = score(), ("burning_seen_share", "front_distance")
+    for flags in ({}, {"publish_truth": True, "reveal_model": False}):
+        running = server(worlds=4, **settings, **flags)
+        keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
+        csv = tmp_path / f"{len(flags)}.csv"
+        rows = evaluate(walk(0), name="mine", csv=csv, **keywords)
+        for row, other in zip(rows, whole, strict=True):
+            assert [getattr(row, value) for value in of_truth] == [None, None]
+            for value in {*MERIT} - {*of_truth}:
+                assert getattr(row, value) == getattr(other, value), value
+        assert read(csv) == rows
 
 
-def test_more_steps_than_recorded_are_refused(states: Path) -> None:
+def test_worlds_that_do_not_fit_an_evaluation_are_refused(states: Path) -> None:
     keywords = {**SCALE, "n_moves": 6, "states": states, "observation": "frame", "seeds": [0, 1]}
     with refuses("steps: expected at most 12, .*, got 13"):
         evaluate(walk(0), name="mine", **(keywords | {"steps": 13}))
-
-
-def test_worlds_of_teams_are_not_taken_for_worlds_of_one_robot() -> None:
     running = server(worlds=1, robots=4, height=7, width=9, moves=6, model=LIVELY, burn_in=60)
+    keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
     with refuses("robots: expected 4"):
-        evaluate(
-            walk(0),
-            name="mine",
-            instance=running.instance,
-            burn_in=60,
-            observation="frame",
-            **SCALE,
-        )
+        evaluate(walk(0), name="mine", **keywords)

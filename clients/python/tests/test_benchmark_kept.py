@@ -60,37 +60,34 @@ def test_rows_of_other_worlds_are_refused_by_name(file: Path) -> None:
     assert file.read_bytes() == kept
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"move": 1},
-        {"deterministic": False},
-        {"estimator": "guess"},
-        {"observation": "image"},
-        {"observation": "local", "window": 5},
-        {"env": WILDFIRE},
-    ],
-    ids=str,
-)
-def test_another_policy_or_setting_runs_again_and_says_so(
-    file: Path, change: dict[str, Any]
-) -> None:
-    first, _ = go(file)
-    token = SHAPE.set((4,) if "env" in change else ())
-    rows, said = go(file, **change)
-    SHAPE.reset(token)
-    assert f"mine: 3 rows already in {file} run again: of another policy or other set" in said
-    assert [row.policy_fingerprint for row in rows] != [row.policy_fingerprint for row in first]
-    assert [row.worlds_fingerprint for row in rows] == [row.worlds_fingerprint for row in first]
-    assert read(file) == rows
+#: Settings of another policy, with which its rows run again.
+CHANGED: list[dict[str, Any]] = [
+    {"move": 1},
+    {"deterministic": False},
+    {"estimator": "guess"},
+    {"observation": "image"},
+    {"observation": "local", "window": 5},
+    {"env": WILDFIRE},
+]
+
+
+def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
+    rows, _ = go(file)
+    for change in CHANGED:
+        token = SHAPE.set((4,) if "env" in change else ())
+        first, (rows, said) = rows, go(file, **change)
+        SHAPE.reset(token)
+        assert f"mine: 3 rows already in {file} run again: of another policy or other set" in said
+        for one, other in zip(rows, first, strict=True):
+            assert one.policy_fingerprint != other.policy_fingerprint, change
+            assert one.worlds_fingerprint == other.worlds_fingerprint, change
+        assert read(file) == rows
     _, said = go(file, **change)
     assert f"mine: 3 rows kept in {file}, not run again. What a policy reads from else" in said
-
-
-def test_defaults_that_are_named_are_other_worlds_only_if_they_differ(file: Path) -> None:
+    file.unlink()
     rows, _ = go(file)
     again, said = go(file, env=MOVES, start="corner", sensor_radius=0, batch=2)
-    assert again == rows and "3 rows kept" in said
+    assert again == rows and "3 rows kept" in said, "defaults that are named"
 
 
 def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
@@ -99,12 +96,13 @@ def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
     running = server(worlds=4, publish_truth=True, **flags)
     keywords = {"observation": "frame", "steps": 5, "instance": running.instance}
     said = io.StringIO()
-    again = evaluate(always(3), name="mine", seeds=range(3, 6), csv=file, progress=said, **keywords)
+    keywords |= {"name": "mine", "seeds": range(3, 6), "csv": file, "progress": said}
+    again = evaluate(always(3), **keywords)
     assert again == rows and "3 rows kept" in said.getvalue()
     other = server(worlds=4, **flags | {"burn_in": 61})
     keywords["instance"] = other.instance
     with refuses("rows of other worlds, of the policies 'mine'"):
-        evaluate(always(3), name="mine", seeds=range(3, 6), csv=file, **keywords)
+        evaluate(always(3), **keywords)
 
 
 def test_rows_of_a_changed_policy_leave_none_of_the_old_one(file: Path) -> None:
@@ -131,26 +129,28 @@ def without_fingerprints(path: Path) -> None:
     path.write_text("".join(",".join(line.split(",")[:-3]) + "\n" for line in lines))
 
 
-def test_own_rows_of_an_older_release_are_refused(file: Path) -> None:
+def test_own_rows_of_an_older_release_are_refused_and_others_stay(file: Path) -> None:
     go(file)
     without_fingerprints(file)
     assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
     with refuses("has rows of 'mine' without a fingerprint of their worlds, as older releases"):
         go(file)
-
-
-@pytest.mark.parametrize("change", [{"burn_in": 61}, {"width": 8}], ids=str)
-def test_rows_of_an_older_release_stay_if_worlds_burn_alike(
-    file: Path, change: dict[str, Any]
-) -> None:
-    go(file)
-    without_fingerprints(file)
+    # Those of others stay if worlds burn alike.
     old = read(file)
     with refuses(r"burning cells of world 3 \('mine'\), got"):
-        go(file, name="other", **change)
+        go(file, name="other", burn_in=61)
     assert read(file) == old
     rows, _ = go(file, name="other")
     assert read(file) == old + rows
+
+
+def test_files_from_before_teams_and_figures_of_merit_are_read(file: Path) -> None:
+    head = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,"
+    head += "mean_fire_cells,mean_plan_millis,brier,moves"
+    file.write_text(f"{head}\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8\n")
+    (row,) = read(file)
+    assert (row.moves, row.robots, row.team, row.mean_repeated) == (8, 1, "alone", 0.0)
+    assert row.recent_steps is None
 
 
 def test_a_file_that_spreadsheets_have_saved_is_read(file: Path) -> None:
@@ -163,8 +163,9 @@ def test_a_file_that_spreadsheets_have_saved_is_read(file: Path) -> None:
 def test_a_row_of_other_values_is_refused(file: Path) -> None:
     go(file)
     text = file.read_text()
-    for line in ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20):
-        file.write_text(f"{text}{line}\n")
+    bad = ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20)
+    for content in (*(f"{text}{line}\n" for line in bad), "policy,steps\nmine,3\n", "\x00\xff"):
+        file.write_text(content, "latin-1")
         with refuses("csv: expected .*mine.csv to have the columns policy,"):
             go(file)
 
@@ -176,31 +177,19 @@ def run_suite(folder: Path, move: int = 3, **changes: Any) -> tuple[list[Row], s
     source = folder / "task.toml"
     source.write_text(TASK.format(**values))
     said = io.StringIO()
-    rows = suite(
-        always(move),
-        name=name,
-        folder=folder / "out",
-        tasks=[source],
-        observation="frame",
-        progress=said,
-    )
+    keywords = {"name": name, "folder": folder / "out", "observation": "frame"}
+    rows = suite(always(move), tasks=[source], progress=said, **keywords)
     return rows["lab"], said.getvalue()
 
 
-def test_a_suite_keeps_rows_of_the_same_task(tmp_path: Path) -> None:
+def test_a_suite_keeps_rows_and_runs_again_what_has_changed(tmp_path: Path) -> None:
     rows, _ = run_suite(tmp_path)
     again, said = run_suite(tmp_path)
     assert again == rows and "mine: 3 rows kept in " in said
-
-
-@pytest.mark.parametrize(
-    "change", [{"burn_in": 50}, {"model": "wildfire-small"}, {"steps": 6}, {"move": 1}], ids=str
-)
-def test_a_suite_runs_again_what_has_changed(tmp_path: Path, change: dict[str, Any]) -> None:
-    first, _ = run_suite(tmp_path)
-    rows, said = run_suite(tmp_path, **change)
-    assert "mine: 3 rows already in " in said and " run again: " in said
-    assert read(tmp_path / "out" / "lab.csv") == rows != first
+    for change in ({"burn_in": 50}, {"model": "wildfire-small"}, {"steps": 6}, {"move": 1}):
+        first, (rows, said) = rows, run_suite(tmp_path, **change)
+        assert "mine: 3 rows already in " in said and " run again: " in said
+        assert read(tmp_path / "out" / "lab.csv") == rows != first
 
 
 def test_a_suite_leaves_rows_of_other_policies_on_older_worlds(tmp_path: Path) -> None:

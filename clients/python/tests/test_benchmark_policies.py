@@ -1,6 +1,7 @@
 """What `evaluate` gives to a policy, and takes from it."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,41 +63,49 @@ class Short(Counter):
 
 
 class Forwarding(Recurrent):
-    """Hands on what it does not know."""
-
     def predict(self, seen: Any, **others: Any) -> Any:  # type: ignore[override]
         assert others.keys() == {"state", "episode_start", "deterministic"}
         return super().predict(seen, **others)
 
 
-class OnlyKeywords(Counter):
-    def predict(self, seen: Any, *, episode_start: Any, state: Any) -> Any:
-        return self.step(seen, state, episode_start)
+def test_models_and_functions_get_their_state_back() -> None:
+    for kind in (Recurrent, Older, Short, Forwarding):
+        model = kind()
+        go(model, batch=2)
+        # Worlds 3 and 4 together, then world 5 from the start.
+        counts = list(range(3 * N_MOVES))
+        assert model.counts == [[n, n] for n in counts] + [[n] for n in counts], kind
+        if kind is not Short:
+            assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
+    counter = Counter()
 
+    def act(frames: Any, state: Any, *, episode_start: Any) -> Any:
+        return counter.step(frames, state, episode_start)
 
-@pytest.mark.parametrize("kind", [Recurrent, Older, Short, Forwarding, OnlyKeywords])
-def test_a_model_gets_its_state_back(kind: type[Counter]) -> None:
-    model = kind()
-    go(model, batch=2)
-    # Worlds 3 and 4 together, then world 5 from the start.
-    counts = list(range(3 * N_MOVES))
-    assert model.counts == [[n, n] for n in counts] + [[n] for n in counts]
-    if kind is not Short:
-        assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
-
-
-def test_a_memory_scores_as_the_moves_that_it_makes() -> None:
-    moves = iter([move for _ in range(3) for move in range(N_MOVES)])
-    rows = go(lambda frames: np.full(len(frames), next(moves)))
-    others = go(Recurrent())
-    assert [row.mean_reward for row in rows] == [row.mean_reward for row in others]
-    assert [row.mean_distinct_cells for row in rows] == [row.mean_distinct_cells for row in others]
-
-
-def test_the_method_of_a_model_acts_as_the_model() -> None:
+    go(act, batch=2)
+    assert (counter.counts, counter.starts) == (model.counts, model.starts)
     model = Recurrent()
     go(model.predict, deterministic=False)
     assert model.counts[-1] == [3 * N_MOVES - 1] * 3 and model.deterministic == {False}
+
+
+@pytest.mark.parametrize("n_worlds", [1, 2, 3])
+@pytest.mark.parametrize("env", [MOVES, WILDFIRE])
+def test_actions_are_taken_in_any_form_without_a_state(env: str, n_worlds: int) -> None:
+    shape = (n_worlds,) if env == MOVES else (n_worlds, N_MOVES)
+    ones, options = np.ones(shape, int), {"env": env, "seeds": range(3, 3 + n_worlds)}
+    whole = [row.mean_reward for row in go(lambda _: ones, **options)]
+    predicts: list[Callable[..., Any]] = [
+        *(
+            lambda self, seen, outcome=outcome: outcome
+            for outcome in (ones, (ones, None), ones.tolist(), tuple(ones), tuple(ones.tolist()))
+        ),
+        lambda self, seen, state: ones,
+    ]
+    for predict in predicts:
+        model = type("Plain", (), {"predict": predict})()
+        for policy in (model, model.predict):
+            assert [row.mean_reward for row in go(policy, **options)] == whole
 
 
 def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
@@ -106,45 +115,6 @@ def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
 
     go(act)
     go(type("Named", (), {"predict": lambda self, state, mask=None: act(state, mask)})())
-
-
-def test_functions_may_have_a_memory() -> None:
-    counts = []
-
-    def act(frames: Any, state: Any) -> Any:
-        state = 0 if state is None else state
-        counts.append(state)
-        return np.full(len(frames), state % 4), state + 1
-
-    go(act)
-    assert counts == list(range(3 * N_MOVES))
-
-
-def test_a_model_may_return_actions_alone() -> None:
-    expected = [row.mean_reward for row in go(lambda frames: np.ones(len(frames), int))]
-    for predict in (
-        lambda self, seen: np.ones(len(seen), int),
-        lambda self, seen: (np.ones(len(seen), int), None),
-        lambda self, seen, state: np.ones(len(seen), int),
-    ):
-        model = type("Plain", (), {"predict": predict})()
-        assert [row.mean_reward for row in go(model)] == expected
-
-
-@pytest.mark.parametrize("n_worlds", [1, 2, 3])
-@pytest.mark.parametrize("env", [MOVES, WILDFIRE])
-def test_a_pair_of_actions_and_no_state_is_taken(env: str, n_worlds: int) -> None:
-    shape = (n_worlds,) if env == MOVES else (n_worlds, N_MOVES)
-    options = {"env": env, "seeds": range(3, 3 + n_worlds)}
-    whole = go(lambda _: np.ones(shape, int), **options)
-    for outcome in (
-        (np.ones(shape, int), None),
-        np.ones(shape, int).tolist(),
-        tuple(np.ones(shape, int)),  # not a pair, but the actions of two worlds
-        tuple(np.ones(shape, int).tolist()),
-    ):
-        rows = go(lambda _, outcome=outcome: outcome, **options)
-        assert [row.mean_reward for row in rows] == [row.mean_reward for row in whole]
 
 
 def test_what_is_no_action_is_named() -> None:
@@ -198,20 +168,9 @@ def test_models_and_functions_get_masks(walled: Path) -> None:
     assert [row.mean_reward for row in rows] == [row.mean_reward for row in others]
     # A mask takes every robot to another cell.
     assert all(row.mean_distinct_cells > 1 for row in rows)
-
-
-def test_each_robot_has_its_mask(walled: Path) -> None:
-    shapes = set()
-
-    def act(frames: Any, action_masks: Any) -> Any:
-        shapes.add(action_masks.shape)
-        return np.argmax(action_masks, axis=1)
-
+    masks.clear()
     go(act, model=walled, robots=2)
-    assert shapes == {(6, 4)}
-
-
-def test_masks_of_whole_paths_are_refused_only_if_they_are_needed() -> None:
+    assert {mask.shape for mask in masks} == {(6, 4)}
     go(Masked(), env=WILDFIRE)
     with refuses("env: expected one with action masks, which the policy takes, got one without"):
         go(lambda frames, action_masks: 0, env=WILDFIRE)
@@ -238,50 +197,37 @@ class Normalized:
         return np.zeros(len(seen), int), None
 
 
-def test_a_model_sees_normalized_observations() -> None:
-    for observation in ("local", "frame"):
-        model = Normalized()
-        go(model, observation=observation)
-        assert np.all(np.array(model.seen) == 7.0)
-
-
-def test_other_statistics_are_another_policy(
+def test_a_model_sees_normalized_observations_by_which_it_is_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = go(Normalized(), csv=tmp_path / "rows.csv")
+    for observation in ("local", "frame"):
+        model = Normalized()
+        first = go(model, observation=observation, csv=tmp_path / f"{observation}.csv")
+        assert np.all(np.array(model.seen) == 7.0)
     monkeypatch.setattr(Statistics, "obs_rms", {"mean": 4.0})
-    rows = go(Normalized(), csv=tmp_path / "rows.csv")
+    rows = go(Normalized(), csv=tmp_path / "frame.csv")
     assert rows[0].policy_fingerprint != first[0].policy_fingerprint
 
 
-@pytest.mark.parametrize(
-    ("space", "words"),
-    [
+FRAME = spaces.Box(0, 255, (7, 9, 1), np.uint8)
+
+
+def test_a_model_of_other_observations_is_refused() -> None:
+    model: Any = Recurrent()
+    for space, words in (
         (spaces.Box(0, 255, (7, 9, 4), np.uint8), r"wrap=, such as lambda worlds: VecFrameStack\("),
         (spaces.Box(-10, 10, (7, 9, 1), np.float32), r"wrap=.*: VecNormalize.load\('stat"),
-        (
-            spaces.Dict({"frame": spaces.Box(0, 255, (7, 9, 1), np.uint8)}),
-            "pass the observation= of",
-        ),
+        (spaces.Dict({"frame": FRAME}), "pass the observation= of"),
         (spaces.Discrete(4), "on which it was trained, got Box"),
-    ],
-    ids=str,
-)
-def test_a_model_of_other_observations_is_refused(space: Any, words: str) -> None:
-    model = Recurrent()
-    model.observation_space = space  # type: ignore[attr-defined]
-    for policy in (model, model.predict):
-        with refuses("policy: expected observations .*" + words):
-            go(policy)
+    ):
+        model.observation_space = space
+        for policy in (model, model.predict):
+            with refuses("policy: expected observations .*" + words):
+                go(policy)
     assert model.counts == []
-
-
-@pytest.mark.parametrize("shape", [(7, 9, 1), (1, 7, 9)])
-def test_a_model_may_have_channels_first(shape: tuple[int, ...]) -> None:
-    model = Recurrent()
-    model.observation_space = spaces.Box(0, 255, shape, np.uint8)  # type: ignore[attr-defined]
-    go(model)
-    assert model.counts
+    for space in (FRAME, spaces.Box(0, 255, (1, 7, 9), np.uint8)):  # channels first
+        model.observation_space = space
+        go(model)
 
 
 def test_a_policy_hears_of_other_worlds() -> None:
@@ -295,9 +241,7 @@ def test_a_policy_hears_of_other_worlds() -> None:
     assert begun == [2, 1]
 
 
-def test_wrapping_without_the_trainer_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_wrapping_without_the_trainer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
         monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, "emberwatch.benchmark.wrapped", raising=False)

@@ -22,7 +22,6 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecMonitor,
     VecNormalize,
-    VecTransposeImage,
 )
 
 from emberwatch.benchmark import evaluate
@@ -37,7 +36,6 @@ Wrap = Callable[[Any], Any]
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Worlds with a wall, so that masks matter."""
     return {**WORLDS, "model": wall(tmp_path_factory.mktemp("model"))}
 
 
@@ -113,10 +111,6 @@ def test_recurrent_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) ->
     check(model, expected, world)
     # Without its memory it acts otherwise, so that the memory is what the test is about.
     assert ours(lambda seen: model.predict(seen, deterministic=True)[0], world) != expected
-
-
-def test_a_recurrent_model_in_a_function_is_refused(world: dict[str, Any]) -> None:
-    model = remembering(world)
     with refuses("policy: it returns a state with its actions, but has no parameter `state`"):
         ours(lambda seen: model.predict(seen), world)
 
@@ -133,26 +127,17 @@ def normalized(worlds: Any) -> Any:
     return VecNormalize(worlds, norm_reward=False)
 
 
-@pytest.fixture(params=["local", ("frame", "local")], ids=str)
-def behind_statistics(
-    world: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
-) -> tuple[Any, Path, list[float], Any]:
-    """A model trained behind VecNormalize, its statistics, and what it scores behind them."""
-    parts = request.param
+@pytest.mark.parametrize("parts", ["local", ("frame", "local")], ids=str)
+def test_a_model_behind_vec_normalize_scores_as_in_its_own(
+    world: dict[str, Any], parts: Any, tmp_path: Path
+) -> None:
     policy = "MlpPolicy" if isinstance(parts, str) else "MultiInputPolicy"
     model = trained(stable_baselines3.PPO, policy, world, normalized, observation=parts)
     file = tmp_path / "statistics.pkl"
     model.get_vec_normalize_env().save(str(file))
     worlds = VecNormalize.load(str(file), vector(world, FIRST, observation=parts))
     worlds.training = False
-    return model, file, own(model, worlds, deterministic=True), parts
-
-
-def test_a_model_behind_vec_normalize_scores_as_in_its_own_evaluation(
-    world: dict[str, Any], behind_statistics: Any, tmp_path: Path
-) -> None:
-    model, file, expected, parts = behind_statistics
-    before = file.read_bytes()
+    expected, before = own(model, worlds, deterministic=True), file.read_bytes()
     check(model, expected, world, observation=parts)
     model.save(tmp_path / "model.zip")
     loaded = stable_baselines3.PPO.load(tmp_path / "model.zip", device="cpu")
@@ -173,44 +158,16 @@ def test_a_model_behind_vec_normalize_scores_as_in_its_own_evaluation(
         ]
         assert str(vars_of(counts[0])) == str(vars_of(counts[1]))
     assert file.read_bytes() == before
-
-
-def vars_of(statistics: Any) -> Any:
-    if isinstance(statistics, dict):
-        return {name: vars(part) for name, part in statistics.items()}
-    return vars(statistics)
-
-
-def test_vec_normalize_without_statistics_is_refused(
-    world: dict[str, Any], behind_statistics: Any
-) -> None:
-    model, _, _, parts = behind_statistics
     with refuses("wrap: VecNormalize has no statistics: save those of the training"):
         ours(model, world, observation=parts, wrap=normalized)
     with refuses("wrap: expected VecNormalize in it, as the policy was trained behind one"):
         ours(model, world, observation=parts, wrap=VecMonitor)
 
 
-def test_normalized_stacked_frames_score_as_in_their_evaluation(
-    world: dict[str, Any], tmp_path: Path
-) -> None:
-    model = trained(
-        stable_baselines3.PPO,
-        "MlpPolicy",
-        world,
-        lambda worlds: normalized(VecFrameStack(VecTransposeImage(worlds), 2)),
-    )
-    with refuses("policy: expected observations .*, wrap="):
-        ours(model, world)
-    model.get_vec_normalize_env().save(str(tmp_path / "statistics.pkl"))
-
-    def wrap(worlds: Any) -> Any:
-        stacked = VecFrameStack(VecTransposeImage(worlds), 2)
-        loaded = VecNormalize.load(str(tmp_path / "statistics.pkl"), stacked)
-        loaded.training = False
-        return loaded
-
-    check(model, own(model, vector(world, FIRST, wrap), deterministic=True), world, wrap=wrap)
+def vars_of(statistics: Any) -> Any:
+    if isinstance(statistics, dict):
+        return {name: vars(part) for name, part in statistics.items()}
+    return vars(statistics)
 
 
 def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
@@ -223,12 +180,6 @@ def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
     check(model, expected, world, wrap=stack)
 
 
-@pytest.mark.parametrize("wrap", [lambda worlds: None, lambda worlds: 7], ids=["None", "7"])
-def test_what_wraps_nothing_is_refused(world: dict[str, Any], wrap: Wrap) -> None:
-    with refuses("wrap: expected a function that returns its argument, a VecEnv of SB3, in wrap"):
-        ours(lambda seen: np.zeros(len(seen), int), world, wrap=wrap)
-
-
 def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
     shapes = set()
 
@@ -238,3 +189,5 @@ def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
 
     ours(act, world, wrap=lambda worlds: VecFrameStack(worlds, 2))
     assert shapes == {(N_WORLDS, 15, 15, 10)}
+    with refuses("wrap: expected a function that returns its argument, a VecEnv of SB3, in wrap"):
+        ours(act, world, wrap=lambda worlds: None)

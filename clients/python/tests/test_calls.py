@@ -34,12 +34,7 @@ def test_every_call_has_a_timeout() -> None:
         assert started.instance in str(raised.value)
     started.wake_up()
     assert client.observe().result().world.step == 0
-
-
-def test_a_timeout_that_is_no_time_has_passed_already() -> None:
-    started = server()
-    client = started.connect()
-    started.stop()
+    started.stop()  # a timeout that is no time has passed already
     for timeout in (0, -1, float("nan"), -float("inf")):
         with pytest.raises(errors.RequestTimeoutError):
             client.observe(timeout=timeout)
@@ -84,14 +79,13 @@ def test_closing_again_is_fine_and_a_closed_client_says_so() -> None:
 
 
 FORK = """
-import multiprocessing, os, sys, threading
+import multiprocessing, os, sys
 from emberwatch.client.client import Client
 from emberwatch.errors import EmberwatchError
 from emberwatch.client.observer import observe
 
-how, instance = sys.argv[1:]
-client = Client(instance)
-lease, observer = client.acquire(), observe(instance, timeout=0)
+client = Client(sys.argv[1])
+lease, observer = client.acquire(), observe(sys.argv[1], timeout=0)
 lease.step([3] * 6)
 
 def child():
@@ -105,39 +99,21 @@ def child():
             os._exit(9)
     client.close()
     observer.close()
-    with Client(instance) as own:
+    with Client(sys.argv[1]) as own:
         assert own.observe().result().world.step == 1
-    if how == "sys.exit":
-        sys.exit(5)
-    if how == "os._exit":
-        os._exit(5)
-    if how == "exception":
-        raise SystemError(5)
 
-if how == "multiprocessing":
-    process = multiprocessing.get_context("fork").Process(target=child)
-    process.start()
-    process.join()
-    code = process.exitcode
-else:
-    pid = os.fork()
-    if pid == 0:
-        child()
-        sys.exit(9)
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+process = multiprocessing.get_context("fork").Process(target=child)
+process.start()
+process.join()
 assert lease.step([3] * 6).result().world.step == 2
 assert observer.receive(5) is not None
-print("child", code)
+print("child", process.exitcode)
 """
 
 
-@pytest.mark.parametrize(
-    "how, code",
-    [("sys.exit", 5), ("os._exit", 5), ("exception", 1), ("multiprocessing", 0)],
-)
-def test_a_forked_child_is_refused_and_its_parent_goes_on(how: str, code: int) -> None:
-    ended, out, err = script(FORK, how, server().instance).end()
-    assert (ended, out) == (0, f"child {code}\n"), err
+def test_a_forked_child_is_refused_and_its_parent_goes_on() -> None:
+    ended, out, err = script(FORK, server().instance).end()
+    assert (ended, out) == (0, "child 0\n"), err
 
 
 def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on() -> None:

@@ -21,9 +21,5 @@ def test_the_documented_codes_are_those_of_the_code() -> None:
     files = [*Path(emberwatch.__file__).parent.rglob("*.py"), *(PYTHON / "native").rglob("*.rs")]
     named = {code for file in files for code in re.findall(r'"(\w+)"', file.read_text("utf-8"))}
     assert of_page | of_classes <= named
-
-
-def test_every_class_of_errors_is_documented() -> None:
-    page = (PYTHON / "README.md").read_text("utf-8")
     for kind in EmberwatchError.__subclasses__():
         assert f"| `{kind.__name__}` |" in page

@@ -27,7 +27,6 @@ test_seeds = { start = 0, end = 2 }
 
 
 def of_states(file: Path) -> Any:
-    """Worlds of the recorded states that the file describes."""
     np.savez(file.with_suffix(".npz"), fire=np.zeros((3, 4, 4), np.uint8))
     return closed_later(gymnasium.make(WILDFIRE, states=file.with_suffix(".npz"), n_moves=4))
 
@@ -35,10 +34,6 @@ def of_states(file: Path) -> Any:
 #: What reads a file, and the file's text in UTF-8.
 READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "task": (Task.named, TASK),
-    "environment of a task": (
-        lambda file: closed_later(gymnasium.make(WILDFIRE, task=file)).reset(seed=1000),
-        TASK,
-    ),
     "model": (Model.named, Path(LIVELY).read_text("utf-8")),
     "states": (of_states, RECORDED.read_text("utf-8")),
     "embedded worlds": (
@@ -74,9 +69,6 @@ def test_other_encodings_are_refused_by_name(tmp_path: Path) -> None:
     file.write_text(TASK, "latin-1")
     with refuses("task .*latin.toml: expected text in UTF-8, got other bytes in line 9: save the"):
         Task.named(file)
-
-
-def test_texts_with_a_mark_are_read_as_well() -> None:
     text = Path(LIVELY).read_text("utf-8")
     assert Model.from_toml("\ufeff" + text) == Model.from_toml(text)
     assert Task.from_toml("\ufeff" + TASK) == Task.from_toml(TASK)

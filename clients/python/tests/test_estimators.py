@@ -1,7 +1,6 @@
 """Beliefs of every kind: equal to the Rust agent's, one world or many; refusals of bad input."""
 
 import re
-import subprocess
 import textwrap
 import types
 from collections.abc import Callable, Iterator
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from failures import fails, refuses
 from numpy.typing import NDArray
-from processes import find
 
 import emberwatch
 from emberwatch import _native, belief
@@ -33,7 +31,7 @@ LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
 CASES: list[tuple[str, str | None]] = [
     *((kind, None) for kind in KNOWN),
     *((kind, "learned_filter") for kind in LEARNED),
-    *((kind, "own_kernels") for kind in LEARNED if "+" not in kind or kind == "learned+spatial"),
+    ("learned", "own_kernels"),
     ("neural", "neural_belief"),
 ]
 
@@ -141,29 +139,6 @@ def test_some_worlds_move_and_begin_again(kind: str, flown: Any) -> None:
     assert (kept.belief == first).all()
 
 
-def test_spatial_beliefs_learn_while_they_run(flown: Any) -> None:
-    """A frame corrects neighbours of seen cells once frames have shown how cells vary together."""
-    kept, changed = made("known+spatial", None), list[bool]()
-    for _, frames, _ in flown:
-        unseen, before = frames[0] == 255, kept.belief
-        kept.correct(frames[0])
-        changed.append(bool((kept.belief != before)[:, unseen].any()))
-        kept.predict()
-    assert not changed[0] and changed[-1]
-    kept.reset()
-    assert (kept.belief == PRIOR).all()
-
-
-def test_a_learned_belief_is_the_one_of_its_checkpoint(checkpoints: Path) -> None:
-    expected = {"learned_filter": "learned", "own_kernels": "learned", "neural_belief": "neural"}
-    for name, kind in expected.items():
-        found = belief.load(checkpoints / name, height=5, width=9)
-        assert found.kind == kind and found.belief.shape == (3, 5, 9)
-        assert found.belief.dtype == np.float32
-        with refuses("frame: cell .0, 2.: expected a value below 3, or 255, got 3"):
-            found.correct(np.full((5, 9), 255, np.uint8) - 252 * np.eye(5, 9, 2, dtype=np.uint8))
-
-
 @pytest.mark.parametrize("n_worlds", [None, N_WORLDS])
 def test_scores_follow_their_definition(n_worlds: int | None, flown: Any) -> None:
     frames, truths = (np.stack(column) for column in list(zip(*flown, strict=True))[1:])
@@ -219,18 +194,18 @@ KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got 'uniform'"),
     ({"prior": PRIOR[:2]}, "prior: expected numbers of shape (3, H, W), got float32 of shape (2,"),
     ({"prior": np.ones((3, 1, 1), bool)}, "prior: expected numbers of shape (3, H, W), got bool"),
-    ({"prior": np.full((3, 1, 1), 1e300)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
+    ({"prior": np.reshape([1.5, -0.5, 0.0], (3, 1, 1))}, "prior: cell (0, 0): expected probabil"),
     ({"prior": np.full((3, 1, 1), np.nan)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
     ({"n_worlds": 0}, "n_worlds: expected an integer within 1 to 1048576, got 0"),
     ({"n_worlds": True}, "n_worlds: expected an integer within 1 to 1048576, got True"),
 ]
 
 
-@pytest.mark.parametrize(("wrong", "error"), KNOWN_REFUSALS)
-def test_known_refuses_wrong_arguments(wrong: dict[str, Any], error: str) -> None:
+def test_known_refuses_wrong_arguments() -> None:
     right: dict[str, Any] = {"model": MODEL, "prior": PRIOR}
-    with refuses(re.escape(error)):
-        belief.known(**(right | wrong))
+    for wrong, error in KNOWN_REFUSALS:
+        with refuses(re.escape(error)):
+            belief.known(**(right | wrong))
 
 
 FRAME = np.full((16, 16), 255, np.uint8)
@@ -247,86 +222,46 @@ def of_frame(value: int) -> NDArray[np.uint8]:
 
 #: Wrong calls of a belief about one world, or about three; the errors.
 REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
-    (
-        N_WORLDS,
-        lambda it: it.correct(FRAME),
-        "frame: expected shape (3, 16, 16) and type uint8, got (16, 16) and uint8",
-    ),
-    *(
-        (N_WORLDS, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}{worlds!r}")
-        for worlds in (3, [0, 3], [True, False], [0.5], True, [[0]], "0", 10**30)
-    ),
-    *(
-        (N_WORLDS, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}slice({worlds.start!r},")
-        for worlds in (slice("a", None), slice(None, None, 0))
-    ),
-    (
-        None,
-        lambda it: it.reset(keep_correlations=1),  # pyright: ignore[reportArgumentType]
-        "keep_correlations: expected True or False, got 1",
-    ),
+    (3, lambda it: it.correct(FRAME),
+        "frame: expected shape (3, 16, 16) and type uint8, got (16, 16) and uint8"),
+    (None, lambda it: it.correct(np.full((16, 16), 3, np.uint8)),
+        "frame: cell (0, 0): expected a value below 3, or 255, got 3"),
+    *((3, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}{worlds!r}")
+        for worlds in (3, [0, 3], [True, False], [0.5], True, [[0]], "0", 10**30)),
+    *((3, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}slice({worlds.start!r},")
+        for worlds in (slice("a", None), slice(None, None, 0))),
+    (None, lambda it: it.reset(keep_correlations=1),  # pyright: ignore[reportArgumentType]
+        "keep_correlations: expected True or False, got 1"),
     (None, lambda it: it.score_states(FRAME), "states: expected values below 3, got 255"),
-    (
-        None,
-        lambda it: it.score_states(TRUTH, target=3),
-        "target: expected an integer within 0 to 2 (normal, latent, fire), got 3",
-    ),
-    *(
-        (
-            None,
-            lambda it, target=target: belief.score(it, FRAME[None], TRUTH[None], target=target),
-            f"target: expected an integer within 0 to 2 (normal, latent, fire), got {target!r}",
-        )
-        for target in (9, -1, True, "fire")
-    ),
-    (
-        None,
-        lambda _: belief.score("known", FRAME[None], TRUTH[None]),  # pyright: ignore
-        "belief: expected a Belief of `known` or `load`, got 'known'",
-    ),
-    (
-        None,
-        lambda it: belief.score(it, FRAME, TRUTH),
-        "observations: expected shape (K, 16, 16) with K >= 1, and type uint8, got (16, 16)",
-    ),
-    (
-        N_WORLDS,
-        lambda it: belief.score(it, FRAME[None], TRUTH[None]),
-        "observations: expected shape (K, 3, 16, 16) with K >= 1, and type uint8, got (1, 16, 16)",
-    ),
-    (
-        None,
-        lambda it: belief.score(it, FRAME[None], TRUTH[None].astype(int)),
-        "states: expected shape (K, 16, 16) with K >= 1, and type uint8, got (1, 16, 16) and int64",
-    ),
-    (
-        None,
-        lambda it: belief.score(it, of_frame(255), TRUTH[None]),
-        "states: expected 2 steps, as observations, got 1",
-    ),
-    (
-        None,
-        lambda it: belief.score(it, of_frame(3), np.stack([TRUTH, TRUTH])),
-        "observations: step 1, cell (15, 15): expected a value below 3, or 255, got 3",
-    ),
-    (
-        None,
-        lambda it: belief.score(it, FRAME[None], FRAME[None]),
-        "states: step 0, cell (0, 0): expected a value below 3, got 255",
-    ),
-]
+    (None, lambda it: it.score_states(TRUTH, target=3),
+        "target: expected an integer within 0 to 2 (normal, latent, fire), got 3"),
+    *((None,
+        lambda it, target=target: belief.score(it, FRAME[None], TRUTH[None], target=target),
+        f"target: expected an integer within 0 to 2 (normal, latent, fire), got {target!r}")
+        for target in (9, -1, True, "fire")),
+    (None, lambda _: belief.score("known", FRAME[None], TRUTH[None]),  # pyright: ignore
+        "belief: expected a Belief of `known` or `load`, got 'known'"),
+    (None, lambda it: belief.score(it, FRAME, TRUTH),
+        "observations: expected shape (K, 16, 16) with K >= 1, and type uint8, got (16, 16)"),
+    (None, lambda it: belief.score(it, FRAME[None], TRUTH[None].astype(int)),
+        "states: expected shape (K, 16, 16) with K >= 1, and type uint8, got (1, 16, 16) and int"),
+    (None, lambda it: belief.score(it, of_frame(255), TRUTH[None]),
+        "states: expected 2 steps, as observations, got 1"),
+    (None, lambda it: belief.score(it, of_frame(3), np.stack([TRUTH, TRUTH])),
+        "observations: step 1, cell (15, 15): expected a value below 3, or 255, got 3"),
+    (None, lambda it: belief.score(it, FRAME[None], FRAME[None]),
+        "states: step 0, cell (0, 0): expected a value below 3, got 255"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("n_worlds", "call", "error"), REFUSALS)
-def test_a_refused_call_leaves_the_belief_as_it_was(
-    n_worlds: int | None, call: Callable[[Belief], Any], error: str
-) -> None:
-    kept = made("known", None, n_worlds)
-    kept.correct(np.full(kept.shape, 2, np.uint8))
-    before = kept.belief
-    with refuses(re.escape(error)):
-        call(kept)
-    assert (kept.belief == before).all()
+def test_a_refused_call_leaves_the_belief_as_it_was() -> None:
+    for n_worlds, call, error in REFUSALS:
+        kept = made("known", None, n_worlds)
+        kept.correct(np.full(kept.shape, 2, np.uint8))
+        before = kept.belief
+        with refuses(re.escape(error)):
+            call(kept)
+        assert (kept.belief == before).all()
 
 
 def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Path) -> None:
@@ -334,8 +269,6 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
         belief.load(None, **GRID)  # pyright: ignore[reportArgumentType]
     with refuses("kind: expected one of learned, .*, got 'known'"):
         made("known", checkpoints / "learned_filter")
-    with refuses("kind: expected one of learned, .*, got 3"):
-        made(3, checkpoints / "learned_filter")  # pyright: ignore[reportArgumentType]
     # No checkpoint, a checkpoint of another kind, and checkpoints of other worlds.
     (tmp_path / "text").write_text("no checkpoint")
     with refuses("checkpoint .*text: expected a whole safetensors file"):
@@ -393,24 +326,6 @@ def test_an_impossible_frame_names_its_world() -> None:
     assert (one.belief == prior).all()
 
 
-def test_an_autoencoder_knows_one_grid(tmp_path: Path) -> None:
-    settings = tmp_path / "agent.toml"
-    settings.write_text("[autoencoder]\nwindow = 2\n")
-    command = [find("emberwatch-agent"), "train", "--learner=autoencoder", "--height=8"]
-    command += ["--width=8", "--steps=6", "--moves=4", f"--out={tmp_path / 'out'}"]
-    command += [f"--config={settings}"]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    checkpoint = tmp_path / "out" / "checkpoint.safetensors"
-    kept = belief.load(checkpoint, height=8, width=8)
-    assert kept.kind == "autoencoder"
-    kept.correct(np.full((8, 8), 2, np.uint8))
-    kept.predict()
-    assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4)
-    for model in (None, MODEL):
-        with refuses("checkpoint: expected .*16 x 16"):
-            belief.load(checkpoint, **GRID, model=model)
-
-
 def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
     page = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
     section = page.split("## Beliefs\n")[1].split("\n## ")[0]
@@ -420,8 +335,8 @@ def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> N
     assert [line.split()[0] for line in printed] == ["known", "known+spatial"]
 
 
-@pytest.mark.parametrize("name", sorted(_native.built_in("models")))
-def test_every_kind_takes_every_built_in_model(name: str) -> None:
+@pytest.mark.parametrize("name", ["wildfire-burnout", "road-ice", "wildfire-terrain"])
+def test_every_kind_takes_models_of_any_form(name: str) -> None:
     model = Model.named(name)
     height, width = (
         (64, 64) if model.zones is not None or model.airspace.no_fly is not None else (5, 4)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from headers import header
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageSequence
 from test_recording import FILE_HEADER, deflated, packed
 
-from emberwatch.belief import known, uniform_prior
+from emberwatch.belief import Belief, known, uniform_prior
 from emberwatch.client import wire
 from emberwatch.model import Model
 from emberwatch.render.film.__main__ import main
@@ -36,18 +36,10 @@ def server(**changes: Any) -> bytes:
     return packed(1, deflated(json.dumps(info).encode()))
 
 
-def frame(
-    step: int,
-    *,
-    episode: int = 0,
-    world: int = 0,
-    reward: float = 2.0,
-    robots: int = 1,
-    hovered: int = 0,
-    late: int = 0,
-) -> bytes:
+def frame(step: int, *, world: int = 0, robots: int = 1, **told: int) -> bytes:
     """Robot r flies right and down from column r of the first row; they see `SEEN`."""
-    result = wire.WORLD.pack(step, 7, episode, reward, hovered, late, 0, 3, 0, 0, 0)
+    episode, hovered, late = (told.get(name, 0) for name in ("episode", "hovered", "late"))
+    result = wire.WORLD.pack(step, 7, episode, 2.0, hovered, late, 0, 3, 0, 0, 0)
     sizes = {"n_robots": robots, "height": HEIGHT, "width": WIDTH}
     place = {"world": world, "first_robot": world * robots}
     head = header("FrameHeader", result=result, **place, **sizes)
@@ -55,7 +47,7 @@ def frame(
     for robot in range(robots):
         flew = not (hovered | late) >> robot & 1
         place = (0, robot, 1, robot + 1) if flew else (0, robot, 0, robot)
-        results += wire.ROBOT.pack(reward, reward, 3, 0, *place, 1, 2 * flew)
+        results += wire.ROBOT.pack(2.0, 2.0, 3, 0, *place, 1, 2 * flew)
         paths += b"\3\1" * flew
     return packed(2, deflated(head + results + SEEN.tobytes() * robots + paths))
 
@@ -99,21 +91,17 @@ class Studio:
             self.film(records, *flags)
         return self._capsys.readouterr().err
 
-    def still(self, records: list[bytes], step: int, *flags: object) -> NDArray[np.uint8]:
-        self.film(records, "--step", step, *flags)
+    def still(self, records: list[bytes], *flags: object) -> NDArray[np.uint8]:
+        self.film(records, "--step", 1, *flags)
         return np.asarray(Image.open(self.png))
 
-    def pictures(self) -> list[tuple[NDArray[np.uint8], int]]:
-        """Pixels and milliseconds of each picture of the film."""
+    def pictures(self) -> list[NDArray[np.uint8]]:
         with Image.open(self.gif) as film:
-            found: list[tuple[NDArray[np.uint8], int]] = []
-            for at in range(getattr(film, "n_frames", 1)):
-                film.seek(at)
-                found.append((np.asarray(film.convert("RGB")), film.info["duration"]))
-        return found
+            return [np.asarray(it.convert("RGB")) for it in ImageSequence.Iterator(film)]
 
     def millis(self) -> list[int]:
-        return [millis for _, millis in self.pictures()]
+        with Image.open(self.gif) as film:
+            return [it.info["duration"] for it in ImageSequence.Iterator(film)]
 
 
 @pytest.fixture
@@ -128,15 +116,20 @@ def cells(image: NDArray[np.uint8], panel: int) -> NDArray[np.uint8]:
     return image[np.ix_(rows, cols)]
 
 
-def test_panels_show_truth_frame_belief_and_entropy(studio: Studio) -> None:
-    image = studio.still([server(), *both(0, 1)], 1)
-    assert (cells(image, 0) == np.array(MODEL.state_colors, np.uint8)[TRUTH]).all()
-    seen = np.array([*MODEL.observation_colors, UNSEEN], np.uint8)[np.minimum(SEEN, 3)]
-    assert (cells(image, 1) == seen).all()
+def believed() -> Belief:
     kept = known(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
     kept.correct(SEEN)
     kept.predict()
     kept.correct(SEEN)
+    return kept
+
+
+def test_panels_show_truth_frame_belief_and_entropy(studio: Studio) -> None:
+    image = studio.still([server(), *both(0, 1)])
+    assert (cells(image, 0) == np.array(MODEL.state_colors, np.uint8)[TRUTH]).all()
+    seen = np.array([*MODEL.observation_colors, UNSEEN], np.uint8)[np.minimum(SEEN, 3)]
+    assert (cells(image, 1) == seen).all()
+    kept = believed()
     for panel, shares in ((2, kept.belief[2]), (3, kept.entropy() / np.log(3))):
         lightness = cells(image, panel).astype(int).sum(axis=2).ravel()
         order = np.argsort(shares.ravel())
@@ -152,9 +145,9 @@ def test_a_film_shows_each_step_and_a_still_one_of_them(studio: Studio) -> None:
     assert studio.film(records, "--fps", 20) == ""
     assert studio.millis() == [50] * 4 + [1000]
     studio.film(records, "--from", 1, "--to", 4, "--every", 2)
-    (first, _), _ = studio.pictures()
+    first, _ = studio.pictures()
     assert studio.millis() == [100, 1000]
-    still = studio.still(records, 1)
+    still = studio.still(records)
     assert still.shape == first.shape
     for panel in range(4):  # texts have fewer greys in a film
         assert np.abs(cells(still, panel).astype(int) - cells(first, panel)).max() <= 4
@@ -165,12 +158,9 @@ def test_the_belief_goes_through_gaps_which_are_shown_and_told(studio: Studio) -
     words = studio.film(records)
     assert "2 steps are not recorded; the belief is predicted through them" in words
     assert studio.millis() == [100, 100, 1000, 100, 1000]
-    gap = studio.pictures()[2][0]
+    gap = studio.pictures()[2]
     assert (cells(gap, 0)[0] == 255).all() and (cells(gap, 1)[0] == 255).all()
-    kept = known(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
-    kept.correct(SEEN)
-    kept.predict()
-    kept.correct(SEEN)
+    kept = believed()
     for _ in range(2):
         kept.predict()
     shades = cells(gap, 2).astype(int).sum(axis=2)
@@ -186,19 +176,28 @@ def test_the_belief_begins_again_with_an_episode(studio: Studio) -> None:
     words = studio.film(records, "--step", 0)
     assert "--step: recorded in 2 episodes; showing the first" in words
     studio.film(records)
-    first, _, again = (cells(image, 2) for image, _ in studio.pictures())
+    first, _, again = (cells(image, 2) for image in studio.pictures())
     assert (first == again).all()
-    lacking = cells(studio.pictures()[2][0], 0)
+    lacking = cells(studio.pictures()[2], 0)
     assert (lacking[0] == 255).all(), "no hidden states of that step"
 
 
 def test_what_is_not_recorded_is_left_out(studio: Studio) -> None:
-    whole = studio.still([server(), *both(1)], 1)
-    blind = studio.still([server(), frame(1)], 1)
+    whole = studio.still([server(), *both(1)])
+    blind = studio.still([server(), frame(1)])
     assert whole.shape[1] - blind.shape[1] == 166, "no panel of hidden states"
     words = studio.film([server(model=None), *both(1)])
     assert "the belief is left out, as the server hid its model" in words
-    assert studio.pictures()[0][0].shape[1] == 2 * 150 + 16 + 28
+    assert studio.pictures()[0].shape[1] == 2 * 150 + 16 + 28
+
+
+def test_a_hidden_model_is_given(studio: Studio, tmp_path: Path) -> None:
+    file = tmp_path / "model.toml"
+    file.write_text(MODEL.toml)
+    plain, given = ([server(**it), *both(1)] for it in ({}, {"model": None}))
+    assert (studio.still(plain) == studio.still(given, "--model", file)).all()
+    error = studio.fails([server(model=None, n_observations=4), *both(1)], "--model", file)
+    assert "--model: expected one with 4 observations, as recorded, got 3" in error
 
 
 def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -> None:
@@ -212,37 +211,21 @@ def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -
     records = [server(model=None, recorded_world=recorded), *both(1)]
     words = studio.film(records)
     assert "the belief is left out, as recorded worlds have no model" in words
-    image = studio.still(records, 1)
+    image = studio.still(records)
     assert (cells(image, 0) == colors[TRUTH]).all()
     seen = SEEN < 255
     assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
-def test_a_hidden_model_is_given(studio: Studio, tmp_path: Path) -> None:
-    file = tmp_path / "model.toml"
-    file.write_text(MODEL.toml)
-    known = studio.still([server(), *both(1)], 1)
-    given = studio.still([server(model=None), *both(1)], 1, "--model", file)
-    assert (known == given).all()
-    error = studio.fails([server(model=None, n_observations=4), *both(1)], "--model", file)
-    assert "--model: expected one with 4 observations, as recorded, got 3" in error
-
-
-def test_a_cut_recording_is_shown_as_far_as_it_goes(studio: Studio) -> None:
+def test_a_recording_is_shown_as_far_as_it_goes(studio: Studio) -> None:
     words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
     assert "warning" in words and "cut short" in words
     assert len(studio.millis()) == 2
-
-
-def test_worlds_of_another_kind_end_the_film(studio: Studio) -> None:
     records = [server(), frame(0), server(pid=9), frame(0), server(pid=7, model=None), frame(1)]
     assert "worlds of another kind follow" in studio.film(records)
     assert len(studio.millis()) == 1, "two alike"
-
-
-def test_a_frame_that_is_published_again_counts_once(studio: Studio) -> None:
     studio.film([server(), frame(0), frame(1), frame(1), frame(1, world=1), frame(2)])
-    assert len(studio.millis()) == 3
+    assert len(studio.millis()) == 3, "published again"
 
 
 #: Flags, and words about them.
@@ -289,9 +272,9 @@ def test_without_pillow_it_says_what_to_install(
 
 def test_a_team_is_drawn_with_its_paths_and_who_stayed_is_told(studio: Studio) -> None:
     team = server(n_robots=3)
-    blank = studio.still([team, frame(1, robots=3, hovered=7)], 1)
-    flown = studio.still([team, frame(1, robots=3, hovered=0)], 1)
-    some = studio.still([team, frame(1, robots=3, hovered=2, late=4)], 1)
+    blank = studio.still([team, frame(1, robots=3, hovered=7)])
+    flown = studio.still([team, frame(1, robots=3, hovered=0)])
+    some = studio.still([team, frame(1, robots=3, hovered=2, late=4)])
     for robot, color in enumerate(ROBOTS[:3]):
         middles = [(0, robot), (1, robot + 1)]
         for image, (row, col) in ((blank, middles[0]), (flown, middles[1])):
@@ -312,9 +295,9 @@ def test_zones_no_fly_cells_and_footprints_are_drawn_and_told(studio: Studio) ->
     airspace = {"radius": 1, "n_rings": 2, "pays": "visited", "no_fly": no_fly}
     names = [*MODEL.observation_names, *(f"{name} ring 1" for name in MODEL.observation_names)]
     rings = {"model": None, "observations": names, "n_observations": 6}
-    plain = studio.still([server(model=None), *both(1)], 1)
+    plain = studio.still([server(model=None), *both(1)])
     land = [server(**rings, airspace=airspace, zones=zones), *both(1)]
-    image = studio.still(land, 1)
+    image = studio.still(land)
     rows = TOP + SCALE * np.arange(HEIGHT) + 6
     unseen = image[rows, LEFTS[1] + SCALE * 2 + 5]
     assert (unseen == [(0x88, 0xEE, 0x88)] * 2 + [(0xEE, 0x88, 0xEE)]).all()
@@ -323,4 +306,4 @@ def test_zones_no_fly_cells_and_footprints_are_drawn_and_told(studio: Studio) ->
         assert changed[:, left + 40 : left + 50].any(axis=1).all(), "hatches"
     assert len(image) > len(plain), "a longer legend"
     studio.film(land)
-    assert np.abs(studio.pictures()[0][0][rows, LEFTS[1] + 25] - unseen.astype(int)).max() <= 4
+    assert np.abs(studio.pictures()[0][rows, LEFTS[1] + 25] - unseen.astype(int)).max() <= 4

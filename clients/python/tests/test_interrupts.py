@@ -18,7 +18,6 @@ from environments import (
     impatient,
     make,
     make_vec,
-    rollout,
     small_server,
 )
 from failures import fails
@@ -38,7 +37,6 @@ MOVE = ("frame", "visited", "robot", "move", "age", "belief", "local", "recent")
 
 #: Environments of each kind: all that they remember is observed.
 KINDS: dict[str, Callable[[], Any]] = {
-    "path": lambda: make(observation=PATH, truth=True),
     "attached": lambda: make(
         instance=small_server(publish_truth=True).instance, observation=PATH, truth=True
     ),
@@ -49,7 +47,6 @@ KINDS: dict[str, Callable[[], Any]] = {
     "team": lambda: closed_later(
         emberwatch.parallel_env(height=7, width=5, n_moves=4, burn_in=50, observation=MOVE)
     ),
-    "objective": lambda: make(OBJECTIVE),
     "objectives": lambda: make_vec(2, OBJECTIVE, max_episode_steps=3),
 }
 
@@ -76,7 +73,6 @@ class Signal:
 
 
 def places(call: Callable[[], object]) -> int:
-    """At how many places a signal may interrupt a call."""
     watched = Signal(0, Alarm)
     sys.setprofile(watched)
     try:
@@ -100,7 +96,6 @@ def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
 
 
 def action(env: Any, seed: int) -> Any:
-    """A random action, or one of each robot."""
     agents: dict[str, Any] = getattr(env, "action_spaces", {})
     for space in agents.values() or [env.action_space]:
         space.seed(seed)
@@ -118,7 +113,6 @@ def no_garbage() -> Generator[None]:
 
 @pytest.fixture(params=KINDS)
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
-    """Two environments of one kind: one to be interrupted, one to compare with."""
     return KINDS[request.param](), KINDS[request.param]()
 
 
@@ -188,17 +182,6 @@ def same(left: object, right: object) -> bool:
     except AssertionError:
         return False
     return True
-
-
-def test_the_first_reset_may_be_interrupted_anywhere() -> None:
-    expected = rollout(make(), 2, seed=5)
-    env = make()
-    n_places = places(lambda: env.reset(seed=5))
-    kept = []
-    for n in range(1, n_places, n_places // 8):
-        env.close()
-        kept.append(interrupted(lambda: env.reset(seed=7), n))
-        assert_same(rollout(env, 2, seed=5), expected)
 
 
 def test_a_close_that_was_interrupted_is_closed_again() -> None:

@@ -22,7 +22,7 @@ from environments import (
 )
 from failures import fails
 from gymnasium.vector import VectorEnv
-from processes import Server, stopped
+from processes import Server
 
 from emberwatch.errors import RequestTimeoutError, ServerGoneError
 
@@ -38,7 +38,6 @@ Make = Callable[..., Any]
     ids=[f"{kind} {many}" for many in ("alone", "vector") for kind in ("path", "move", "option")],
 )
 def making(request: pytest.FixtureRequest) -> Make:
-    """Makes an environment of each kind."""
     return request.param
 
 
@@ -49,7 +48,6 @@ def started() -> Server:
 
 @pytest.fixture
 def attached(making: Make, started: Server) -> Any:
-    """An environment at a running server, after a step of its worlds."""
     env = making(instance=started.instance)
     env.reset(seed=1)
     fly(env)
@@ -99,12 +97,10 @@ def test_worlds_that_are_gone_are_not_gone_on_with(attached: Any, started: Serve
 
 
 def test_a_stopped_server_times_out_and_resume_goes_on(attached: Any, started: Server) -> None:
-    with (
-        stopped(started.program.pid),
-        impatient(attached),
-        pytest.raises(RequestTimeoutError),
-    ):
+    started.stop()
+    with impatient(attached), pytest.raises(RequestTimeoutError):
         fly(attached)
+    started.wake_up()
     with fails("closed", match="an earlier step or reset timed out"):
         # The first move, as that which timed out was the last of its path.
         attached.step(np.zeros(attached.action_space.shape, int))

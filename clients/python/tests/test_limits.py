@@ -14,11 +14,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from failures import fails
-from processes import eventually, find, server, stopped, unused_instance
+from processes import eventually, find, server, unused_instance
 
 import emberwatch
-from emberwatch.errors import EmberwatchError, NotEnoughMemoryError
+from emberwatch.errors import EmberwatchError
 
 #: Says what an error says.
 HEAD = """
@@ -47,14 +46,12 @@ on_x86 = pytest.mark.skipif(platform.machine() != "x86_64", reason="numbers of x
 
 
 def run(*command: str | Path, limit: str = "true") -> subprocess.CompletedProcess[str]:
-    """Runs a program in a shell that first sets a limit on itself."""
     shell = ["bash", "-c", f'ulimit -c 0; {limit} && exec "$@"', "bash", *map(str, command)]
     few = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run(shell, capture_output=True, text=True, timeout=60, env=few)
 
 
 def python(code: str, *arguments: object, limit: str = "true") -> str:
-    """What Python code prints; it ends well."""
     words = [sys.executable, "-W", "ignore", "-c", HEAD + code, *map(str, arguments)]
     ended = run(*words, limit=limit)
     assert ended.returncode == 0, ended
@@ -98,15 +95,13 @@ def removed(folder: Path) -> bool:
 MEMORY = "memory", ["memory.limit_in_bytes", "memory.max"], "400M"
 
 
-@pytest.mark.parametrize(
-    ("limit", "name"),
-    [("ulimit -v 1500000", "RLIMIT_AS"), ("ulimit -d 1200000", "RLIMIT_DATA")],
-)
-def test_worlds_beyond_a_ulimit_are_refused_with_numbers(limit: str, name: str) -> None:
-    said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=limit)
-    assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
-    assert "MiB for 256 worlds of 1024 x 1024 cells, got " in said, said
-    assert f"the limit {name}; raise it (`ulimit " in said, said
+def test_worlds_beyond_a_ulimit_are_refused_with_numbers() -> None:
+    limits = {"ulimit -v 1500000": "RLIMIT_AS", "ulimit -d 1200000": "RLIMIT_DATA"}
+    for limit, name in limits.items():
+        said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=limit)
+        assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
+        assert "MiB for 256 worlds of 1024 x 1024 cells, got " in said, said
+        assert f"the limit {name}; raise it (`ulimit " in said, said
 
 
 def test_a_cgroup_limits_worlds_by_its_memory() -> None:
@@ -126,37 +121,28 @@ print(len(lease.reset(range(32))))
         assert python(few, limit=enter) == "32\n"
 
 
-@pytest.mark.parametrize(
-    # A belief alone takes 240 bytes and 3 KiB, with its tables and cavities 6 and 160 KiB.
-    ("kind", "side", "n_worlds"),
-    [("known", 4, 1 << 20), ("known+cavities", 16, 40_000)],
-)
-def test_beliefs_beyond_a_limit_are_refused_before_they_are_made(
-    kind: str, side: int, n_worlds: int
-) -> None:
+def test_beliefs_beyond_a_limit_are_refused_before_they_are_made() -> None:
     code = """
 from emberwatch import belief
 from emberwatch.model import Model
-kind, side, n_worlds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 model = Model.named("wildfire-burnout")
-prior = belief.uniform_prior(model, height=side, width=side)
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-before = peak()
-tell(lambda: belief.known(model, prior=prior, kind=kind, n_worlds=n_worlds))
-print(peak() - before)
+# A belief alone takes 240 bytes and 3 KiB, with its tables and cavities 6 and 160 KiB.
+for kind, side, n_worlds in ("known", 4, 1 << 20), ("known+cavities", 16, 40_000):
+    prior, before = belief.uniform_prior(model, height=side, width=side), peak()
+    tell(lambda: belief.known(model, prior=prior, kind=kind, n_worlds=n_worlds))
+    assert peak() - before < 100
 """
-    error, mebibytes = python(code, kind, side, n_worlds).splitlines()
-    assert "NotEnoughMemoryError no_memory memory: expected " in error
-    assert f" MiB for the beliefs about {n_worlds} worlds, got " in error
-    assert int(mebibytes) < 100
+    for n_worlds, error in zip((1 << 20, 40_000), python(code).splitlines(), strict=True):
+        assert "NotEnoughMemoryError no_memory memory: expected " in error
+        assert f" MiB for the beliefs about {n_worlds} worlds, got " in error
 
 
 def test_memory_errors_are_of_both_kinds() -> None:
     with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells") as caught:
         emberwatch.embed(worlds=1024, height=4096, width=4096)
-    assert isinstance(caught.value, NotEnoughMemoryError)
-    assert isinstance(caught.value, EmberwatchError) and caught.value.code == "no_memory"
+    assert isinstance(caught.value, EmberwatchError)
 
 
 @as_root
@@ -187,21 +173,8 @@ def test_a_cgroup_without_threads_is_named() -> None:
 
 
 @on_x86
-@pytest.mark.parametrize(
-    ("call", "number"),
-    [
-        ("pidfd_open", errno.EPERM),
-        pytest.param("pidfd_open", errno.ENOSYS, marks=pytest.mark.slow),
-        pytest.param("pidfd_open", errno.EACCES, marks=pytest.mark.slow),
-        ("flock", errno.EPERM),
-        ("fallocate", errno.EPERM),
-        ("socket", errno.EAFNOSUPPORT),
-    ],
-)
-def test_a_refused_call_is_named_and_not_taken_for_no_server(call: str, number: int) -> None:
+def test_a_refused_call_is_named_and_not_taken_for_no_server() -> None:
     running = server()
-    words = f"{call}: expected the system to allow this call, got: {os.strerror(number)}"
-    words = words.replace("socket:", "socket (AF_UNIX):")
     code = """
 import logging
 refuse(int(sys.argv[2]), int(sys.argv[3]))
@@ -210,30 +183,34 @@ def waits(record): raise AssertionError(record.getMessage())  # "waiting up to 1
 logging.getLogger("emberwatch").addFilter(waits)
 tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
 """
-    embedded, connected = python(code, running.instance, CALLS[call], number).splitlines()
-    assert embedded.startswith("made "), embedded
-    assert connected.startswith(f"EmberwatchError channel {words}"), connected
-    assert "--security-opt seccomp" in connected, connected
-    code = "refuse(int(sys.argv[1]), int(sys.argv[2])); os.execv(sys.argv[3], sys.argv[3:])"
-    program = find("emberwatch-server")
-    for more in (["status", f"--instance={running.instance}"], [f"--instance={unused_instance()}"]):
-        wrapped = [sys.executable, "-c", HEAD + code, str(CALLS[call]), str(number), program]
-        ended = run(*wrapped, *more)
-        assert ended.returncode == 1 and words in ended.stderr, ended
+    starts = "refuse(int(sys.argv[1]), int(sys.argv[2])); os.execv(sys.argv[3], sys.argv[3:])"
+    program = [sys.executable, "-c", HEAD + starts]
+    of_server = [["status", f"--instance={running.instance}"], [f"--instance={unused_instance()}"]]
+    for call, number in (
+        ("pidfd_open", errno.EPERM),
+        ("flock", errno.EPERM),
+        ("fallocate", errno.EPERM),
+        ("socket", errno.EAFNOSUPPORT),
+    ):
+        words = f"{call}: expected the system to allow this call, got: {os.strerror(number)}"
+        words = words.replace("socket:", "socket (AF_UNIX):")
+        told = python(code, running.instance, CALLS[call], number).splitlines()
+        assert told[0].startswith("made ") and "--security-opt seccomp" in told[1], told
+        assert told[1].startswith(f"EmberwatchError channel {words}"), told
+        for more in of_server:
+            flags = [str(CALLS[call]), str(number), find("emberwatch-server"), *more]
+            ended = run(*program, *flags)
+            assert ended.returncode == 1 and words in ended.stderr, ended
 
 
 @on_x86
-def test_threads_that_a_seccomp_profile_forbids_are_called_so() -> None:
+def test_what_a_seccomp_profile_hides_is_called_so() -> None:
     code = """
 refuse(435, 1)
 tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
 """
     said = python(code)
     assert said.startswith("EmberwatchError threads threads: ") and "`clone3`" in said, said
-
-
-@on_x86
-def test_a_process_that_cannot_be_watched_is_not_called_ended() -> None:
     code = "refuse(434, 1); os.execv(sys.argv[1], sys.argv[1:])"
     flags = [f"--instance={unused_instance()}", f"--exit-with={os.getpid()}"]
     ended = run(sys.executable, "-c", HEAD + code, find("emberwatch-server"), *flags)
@@ -264,26 +241,9 @@ print(free, needed, count() - before)
 """
 
 
-@pytest.mark.parametrize("kind", ["connect", "observe"])
-def test_a_connection_takes_as_many_descriptors_as_it_says(kind: str) -> None:
-    said = python(DESCRIPTORS, server().instance, kind)
-    free, needed, left = map(int, said.split())
-    assert left == 0
-    assert needed <= free <= needed + 1, said
-
-
-def test_attempts_that_time_out_leave_no_descriptor_and_no_place() -> None:
-    running = server()
-
-    def n_open() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    running.connect().close()
-    before = n_open()
-    with stopped(running.program.pid):
-        for _ in range(3):
-            with fails("timeout"):
-                emberwatch.connect(running.instance, timeout=0.1)
-        assert n_open() == before
-    clients = [running.connect() for _ in range(15)]  # the sixteenth is `running`'s own
-    assert len(clients) == 15
+def test_a_connection_takes_as_many_descriptors_as_it_says() -> None:
+    instance = server().instance
+    for kind in ("connect", "observe"):
+        free, needed, left = map(int, python(DESCRIPTORS, instance, kind).split())
+        assert left == 0
+        assert needed <= free <= needed + 1, kind

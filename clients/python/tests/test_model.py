@@ -21,7 +21,6 @@ WILDFIRE = (CONFIG / "wildfire.toml").read_text()
 
 
 def read(folder: Path, text: str | bytes) -> Model:
-    """The model of a file with this text, which the server checks."""
     path = folder / "model.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return Model.named(path)

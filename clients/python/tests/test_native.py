@@ -62,13 +62,6 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         client.status()
 
 
-def test_phi_of_single_precision_is_that_of_double() -> None:
-    prior = simulated_prior(WILDFIRE, height=5, width=7, burn_in=40)
-    assert prior.dtype == np.float32
-    transition = Transition(WILDFIRE, height=5, width=7)
-    assert (transition.apply(prior) == transition.apply(prior.astype(np.float64))).all()
-
-
 def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
     likelihood, frames = WILDFIRE.observation_matrix, np.zeros((1, 2, 2), np.uint8)
     beliefs = np.full((3, 1, 2, 2), 1 / 3)
@@ -150,14 +143,3 @@ def test_flights_refuse_rows_and_states_of_others() -> None:
     for shape in ((1, 3, 5), (2, 3, 4)):
         with refuses(r"states: expected shape \(2, 3, 5\), got"):
             flights().begin(begun, robots, np.zeros(shape, np.uint8))
-
-
-def test_a_lease_flies_no_robots_of_others() -> None:
-    started = server(worlds=4)
-    lease = started.connect().acquire(1, 2)
-    for first, n_robots in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
-        with refuses("step: expected robots of worlds 1..3"):
-            lease.native.step(np.zeros((n_robots, 6), np.uint8), first, n_robots, 0, 5.0)
-    assert lease.step([[3] * 6] * 2).result().world.step == 1
-    with pytest.raises(errors.EmberwatchError):
-        lease.step([3] * 6, robots=range(0, 1))

@@ -16,12 +16,7 @@ import golden_options
 import gymnasium
 import numpy as np
 import pytest
-from environments import (
-    OBJECTIVE,
-    assert_same,
-    closed_later,
-    rollout,
-)
+from environments import OBJECTIVE, assert_same, closed_later, rollout
 from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
 from processes import eventually, find, server
@@ -29,7 +24,6 @@ from processes import eventually, find, server
 import emberwatch
 from emberwatch import _native, errors
 from emberwatch.envs.plans import Estimator
-from emberwatch.wrappers import BeliefObservation
 
 GOLDEN = np.load(golden_options.FILE)
 
@@ -56,7 +50,7 @@ def decide(env: Any) -> Any:
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"truth": True}, {"estimator": "spatial_filter"}])
+@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "spatial_filter"}])
 def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     with environments.no_warnings():
@@ -99,7 +93,6 @@ def test_the_former_version_is_named() -> None:
 
 
 def trained(folder: Path, **world: object) -> Path:
-    """The checkpoint of a filter that learned a little."""
     settings = folder / "agent.toml"
     settings.write_text("[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n")
     flags = {"worlds": 2, "steps": 40, "config": settings, "out": folder / "out", "moves": 4}
@@ -112,7 +105,6 @@ def trained(folder: Path, **world: object) -> Path:
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the checkpoints of the golden episodes, by what they are of."""
     folder = tmp_path_factory.mktemp("checkpoints")
     for name in ("learned_filter", "own_kernels", "neural_belief"):
         (folder / name).write_bytes(GOLDEN[f"checkpoint {name}"].tobytes())
@@ -120,7 +112,6 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def believing(name: str, checkpoints: Path) -> dict[str, Any]:
-    """The keywords of golden episodes."""
     keywords = dict(golden_options.BELIEFS[name])
     if "checkpoint" in keywords:
         keywords["checkpoint"] = checkpoints / keywords["checkpoint"]
@@ -143,7 +134,7 @@ def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> 
             assert_same(value, expected, key)
 
 
-@pytest.mark.parametrize("name", ["spatial_filter", "learned_filter, own kernels", "neural_belief"])
+@pytest.mark.parametrize("name", ["spatial_filter", "neural_belief"])
 @pytest.mark.parametrize("is_left", [True, False])
 def test_the_next_one_goes_on_from_the_same_belief(
     name: str, is_left: bool, checkpoints: Path
@@ -199,26 +190,11 @@ def ringed(folder: Path) -> Path:
 
 
 def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Path) -> None:
-    with refuses("checkpoint.*of `train --learner neural`"):
-        make(checkpoint=checkpoints / "own_kernels", estimator="neural_belief")
     for name in ("learned_filter", "neural_belief"):
         for maker in (make, make_vec):
             with refuses("checkpoint: expected 6 observations as the world's, got 3"):
                 maker(checkpoint=checkpoints / name, model=ringed(tmp_path))
-    (checkpoints / "damaged").write_bytes(b"no checkpoint")
-    with refuses("checkpoint .*damaged: expected a whole safetensors file"):
-        make(checkpoint=checkpoints / "damaged")
-
-
-def test_a_sensor_of_several_matrices_is_learned_without_its_model(tmp_path: Path) -> None:
-    world = {"model": ringed(tmp_path), "height": 7, "width": 5, "moves": 4, "burn_in": 50}
-    checkpoint = trained(tmp_path, **world)
-    shown = [server(reveal_model=reveals, **world) for reveals in (True, False)]
-    seen = [rollout(make(instance=it.instance, checkpoint=checkpoint), 3, seed=5) for it in shown]
-    assert_same(*seen)
-
-
-def test_an_estimator_that_knows_the_model_ignores_what_was_learned(checkpoints: Path) -> None:
+    # An estimator that knows the model ignores what was learned.
     known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
 
@@ -283,12 +259,8 @@ def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
     process.join()
 
 
-@pytest.mark.parametrize(
-    ("belief", "estimator"),
-    [("known", "known_model"), ("known+spatial", "spatial_filter")],
-)
-def test_exploiting_makes_the_steps_of_a_policy_that_does(belief: str, estimator: str) -> None:
-    found = []
+def test_exploiting_makes_the_steps_of_a_policy_that_does() -> None:
+    belief, estimator, found = "known+spatial", "spatial_filter", list[Any]()
     for flies in (False, True):
         started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
         client = started.connect()
@@ -305,12 +277,6 @@ def test_exploiting_makes_the_steps_of_a_policy_that_does(belief: str, estimator
         answers = [client.recall(step) for step in range(6)]
         found.append([(answer.results.tolist(), answer.frames.tolist()) for answer in answers])
     assert_same(*found)
-
-
-def test_the_world_is_that_of_wildfire_with_the_same_seed() -> None:
-    worlds = [make(truth=True), environments.make(truth=True)]
-    counts = [[seen[-1]["n_target_cells"] for seen in rollout(one, 4, seed=3)] for one in worlds]
-    assert counts[0] == counts[1]
 
 
 def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
@@ -334,16 +300,12 @@ def test_a_hidden_model_must_be_given() -> None:
 def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> None:
     """The same features as where the server reveals it."""
     flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "sensor_radius": 1}
+    shown = [server(**flags, **one).instance for one in ({}, {"reveal_model": False})]
     for name in ("learned_filter", "neural_belief"):
-        seen = [
-            rollout(
-                make(instance=server(**flags, **one).instance, checkpoint=checkpoints / name),
-                3,
-                seed=5,
-            )
-            for one in ({}, {"reveal_model": False})
-        ]
-        assert_same(*seen)
+        envs = [make(instance=one, checkpoint=checkpoints / name) for one in shown]
+        assert_same(*(rollout(env, 3, seed=5) for env in envs))
+        for env in envs:
+            env.close()
 
 
 def test_a_wrong_keyword_is_refused() -> None:
@@ -359,10 +321,3 @@ def test_a_wrong_keyword_is_refused() -> None:
         for maker in (make, make_vec):
             with refuses(words):
                 maker(**keywords)
-
-
-def test_beliefs_start_from_the_programs_prior() -> None:
-    env = BeliefObservation(environments.make(), prior="simulated")
-    belief, _ = env.reset(seed=1000)
-    assert belief.shape == (3, 7, 5)
-    assert np.allclose(belief.sum(0), 1.0) and (belief > 0).all()

@@ -7,7 +7,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from failures import fails, refuses
+from failures import fails
 from processes import CHANNELS, PATIENCE, ctrl_c, eventually, server, unused_instance
 
 from emberwatch import errors
@@ -34,12 +34,6 @@ def test_a_server_that_is_started_later_is_waited_for(caplog: pytest.LogCaptureF
     # Once in this test, and once in `server` if its program was slow.
     assert caplog.text.count("waiting up to 20 s") in (1, 2)
     assert f"no server on instance {instance!r}" in caplog.text
-
-
-def test_a_bad_instance_name_is_refused() -> None:
-    for name in ("", "a/b", "a b", ".", "ä", "x" * 65, "a\n", "a\0"):
-        with refuses("instance: expected 1 to 64 characters"):
-            connect(name)
 
 
 def test_a_wait_for_the_lock_ends_with_its_limit_or_ctrl_c() -> None:

@@ -20,6 +20,7 @@ BOUNDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "which"), list(enumerate(["all", "tenth", "window"])))
 def test_each_cure_takes_off_what_it_did(at: int, which: str) -> None:
     fires = list(BENCHMARK["recorded"](FIRES / f"fires-{which}.npz"))

@@ -31,17 +31,10 @@ def sequences() -> list[States]:
 
 @pytest.fixture
 def states(tmp_path: Path, sequences: list[States]) -> Path:
-    """A states file with a description beside it."""
     path = tmp_path / "lab.npz"
     np.savez_compressed(path, states_000=sequences[0], states_001=sequences[1])
     path.with_suffix(".toml").write_bytes(RECORDED.read_bytes())
     return path
-
-
-def test_a_recorded_world_passes_the_checker(states: Path) -> None:
-    for name in (WILDFIRE, MOVES):
-        env: Any = gymnasium.make(name, states=states, n_moves=3, states_symmetries=True)
-        check_env(env.unwrapped, skip_render_check=True)
 
 
 def test_symmetries_and_offsets_are_those_asked_for(states: Path, sequences: list[States]) -> None:
@@ -107,6 +100,8 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
     env: Any = gymnasium.make(MOVES, states=states, n_moves=3, reward="move")
     paths: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3)
     path = [3, 1, 2]
+    for one in (env, paths):
+        check_env(one.unwrapped, skip_render_check=True)
     for seed in range(4):
         env.reset(seed=seed)
         paths.reset(seed=seed)

@@ -81,18 +81,15 @@ def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
     assert list(recording.read(path, world=1)) == []
 
 
-def test_a_cut_recording_is_read_to_its_last_whole_record(path: Path) -> None:
+def test_a_cut_or_damaged_recording_is_read_to_its_last_good_record(path: Path) -> None:
     ends = np.cumsum([len(part) for part in PARTS])
-    for length in (0, ends[0], ends[1] + 1, ends[2], ends[3] - 1, ends[4], len(GOOD) - 1):
+    for length in (0, ends[1] + 1, ends[4], len(GOOD) - 1):
         whole = int((ends <= length).sum())
         offset = ends[whole - 1] if whole else 0
         words = f"cut short: expected a whole record at byte {offset}, got {length - offset} bytes"
         with pytest.warns(RecordingCutWarning, match=words):
             assert len(read(path, GOOD[:length])) == max(0, whole - 2)
         refused(path, GOOD[:length], words)
-
-
-def test_a_damaged_recording_is_read_up_to_the_damage(path: Path) -> None:
     damaged = bytearray(GOOD)
     offset = sum(map(len, PARTS[:4]))
     damaged[offset + 30] ^= 0x10
@@ -103,19 +100,12 @@ def test_a_damaged_recording_is_read_up_to_the_damage(path: Path) -> None:
     refused(path, bytes(damaged), f"damaged at byte {offset}: checksum")
 
 
-def test_what_is_no_recording_is_refused(path: Path) -> None:
+def test_what_is_no_recording_is_refused(path: Path, tmp_path: Path) -> None:
     for content, words in (
         (b"PK\3\4 and so on, at length", 'expected it to begin with "EMBERREC", got "PK'),
-        (FILE_HEADER + frame(0), "at byte 16: expected a server before its samples"),
-        (FILE_HEADER + packed(1, deflated(b"{}")), "missing field"),
         (FILE_HEADER + SERVER + frame(0, n_moves=3), "payload bytes: expected 129, got 130"),
-        (FILE_HEADER + SERVER + frame(0) + END, "totals: expected"),
-        (GOOD + b"x", "nothing behind the end"),
     ):
         refused(path, content, words)
-
-
-def test_what_is_no_regular_file_is_no_recording(tmp_path: Path) -> None:
     os.mkfifo(fifo := tmp_path / "fifo")
     for path in (fifo, tmp_path):
         with fails("recording", match=f"expected a regular file, got {path}"):

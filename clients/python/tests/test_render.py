@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emberwatch.model import Model
@@ -45,6 +43,12 @@ def test_cells_are_squares_of_their_colour() -> None:
         for down, right in ((0, 0), (0, 39), (39, 0), (39, 39)):
             at = 40 * row + down, 40 * col + right
             assert pixel(image, *at) == (color or WILDFIRE.unobserved)
+    cells = WILDFIRE.paint_frame(FRAME).repeat(40, axis=0).repeat(40, axis=1)
+    assert (draw(robots=[], paths=[]) == cells).all()
+    # Odd pictures repeat their last row and column.
+    image = draw(frame=np.full((3, 3), 2, np.uint8), robots=[(0, 0)], paths=[], scale=15)
+    assert image.shape == (46, 46, 3)
+    assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
 
 
 def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
@@ -55,29 +59,13 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its circle
     without = draw(paths=[])
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
-
-
-def test_without_robot_and_path_there_are_only_cells() -> None:
-    cells = WILDFIRE.paint_frame(FRAME).repeat(40, axis=0).repeat(40, axis=1)
-    assert (draw(robots=[], paths=[]) == cells).all()
-
-
-def test_a_path_over_unseen_cells_is_light() -> None:
-    unseen = np.full((2, 3), 255, np.uint8)
-    assert pixel(draw(frame=unseen), 40, 20) == WHITE
-    assert pixel(draw(frame=unseen), 40, 12) == WILDFIRE.unobserved
-
-
-def test_a_path_may_begin_in_the_corner() -> None:
-    frame = np.zeros((4, 4), np.uint8)
-    image = draw(frame=frame, robots=[(3, 3)], paths=[[(0, 0), (0, 1)]], scale=4)
-    assert pixel(image, 0, 0) == WHITE and pixel(image, 3, 3) == DARK
-
-
-def test_odd_pictures_repeat_their_last_row_and_column() -> None:
-    image = draw(frame=np.full((3, 3), 2, np.uint8), robots=[(0, 0)], paths=[], scale=15)
-    assert image.shape == (46, 46, 3)
-    assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
+    unseen = draw(frame=np.full((2, 3), 255, np.uint8))
+    assert pixel(unseen, 40, 20) == WHITE and pixel(unseen, 40, 12) == WILDFIRE.unobserved
+    robots, paths = [(1, 1), (0, 2)], [PATH, [(0, 1), (0, 2)]]
+    image = draw(robots=robots, paths=paths)
+    for (row, col), color in zip(robots, ROBOTS, strict=False):
+        assert pixel(image, 40 * row + 20, 40 * col + 20) == color
+    assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
 
 
 def test_small_cells_are_tinted_where_visited() -> None:
@@ -98,74 +86,37 @@ def test_the_truth_stands_beside_or_below() -> None:
     assert draw(frame=wide, truth=wide, scale=10).shape == (20 + 8 + 20, 60, 3)
 
 
-@pytest.mark.parametrize(
-    ("grid", "panel", "both"),
-    [
+def test_panels_are_about_512_pixels_and_even() -> None:
+    for grid, panel, both in (
         ((64, 64), (512, 512), (512, 1032)),
         ((7, 5), (518, 370), (518, 748)),
         ((128, 40), (512, 160), (512, 328)),
         ((40, 128), (160, 512), (328, 512)),
         ((1, 1), (512, 512), (512, 1032)),
         ((600, 601), (600, 602), (600, 1210)),
-    ],
-)
-def test_panels_are_about_512_pixels_and_even(
-    grid: tuple[int, int], panel: tuple[int, int], both: tuple[int, int]
-) -> None:
-    frame = np.full(grid, 255, np.uint8)
-    assert draw(frame=frame, robots=[(0, 0)], paths=[], scale=None).shape[:2] == panel
-    truth = np.zeros(grid, np.uint8)
-    assert draw(frame=frame, robots=[(0, 0)], paths=[], truth=truth, scale=None).shape[:2] == both
+    ):
+        parts = {"frame": np.full(grid, 255, np.uint8), "robots": [(0, 0)], "paths": []}
+        assert draw(**parts, scale=None).shape[:2] == panel
+        assert draw(**parts, truth=np.zeros(grid, np.uint8), scale=None).shape[:2] == both
 
 
-@settings(deadline=None)
-@given(
-    st.tuples(st.integers(1, 40), st.integers(1, 40)),
-    st.integers(1, 17),
-    st.integers(0, 2**32),
-    st.booleans(),
-)
-def test_sizes_depend_on_the_grid_only(
-    grid: tuple[int, int], scale: int, key: int, with_truth: bool
-) -> None:
-    rng = np.random.default_rng(key)
-    moves = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])[rng.integers(0, 4, 30)]
-    cells = [np.array([rng.integers(side) for side in grid])]
-    for move in moves:
-        cells.append(np.clip(cells[-1] + move, 0, np.array(grid) - 1))
-    frame = rng.choice(np.array([0, 1, 2, 255], np.uint8), grid)
-    truth = rng.integers(0, 3, grid).astype(np.uint8) if with_truth else None
-    robot = (int(cells[-1][0]), int(cells[-1][1]))
-    full = draw(frame=frame, robots=[robot], paths=[np.array(cells)], truth=truth, scale=scale)
-    unobserved = np.full(grid, 255, np.uint8)
-    empty = draw(frame=unobserved, robots=[(0, 0)], paths=[], truth=truth, scale=scale)
-    assert full.shape == empty.shape
-    assert full.shape[0] % 2 == full.shape[1] % 2 == 0
+#: Changes of a picture, and words about them.
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"frame": FRAME[0]}, r"frame: expected shape \(H, W\)"),
+    ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
+    ({"robots": [(1, 1), (2, 0)]}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
+    ({"paths": [[(0, 0), (-1, 0)]]}, r"path: expected cells .* got \(-1, 0\)"),
+    ({"paths": [[(0, 0), (1, 1)]]}, "path: expected neighbours"),
+    ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
+    ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
+]
 
 
-def test_drawing_changes_no_argument() -> None:
-    frame, truth, path = FRAME.copy(), TRUTH.copy(), np.array(PATH)
-    draw(frame=frame, truth=truth, paths=[path], scale=2)
-    text(frame=frame, truth=truth, paths=[path], color=True)
-    assert (frame == FRAME).all() and (truth == TRUTH).all() and (path == PATH).all()
-
-
-@pytest.mark.parametrize("picture", [draw, text])
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"frame": FRAME[0]}, r"frame: expected shape \(H, W\)"),
-        ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
-        ({"robots": [(1, 1), (2, 0)]}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
-        ({"paths": [[(0, 0), (-1, 0)]]}, r"path: expected cells .* got \(-1, 0\)"),
-        ({"paths": [[(0, 0), (1, 1)]]}, "path: expected neighbours"),
-        ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
-        ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
-    ],
-)
-def test_what_does_not_fit_is_refused(picture: Any, changes: Any, expected: str) -> None:
-    with pytest.raises(ValueError, match=expected):
-        picture(**changes)
+def test_what_does_not_fit_is_refused() -> None:
+    for changes, expected in WRONG:
+        for picture in (draw, text):
+            with pytest.raises(ValueError, match=expected):
+                picture(**changes)
     with pytest.raises(ValueError, match="scale: expected at least 1 pixel, got 0"):
         draw(scale=0)
 
@@ -176,9 +127,7 @@ def test_a_palette_keeps_grey_and_path_apart_from_the_model() -> None:
     dark = Model.from_toml(re.sub(r"#\w{6}\"", '#202028"', toml))
     assert Palette.of(dark).unobserved == (0x60,) * 3
     assert Palette.of(dark).path == WHITE
-
-
-def test_a_hidden_model_has_colours_too() -> None:
+    # A hidden model has colours, too.
     palette = Palette.of(3)
     assert palette.observations == WILDFIRE.observations
     draw(palette=palette, truth=TRUTH + np.uint8(60))
@@ -188,7 +137,8 @@ def test_a_hidden_model_has_colours_too() -> None:
 def test_ascii_shows_values_path_and_robot() -> None:
     assert text().split("\n") == ["0*. .", "2*1@."]
     assert text(truth=TRUTH).split("\n") == ["0*. .   0 1 2", "2*1@.   2 1@0"]
-    assert text(paths=[]).isascii()
+    robots, paths = [(1, 1), (0, 2)], [PATH, [(0, 1), (0, 2)]]
+    assert text(robots=robots, paths=paths).split("\n") == ["0*.*.@", "2*1@."]
     many = Palette.of(64)
     assert text(palette=many, frame=FRAME + np.uint8(10), paths=[]).startswith("A 9 9")
 
@@ -236,12 +186,7 @@ def test_a_window_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     screen.show(Picture(**PARTS))
     screen.close()
     screen.close()
-
-
-def test_two_screens_take_turns_in_the_one_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pygame")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    one, other = Screen(), Screen()
+    one, other = Screen(), Screen()  # take turns in the one window
     for screen in (one, other, one):
         screen.show(Picture(**PARTS))
     other.close()
@@ -288,12 +233,3 @@ def test_pictures_keep_their_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(3):
         screen.show(Picture(**PARTS))
     assert waits == [0.0, 0.25, 0.5]
-
-
-def test_a_team_has_a_colour_for_each_robot() -> None:
-    robots, paths = [(1, 1), (0, 2)], [PATH, [(0, 1), (0, 2)]]
-    image = draw(robots=robots, paths=paths)
-    for (row, col), color in zip(robots, ROBOTS, strict=False):
-        assert pixel(image, 40 * row + 20, 40 * col + 20) == color
-    assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
-    assert text(robots=robots, paths=paths).split("\n") == ["0*.*.@", "2*1@."]

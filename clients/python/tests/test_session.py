@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium
 import pytest
-from environments import closed_later, impatient, make, rollout, small_server
+from environments import closed_later, make, rollout, small_server
 from processes import Server
 
 from emberwatch.envs.session import State
@@ -20,7 +20,6 @@ def interrupt(*_: object, **__: object) -> None:
 
 
 def interrupted(owner: object, name: str, call: Callable[[], object]) -> None:
-    """Ctrl-C where a call calls a method."""
     with pytest.MonkeyPatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(owner, name, interrupt)
         call()
@@ -63,7 +62,6 @@ OUTCOMES: dict[State, tuple[str | int, str | int]] = {
 
 @pytest.fixture
 def env() -> Any:
-    """Two steps into an episode, in this process."""
     made = make().unwrapped
     rollout(made, 2, seed=1)
     return made
@@ -106,19 +104,6 @@ def test_each_state_has_its_calls(env: Any, state: State) -> None:
             step(env)
         assert env.reset(seed=1)[1]["step"] == 0
         assert step(env) == 1
-
-
-def test_a_time_out_asks_for_a_reset_or_resume(started: Server) -> None:
-    env = make(instance=started.instance, robots=2, robot=0).unwrapped
-    env.reset()
-    started.stop()
-    with impatient(env):
-        assert step(env) == "timeout"
-    started.wake_up()
-    assert env._session._state is State.TIMED_OUT
-    assert step(env) == "closed"
-    k = resume(env)
-    assert k in (0, 1) and step(env) == k + 1
 
 
 def test_an_episode_that_is_over_waits_for_the_holder_of_all(started: Server) -> None:

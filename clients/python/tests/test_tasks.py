@@ -5,13 +5,23 @@ import sys
 import tomllib
 import warnings
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from environments import assert_same, closed_later, no_warnings, rollout, serving
+from environments import (
+    MOVES,
+    OBJECTIVE,
+    WILDFIRE,
+    assert_same,
+    closed_later,
+    no_warnings,
+    rollout,
+    serving,
+)
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
 from processes import find
@@ -39,18 +49,13 @@ def each(names: Iterable[str]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("name", kept)
 
 
-each_alone = each(name for name, task in TASKS.items() if task.robots == 1)
-
-
 def warns_of_tests(name: str) -> Any:
-    """A context in which an episode begins on a test world."""
     return pytest.warns(
         emberwatch.TrainingOnTestWorldsWarning, match=f"task '{name}': .* test world"
     )
 
 
 def by_hand(name: str) -> dict[str, Any]:
-    """The keywords that a task stands for."""
     file = tomllib.loads((CONFIG / f"tasks/{name}.toml").read_text("utf-8"))
     renamed = {"n_moves" if key == "moves" else key: value for key, value in file.items()}
     not_keywords = ("name", "test_seeds", "max_steps", "listing")
@@ -68,60 +73,39 @@ def test_the_package_has_the_files_of_the_programs() -> None:
         assert Task.named(name) == Task.named(CONFIG / f"tasks/{name}.toml") == task
     with refuses("task ash: No such file .*expected one, or wildfire, small, "):
         Task.named("ash")
-
-
-def test_ids_end_episodes_with_the_task() -> None:
-    for name, task in TASKS.items():
+    for name, task in TASKS.items():  # ids end episodes with the task
         for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
             spec = gymnasium.spec(f"emberwatch/{task.ids}{kind}")
             assert spec.max_episode_steps == n_moves * task.max_steps
             assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
 
 
-@each_alone
-def test_a_task_is_its_settings_by_hand(name: str) -> None:
-    file = CONFIG / f"tasks/{name}.toml"
-    for kind, steps, other in (
-        ("-v0", 3, by_hand(name)),
-        ("Moves-v0", 2 * by_hand(name)["n_moves"], {"task": file}),
-    ):
-        worlds: list[Any] = [
-            gymnasium.make(f"emberwatch/{TASKS[name].ids}{kind}"),
-            gymnasium.make(f"emberwatch/Wildfire{kind}", **other),
-        ]
-        first, second = [rollout(env, steps, seed=1005) for env in worlds]
-        assert_same(first, second)
-        for env in worlds:
-            env.close()
+def are_same(makers: list[Any], steps: int) -> None:
+    worlds = [maker() for maker in makers]
+    assert_same(*(rollout(one, steps, seed=1005) for one in worlds))
+    for one in worlds:
+        one.close()
 
 
 @each(TASKS)
-def test_a_vector_of_a_task_is_one_of_its_settings(name: str) -> None:
-    task = TASKS[name]
-    n_rows = 2 * task.robots
-    for kind, steps in (("-v0", 3), ("Moves-v0", 2 * task.n_moves)):
-        worlds: list[Any] = [
-            gymnasium.make_vec(f"emberwatch/{TASKS[name].ids}{kind}", num_envs=n_rows),
-            gymnasium.make_vec(f"emberwatch/Wildfire{kind}", num_envs=n_rows, **by_hand(name)),
-        ]
-        first, second = [rollout(envs, steps, seed=1005) for envs in worlds]
-        assert_same(first, second)
-        for envs in worlds:
-            envs.close()
+def test_a_task_is_its_settings_by_hand(name: str) -> None:
+    task, hand = TASKS[name], by_hand(name)
+    ids, n_rows, n_moves = f"emberwatch/{task.ids}", 2 * task.robots, 2 * task.n_moves
+    make, many = gymnasium.make, partial(gymnasium.make_vec, num_envs=n_rows)
+    are_same([lambda: many(f"{ids}-v0"), lambda: many(WILDFIRE, **hand)], 3)
+    if task.robots == 1:
+        file = CONFIG / f"tasks/{name}.toml"
+        are_same([lambda: make(f"{ids}Moves-v0"), lambda: make(MOVES, task=file)], n_moves)
+    if name == "small":
+        are_same([lambda: many(f"{ids}Moves-v0"), lambda: many(MOVES, **hand)], n_moves)
+        for kind in ("-v0", "Moves-v0", "Objective-v1"):
+            with no_warnings():
+                env = make(f"{ids}{kind}", disable_env_checker=True)
+                check_env(env.unwrapped, skip_render_check=True)
+                env.close()
 
 
-@each_alone
-def test_gymnasium_finds_no_fault(name: str) -> None:
-    # The filter's first belief takes seconds on larger grids.
-    kinds = ["-v0", "Moves-v0"] + (["Objective-v1"] if name == "small" else [])
-    for kind in kinds:
-        with no_warnings():
-            env = gymnasium.make(f"emberwatch/{TASKS[name].ids}{kind}", disable_env_checker=True)
-            check_env(env.unwrapped, skip_render_check=True)
-            env.close()
-
-
-def test_pettingzoo_finds_no_fault_in_the_team() -> None:
+def test_the_team_s_robots_fly_together() -> None:
     with no_warnings():
         env = emberwatch.parallel_env(task="team")
         assert len(env.possible_agents) == 4
@@ -129,22 +113,12 @@ def test_pettingzoo_finds_no_fault_in_the_team() -> None:
         warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
         parallel_api_test(env, num_cycles=50)
         env.close()
-
-
-def test_one_robot_flies_the_team_s_world_only_beside_others() -> None:
     with refuses("robots: expected one robot in a world, got 4: fly one of them with robot="):
         gymnasium.make("emberwatch/WildfireTeam-v0")
     with serving(task="team", **OF_TASKS) as lab:
         env = gymnasium.make("emberwatch/WildfireTeam-v0", instance=lab, robot=2)
         env.reset()
         env.close()
-
-
-def test_a_task_ends_episodes_in_any_environment() -> None:
-    env = gymnasium.make("emberwatch/Wildfire-v0", task="small")
-    *_, last = rollout(env, TASKS["small"].max_steps, seed=1001)
-    assert last[3]
-    env.close()
 
 
 def test_what_a_task_decides_is_refused_by_name() -> None:
@@ -154,8 +128,10 @@ def test_what_a_task_decides_is_refused_by_name() -> None:
     for keyword, value in decided.items():
         with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
             gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
+    env = closed_later(gymnasium.make(WILDFIRE, task="small"))
+    assert rollout(env, TASKS["small"].max_steps, seed=1001)[-1][3], "it ends episodes"
     with refuses('task : expected a name or a file, got ""'):
-        gymnasium.make("emberwatch/Wildfire-v0", task="")
+        gymnasium.make(WILDFIRE, task="")
 
 
 def test_a_running_server_must_have_the_task() -> None:
@@ -164,15 +140,14 @@ def test_a_running_server_must_have_the_task() -> None:
         env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
         env.reset()
         env.close()
-        for name in ("emberwatch/WildfireSmall-v0", "emberwatch/Wildfire-v0"):
-            env = gymnasium.make(name, instance=lab)
-            with warns_of_tests("small"):
-                env.reset(seed=0)
-            env.close()
+        env = gymnasium.make(WILDFIRE, instance=lab)
+        with warns_of_tests("small"):
+            env.reset(seed=0)
+        env.close()
         with refuses("task: expected 'small', as the server has, or None, got 'sparse'"):
             gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
         with refuses("task ash: No such file"):
-            gymnasium.make("emberwatch/Wildfire-v0", instance=lab, task="ash")
+            gymnasium.make(WILDFIRE, instance=lab, task="ash")
 
 
 #: Changes of a task, and words about a server of the task before.
@@ -194,29 +169,14 @@ def test_a_running_server_must_run_what_the_task_says(tmp_path: Path, name: str)
     file.write_text(text, "utf-8")
     with serving(task=file, **OF_TASKS) as lab:
         keywords = {"instance": lab, "task": file, "robot": 0}
-        env = gymnasium.make("emberwatch/Wildfire-v0", **keywords)
+        env = gymnasium.make(WILDFIRE, **keywords)
         env.reset()
         env.close()
         for old, new, words in CHANGED[name]:
             assert old in text
             file.write_text(text.replace(old, new), "utf-8")
             with refuses(words):
-                gymnasium.make("emberwatch/Wildfire-v0", **keywords)
-
-
-def test_an_evaluation_takes_seeds_and_steps_of_its_task(tmp_path: Path) -> None:
-    text = (CONFIG / "tasks/team.toml").read_text("utf-8")
-    own = tmp_path / "own.toml"
-    text = text.replace("max_steps = 300", "max_steps = 2").replace("end = 32", "end = 3")
-    own.write_text(text.replace('"team"', '"own"'), "utf-8")
-    rows = evaluate(
-        lambda seen: [0] * len(seen), name="up", task=own, observation="frame", progress=None
-    )
-    assert [(row.world_seed, row.steps, row.robots) for row in rows] == [
-        (0, 2, 4),
-        (1, 2, 4),
-        (2, 2, 4),
-    ]
+                gymnasium.make(WILDFIRE, **keywords)
 
 
 def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
@@ -251,20 +211,16 @@ def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
 
 
 #: What makes environments of a task, and resets them on its test world of that seed.
-ON_TEST_WORLDS: dict[str, Any] = {
-    "path": lambda task: gymnasium.make("emberwatch/Wildfire-v0", task=task),
-    "move": lambda task: gymnasium.make("emberwatch/WildfireMoves-v0", task=task),
-    "moves": lambda task: gymnasium.make_vec("emberwatch/WildfireMoves-v0", 2, task=task),
-    "team": lambda task: emberwatch.parallel_env(task=task),
-    "objective": lambda task: gymnasium.make(
-        "emberwatch/WildfireObjective-v1", task=task, prior="initial"
-    ),
-}
+ON_TEST_WORLDS: list[Any] = [
+    lambda task: gymnasium.make(WILDFIRE, task=task),
+    lambda task: gymnasium.make_vec(MOVES, 2, task=task),
+    lambda task: emberwatch.parallel_env(task=task),
+    lambda task: gymnasium.make(OBJECTIVE, task=task, prior="initial"),
+]
 
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A task with the test seeds 5 and 6."""
     file = tmp_path / "own.toml"
     text = (CONFIG / "tasks/small.toml").read_text("utf-8").replace('"small"', '"own"')
     for old, new in {"3000": "3", "start = 0": "start = 5", "end = 32": "end = 7"}.items():
@@ -274,20 +230,16 @@ def own(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize("kind", ON_TEST_WORLDS)
-def test_an_episode_on_a_test_world_warns(own: Path, kind: str) -> None:
-    env = closed_later(ON_TEST_WORLDS[kind](own))
-    with warns_of_tests("own"):
-        env.reset(seed=6)
-    with warns_of_tests("own"):
-        env.reset(seed=5)
-    with no_warnings():
-        for seed in (7, 1000, None):
-            env.reset(seed=seed)
-
-
-def test_seeds_of_a_vector_are_those_of_its_worlds(own: Path) -> None:
-    envs = closed_later(gymnasium.make_vec("emberwatch/Wildfire-v0", 4, task=own))
+def test_an_episode_on_a_test_world_warns(own: Path) -> None:
+    for maker in ON_TEST_WORLDS:
+        env = closed_later(maker(own))
+        for seed in (6, 5):
+            with warns_of_tests("own"):
+                env.reset(seed=seed)
+        with no_warnings():
+            for seed in (7, 1000, None):
+                env.reset(seed=seed)
+    envs = closed_later(gymnasium.make_vec(WILDFIRE, 4, task=own))
     with no_warnings():
         envs.reset(seed=1)
         envs.reset(seed=[None, 7, 8, None])
@@ -302,8 +254,10 @@ def test_evaluations_are_on_test_worlds_without_a_warning(own: Path, tmp_path: P
 
     common: dict[str, Any] = {"name": "up", "observation": "frame", "progress": None}
     with no_warnings():
-        evaluate(up, task=own, steps=1, **common)
-        evaluate(up, task="team", steps=1, seeds=[0], **common)
+        rows = evaluate(up, task=own, steps=1, **common)
+        assert [row.world_seed for row in rows] == [5, 6]
+        (row,) = evaluate(up, task="team", steps=1, seeds=[0], **common)
+        assert row.robots == 4
         suite(up, tasks=[own], worlds=1, folder=tmp_path / "suite", **common)
 
 

@@ -75,17 +75,3 @@ def test_a_team_is_evaluated_as_a_whole(tmp_path: Path) -> None:
     assert all(0.0 < row.mean_repeated < 0.5 for row in rows)
     assert all(row.mean_distinct_cells < 8 for row in rows)
     assert len(emberwatch.benchmark.read(tmp_path / "team.csv")) == 4
-
-
-def test_files_from_before_teams_and_figures_of_merit_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "old.csv"
-    head = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,"
-    head += "mean_fire_cells,mean_plan_millis,brier,moves"
-    file.write_text(f"{head}\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8\n")
-    (row,) = emberwatch.benchmark.read(file)
-    assert (row.moves, row.robots, row.team, row.mean_repeated) == (8, 1, "alone", 0.0)
-    file.write_text(
-        f"{head},robots,team,mean_repeated\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8,2,both,0.5\n"
-    )
-    (row,) = emberwatch.benchmark.read(file)
-    assert (row.robots, row.team, row.mean_repeated, row.recent_steps) == (2, "both", 0.5, None)

@@ -49,7 +49,6 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def averages(folder: Path, name: str) -> dict[int, float]:
-    """Means over the CSV's rows of a step."""
     values: dict[int, list[float]] = {}
     for row in rows(folder):
         if row[name]:
@@ -71,35 +70,3 @@ def test_a_training_shows_its_metrics_and_beliefs(tmp_path: Path) -> None:
     for image in images:
         assert (image.width, image.height) == (9 * 16, 6 * 16)
         assert image.encoded_image_string.startswith(b"\x89PNG\r\n\x1a\n")
-
-
-def test_what_is_gone_back_on_goes_from_the_curves_too(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    train(folder, "--steps", 60)
-    saved = (folder / "checkpoint.safetensors").read_bytes()
-    train(folder, "--steps", 60, "--resume")
-    # As if a kill had lost what came after the checkpoint.
-    (folder / "checkpoint.safetensors").write_bytes(saved)
-    train(folder, "--steps", 20, "--resume", "--agent-seed", 9)
-    rewards = scalars(folder, "mean_reward")
-    assert rewards == pytest.approx(averages(folder, "mean_reward"), rel=1e-6)
-    assert max(rewards) == 80
-    frozen = folder / "frozen"
-    for _ in range(2):
-        train(folder, "--steps", 10, "--resume", "--freeze")
-        assert len(scalars(frozen, "mean_reward")) == 5
-    assert scalars(folder, "mean_reward") == rewards
-
-
-def test_a_comparison_is_a_run_of_each_policy(tmp_path: Path) -> None:
-    folder = tmp_path / "runs"
-    what = "--seeds 3..5 --steps 7 --policies random_walk,beam_exploit".split()
-    agent("compare", "--tensorboard", folder, "--csv", tmp_path / "out.csv", *what, *WORLDS)
-    with (tmp_path / "out.csv").open() as file:
-        means = [(row["policy"], float(row["mean_reward"])) for row in csv.DictReader(file)]
-    for policy in ["random_walk", "beam_exploit"]:
-        rewards = scalars(folder / policy, "reward")
-        assert list(rewards) == list(range(1, 8))
-        of_worlds = [mean for name, mean in means if name == policy]
-        assert sum(rewards.values()) / 7 == pytest.approx(sum(of_worlds) / 2, rel=1e-4)
-        assert len(scalars(folder / policy, "reward_standard_error")) == 7

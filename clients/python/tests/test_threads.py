@@ -17,27 +17,22 @@ from processes import at_once, script, server
 
 import emberwatch
 
-#: Forks while a thread opens connections, or steps with one; each child flies a robot of its own.
+#: Forks while a thread opens connections and steps; each child flies a robot of its own.
 FORKS = """
 import os, sys, threading, time
 from emberwatch.client.client import connect
 from emberwatch.errors import EmberwatchError
 
-instance, what = sys.argv[1:]
+instance = sys.argv[1]
 held = connect(instance)
 lease, is_over, errors = held.acquire(0), threading.Event(), []
-
-def opens():
-    with connect(instance) as client:
-        client.acquire(1).release()
-
-def steps():
-    lease.step([3] * 6)
 
 def loop():
     try:
         while not is_over.is_set():
-            {"opens": opens, "steps": steps}[what]()
+            lease.step([3] * 6)
+            with connect(instance) as client:
+                client.acquire(1).release()
     except Exception as error:
         errors.append(error)
 
@@ -69,10 +64,8 @@ print(codes, errors)
 """
 
 
-@pytest.mark.parametrize("what", ["opens", "steps"])
-def test_children_of_a_busy_process_open_their_own(what: str) -> None:
-    started = server(worlds=3)
-    ended, out, err = script(FORKS, started.instance, what).end()
+def test_children_of_a_busy_process_open_their_own() -> None:
+    ended, out, err = script(FORKS, server(worlds=3).instance).end()
     assert (ended, out) == (0, "{0} []\n"), err
 
 
@@ -95,8 +88,6 @@ def test_what_is_open_is_not_copied() -> None:
 #: Environments, with the action that all steps take.
 SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
     "path": (make, np.array([1, 3, 1, 3])),
-    "move": (lambda: make(MOVES, observation=("belief", "local")), 3),
-    "paths": (lambda: make_vec(3), np.array([[1, 3, 1, 3]] * 3)),
     "moves": (lambda: make_vec(3, MOVES, observation=("belief", "local")), np.array([3, 1, 0])),
     "team": (
         lambda: closed_later(emberwatch.parallel_env(robots=2, max_episode_steps=None, **SMALL)),
@@ -146,13 +137,7 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
         return repr(outcome[-1]) + repr(outcome[0]) + repr(outcome[1])
 
     assert sorted(map(moment, steps)) == sorted(map(moment, expected[1:]))
-
-
-@pytest.mark.parametrize("kind", SHARED)
-def test_a_thread_that_resets_waits_for_a_step_of_another(kind: str) -> None:
-    maker, action = SHARED[kind]
-    env, alone = maker(), maker()
-    env.reset(seed=1000)
+    # A thread that resets waits for a step of another.
     with repeated(lambda: env.step(action)):
         for _ in range(20):
             env.reset(seed=1000)
@@ -160,9 +145,8 @@ def test_a_thread_that_resets_waits_for_a_step_of_another(kind: str) -> None:
     assert_same(first, [alone.reset(seed=1001), *(alone.step(action) for _ in range(8))])
 
 
-@pytest.mark.parametrize("height", [7, 130])
+@pytest.mark.parametrize("height", [7, 130])  # beyond 16,384 cells in all, too
 def test_a_thread_that_watches_reads_masks_and_parts_of_the_path(height: int) -> None:
-    # Beyond 16,384 cells in all, too.
     envs = make_vec(2, MOVES, height=height, width=height)
     envs.reset(seed=1000)
     flights = envs.unwrapped._flights

@@ -19,7 +19,6 @@ from environments import (
     no_warnings,
     serving,
 )
-from failures import refuses
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import emberwatch
@@ -55,7 +54,6 @@ def pair(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> tuple[Vector, V
 
 
 def assert_same_resets(ours: Vector, theirs: Vector, mask: Any, seed: Any = None) -> None:
-    """Both return the same when some worlds are reset."""
     left, right = (
         envs.reset(seed=seed, options={"reset_mask": np.array(mask)}) for envs in (ours, theirs)
     )
@@ -63,7 +61,6 @@ def assert_same_resets(ours: Vector, theirs: Vector, mask: Any, seed: Any = None
 
 
 def assert_same_flight(ours: Vector, theirs: Vector, n_steps: int, seed: Any) -> None:
-    """Both return the same, in every field, from a reset on."""
     assert_same(ours.reset(seed=seed), theirs.reset(seed=seed), "reset")
     assert_same_steps(ours, theirs, n_steps)
 
@@ -78,14 +75,11 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
     return n_ends
 
 
-# Against SyncVectorEnv
-
-
 @pytest.mark.parametrize(
     ("name", "keywords"),
     [
-        *((WILDFIRE, {"observation": parts}) for parts in (*PARTS, ("frame", "robot"))),
-        *((MOVES, {"observation": part}) for part in ("local", "move")),
+        (WILDFIRE, {"observation": "robot"}),
+        (MOVES, {"observation": "move"}),
         (OBJECTIVE, {"prior": "uniform", "estimator": "spatial_filter"}),
         *ALL.items(),
     ],
@@ -95,59 +89,36 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
 def test_every_field_is_that_of_single_environments(
     mode: AutoresetMode, name: str, keywords: dict[str, Any]
 ) -> None:
-    ours, theirs = pair(3, mode, name=name, truth=True, **keywords)
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
+    n_steps, truth = 10 if name == MOVES else 3, mode is not AutoresetMode.SAME_STEP
+    keywords = {**keywords, "name": name, "truth": truth, "max_episode_steps": n_steps}
+    ours, theirs = pair(4, mode, **keywords)
+    for of in ("observation_space", "action_space", "metadata"):
+        assert getattr(ours, of) == getattr(theirs, of)
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.single_action_space == theirs.single_action_space
-    assert ours.metadata == theirs.metadata
-    assert_same_flight(ours, theirs, 6, seed=17)
+    assert_same_flight(ours, theirs, 2, seed=17)
+    # Some are reset in between, so that episodes end at different times.
+    assert_same_resets(ours, theirs, [True, False, True, False], [7, None, 8, None])
+    n_ends = assert_same_steps(ours, theirs, n_steps - 2)
+    assert n_ends == 2
+    if mode is AutoresetMode.DISABLED:
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[1, 3\]: the episode is ov"):
+            ours.step(actions(theirs, 1)[0])
+        assert_same_resets(ours, theirs, [False, True, False, True])
+        assert_same_steps(ours, theirs, 1)
+    else:
+        assert assert_same_steps(ours, theirs, 5 * n_steps) > 8
     # Without a seed, each world's own generator goes on.
     assert_same_flight(ours, theirs, 2, seed=None)
 
 
 @by_name
-@pytest.mark.parametrize("truth", [False, True])
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_episodes_end_and_begin_again_as_in_single_environments(
-    mode: AutoresetMode, truth: bool, name: str
-) -> None:
-    n_steps = 10 if name == MOVES else 3
-    keywords = {**ALL[name], "truth": truth, "max_episode_steps": n_steps}
-    ours, theirs = pair(4, mode, name=name, **keywords)
-    assert_same_flight(ours, theirs, 2, seed=0)
-    # Some are reset in between, so that episodes end at different times.
-    for mask in ([True, False, True, False], [False, False, True, False]):
-        for env_seed in (5, [7, None, 8, None], None):
-            assert_same_resets(ours, theirs, mask, env_seed)
-            assert_same_steps(ours, theirs, 1)
-    assert assert_same_steps(ours, theirs, 5 * n_steps) > 8
-
-
-@by_name
-def test_disabled_autoreset_leaves_resets_to_the_caller(name: str) -> None:
-    keywords = {**ALL[name], "max_episode_steps": 2}
-    ours, theirs = pair(3, AutoresetMode.DISABLED, name=name, **keywords)
-    assert_same_flight(ours, theirs, 1, seed=3)
-    assert_same_resets(ours, theirs, [False, True, False])
-    action = actions(theirs, 1)[0]
-    left, right = ours.step(action), theirs.step(action)
-    assert_same(left, right)
-    assert left[3].tolist() == [True, False, True]
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[0, 2\]: the episode is over"):
-        ours.step(action)
-    assert_same_resets(ours, theirs, left[3])
-    assert_same(ours.step(action), theirs.step(action))
-
-
-@by_name
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: str) -> None:
+def test_worlds_of_running_servers_are_the_same_too(name: str) -> None:
     # The servers truncate by themselves, and the vector's worlds begin at 2 of theirs.
     flags = {"publish_truth": True, "max_steps": 3}
     with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
-        ours = make_vec(3, name, instance=one, world=2, autoreset_mode=mode, truth=True)
-        theirs = sync_of(3, mode, name=name, instance=other, truth=True)
+        ours = make_vec(3, name, instance=one, world=2, truth=True)
+        theirs = sync_of(3, AutoresetMode.NEXT_STEP, name=name, instance=other, truth=True)
         assert_same_flight(ours, theirs, 2, seed=6)
         assert_same_resets(ours, theirs, [False, True, False])
         assert assert_same_steps(ours, theirs, 32 if name == MOVES else 8) > 4
@@ -167,38 +138,16 @@ def test_seeds_are_those_of_single_environments() -> None:
             assert_same(ours.reset(), theirs.reset(), repr(seed))
 
 
-# reset
-
-
 def test_a_reset_mask_is_left_as_it_was() -> None:
     env = make_vec(2)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset of all worlds before"):
+        env.reset(options={"reset_mask": np.array([True, False])})
     env.reset(seed=1)
     options = {"reset_mask": np.array([True, False])}
     infos = env.reset(options=options)[1]
     assert options["reset_mask"].tolist() == [True, False]
     infos["_step"][:] = False
     assert options["reset_mask"].tolist() == [True, False]
-
-
-def test_the_first_reset_is_of_all_worlds() -> None:
-    env = make_vec(2)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="reset of all worlds before"):
-        env.reset(options={"reset_mask": np.array([True, False])})
-
-
-def test_an_impossible_seed_changes_nothing() -> None:
-    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, truth=True)
-    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
-    for seed in (-1, 2**64 - 1):
-        with refuses("seed: expected an integer within 0 to"):
-            ours.reset(seed=seed)
-    assert_same(ours.reset(), theirs.reset())
-
-
-def test_the_truth_of_too_many_worlds_of_a_server_is_refused() -> None:
-    words = "truth: expected at most 128 worlds, got 129"
-    with serving(worlds=129, publish_truth=True) as instance, refuses(words):
-        make_vec(129, instance=instance, truth=True)
 
 
 def test_resume_goes_on_where_the_worlds_stand() -> None:
@@ -231,50 +180,41 @@ def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
             assert not second.step(np.zeros(2, int))[3].any()
 
 
-# step
-
-
-@by_name
-@pytest.mark.parametrize("mode", AutoresetMode, ids=str)
-def test_what_was_returned_is_never_changed(mode: AutoresetMode, name: str) -> None:
-    keywords = {**ALL[name], "truth": True, "max_episode_steps": 3}
-    env = make_vec(3, name, autoreset_mode=mode, **keywords)
-    returned = [env.reset(seed=1)]
-    kept: list[Any] = []
-    for step, action in enumerate(actions(env, 12)):
-        if mode is AutoresetMode.DISABLED and step % 3 == 0:
-            returned.append(env.reset())
-        elif step == 2:
-            returned.append(env.reset(options={"reset_mask": np.array([False, True, False])}))
-        returned.append(env.step(action))
-        kept.append(copy.deepcopy(returned[-1]))
-    assert_same([value for value in returned if len(value) == 5], kept)
-
-
-@by_name
-def test_what_was_returned_may_be_written_to(name: str) -> None:
-    keywords = {**ALL[name], "max_episode_steps": 2}
-    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, name=name, **keywords)
-    _spoil(ours.reset(seed=4))
-    theirs.reset(seed=4)
-    for action in actions(theirs, 13):
-        left = ours.step(action)
-        assert_same(left, theirs.step(action))
-        _spoil(left)
-
-
-def _spoil(value: Any) -> None:
+def spoil(value: Any) -> None:
     if isinstance(value, np.ndarray):
         value[:] = 1
-    elif isinstance(value, dict):
-        for part in value.values():
-            _spoil(part)
-    else:
-        for part in value:
-            _spoil(part)
+    elif isinstance(value, dict | tuple | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            spoil(part)
 
 
-# Keywords and the registry
+@by_name
+@pytest.mark.parametrize("mode", [*AutoresetMode, None], ids=str)
+def test_what_was_returned_is_never_changed_and_may_be_written_to(
+    mode: AutoresetMode | None, name: str
+) -> None:
+    """Of vectors in each mode, or of single environments."""
+    keywords: dict[str, Any] = {**ALL[name], "max_episode_steps": 3, "truth": True}
+    keywords["render_mode"] = "rgb_array"
+    many: dict[str, Any] = {"n_worlds": 3, "autoreset_mode": mode} if mode else {}
+    spoilt, env = ((make_vec if mode else make)(name=name, **many, **keywords) for _ in range(2))
+    kept: list[Any] = []
+    returned = [env.reset(seed=1)]
+    spoil(spoilt.reset(seed=1))
+    for step, action in enumerate(actions(env, 12)):
+        if mode in (AutoresetMode.DISABLED, None) and step % 3 == 0:
+            returned.append(env.reset())
+            spoil(spoilt.reset())
+        elif step == 2 and mode:
+            for one in (env, spoilt):
+                one.reset(options={"reset_mask": np.array([False, True, False])})
+        returned.append(env.step(action))
+        kept.append(copy.deepcopy(returned[-1]))
+        outcome = spoilt.step(action)
+        assert_same(outcome, kept[-1])
+        spoil(outcome)
+        assert_same(spoilt.render(), env.render())
+    assert_same([value for value in returned if len(value) == 5], kept)
 
 
 def test_the_registry_sets_spec_and_metadata() -> None:
@@ -304,12 +244,6 @@ def test_the_registrys_time_limit_holds_unless_another_is_given() -> None:
     assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
 
 
-def test_gymnasiums_own_vectorizer_works() -> None:
-    ours = make_vec(2)
-    theirs = make_vec(2, vectorization_mode="async")
-    assert_same_flight(ours, theirs, 3, seed=2)
-
-
 def test_vector_wrappers_work() -> None:
     env = gymnasium.wrappers.vector.FlattenObservation(make_vec(2, observation=PARTS))
     for observation in (env.reset(seed=1)[0], env.step(env.action_space.sample())[0]):
@@ -319,11 +253,8 @@ def test_vector_wrappers_work() -> None:
     assert [info["step"] for info in recorder.reset(seed=1)[1]] == [0, 0]
 
 
-# Pictures
-
-
-@pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
-def test_pictures_are_those_of_single_environments(name: str) -> None:
+def test_pictures_are_those_of_single_environments() -> None:
+    name = WILDFIRE
     keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, name=name, **keywords)
     ours.reset(seed=1)
@@ -348,9 +279,6 @@ def test_texts_and_windows_are_shown() -> None:
         env.reset(seed=1)
         env.step(np.zeros((2, 4), int))
         assert env.render() == (None, None)
-
-
-# Life and death
 
 
 @by_name

@@ -84,13 +84,15 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             "is_parallelizable": True,
         }
         self.render_mode = self._worlds.render_mode
-        # Copies: each agent draws its own samples.
+        # Copies with seeds of their own: each agent draws its own samples.
         self.observation_spaces = {
             agent: deepcopy(self._worlds.single_observation_space) for agent in self.possible_agents
         }
         self.action_spaces = {
             agent: deepcopy(self._worlds.single_action_space) for agent in self.possible_agents
         }
+        for space in (*self.observation_spaces.values(), *self.action_spaces.values()):
+            space.seed()
         spec = self._worlds.world_spec
         #: What `state` returns.
         self.state_space = spaces.Box(
