@@ -245,7 +245,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         ladder.check_prints(words);
     }
     assert!(!ladder.stdout.contains("| beam_"), "{}", ladder.stdout);
-    assert!(results.path("figures/ladder.svg").exists());
+    assert!(results.path("figures/snapshot.svg").exists());
     let no_model = "filters with a model, and recorded worlds have none";
     for (words, expected) in [
         ("run --policy spatial_beam", no_model),

@@ -28,7 +28,9 @@ pub fn heat(probabilities: ArrayView2<'_, f32>) -> Result<Heat, EncodingError> {
     let cells = (0..height * width)
         .map(|at| probabilities[[at / width / side, at % width / side]])
         .map(sequential);
-    let pixels: Vec<u8> = cells.flat_map(|color| [color.0, color.1, color.2]).collect();
+    let pixels: Vec<u8> = cells
+        .flat_map(|color| [color.0, color.1, color.2])
+        .collect();
     let mut png = Vec::new();
     let mut encoder = Encoder::new(&mut png, width as u32, height as u32);
     encoder.set_color(ColorType::Rgb);

@@ -320,7 +320,12 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     let label = &*report.axis_label;
     draw_ladder(&directory.join("ladder.svg"), all, label)?;
     let fire_cells = Some(&*report.fire_cells);
-    draw_rewards(&directory.join("rewards.svg"), &report.runs, label, fire_cells)?;
+    draw_rewards(
+        &directory.join("rewards.svg"),
+        &report.runs,
+        label,
+        fire_cells,
+    )?;
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
