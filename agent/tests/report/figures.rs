@@ -122,6 +122,7 @@ fn a_training_is_drawn_from_its_metrics() {
         "reward per world step",
         "world steps, of all worlds together",
     ];
+    assert_eq!(FIGURE, "training.svg");
     check("training/training", 84 + 5 * 190 + 64, &texts, |_| {
         draw_training(&folder)
     });

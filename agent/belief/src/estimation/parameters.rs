@@ -401,7 +401,8 @@ mod tests {
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        let changes: [(fn(&mut Dimensions), &str); 4] = [
+        type Change = fn(&mut Dimensions);
+        let changes: [(Change, &str); 4] = [
             (|it| it.n_states = 1, "states: expected 2 to 64, got 1"),
             (|it| it.n_observations = 65, "got 65"),
             (

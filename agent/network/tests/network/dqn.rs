@@ -217,7 +217,8 @@ fn the_latest_transitions_are_kept_oldest_first() {
 #[test]
 fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
     let row = "dqn.transitions: 7: expected 6 finite inputs, an action below 4 and a discount from 0 to 1, got";
-    let changes: [(fn(&mut Saved), &str); 5] = [
+    type Change = fn(&mut Saved);
+    let changes: [(Change, &str); 5] = [
         (
             |it| it.0.retain(|tensor| tensor.0 != "dqn.target.2.bias"),
             "dqn.target.2.bias: missing",
@@ -245,7 +246,8 @@ fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
 
 #[test]
 fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
-    let changes: [(fn(&mut Dqn, &mut [Transition]), &str); 5] = [
+    type Change = fn(&mut Dqn, &mut [Transition]);
+    let changes: [(Change, &str); 5] = [
         (|_, rows| rows[5].input[2] = f32::NAN, "dqn.replay.input"),
         (
             |_, rows| rows[63].next[2] = f32::INFINITY,
