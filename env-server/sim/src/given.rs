@@ -164,63 +164,31 @@ mod tests {
         assert_eq!(with(start).map(|it| it.start), Ok(config.start));
     }
 
+    /// Settings, and what is said of them.
+    const WRONG: &str = r#"
+{"height": -1} => height: expected 1 to 4096, got -1
+{"height": 16.0} => height: expected 1 to 4096, got 16.0
+{"height": "x"} => height: expected 1 to 4096, got x
+{"width": 4097} => width: expected 1 to 4096, got 4097
+{"moves": null} => moves: expected 1 to 4096, got null
+{"seed": -1} => seed: expected 0 to 18446744073709551615, got -1
+{"worlds": 4294967296} => worlds: expected 1 to 1024, got 4294967296
+{"reveal_model": 1} => reveal_model: expected true or false, got 1
+{"model": 3} => model: expected text, got 3
+{"coverage": "some"} => coverage: expected path, full or client, got some
+{"start": "north"} => start: expected corner, centre, random or ROW,COL, got north
+{"wrolds": 2} => wrolds: expected the name of a setting (burn_in, coverage
+{"task": "small", "robots": 1} => robots: expected to be left out, as the task decides it, got 1
+{"states": "jacksboro", "height": 1} => height: expected to be left out, as the states file
+{"task": ""} => task : expected a name or a file, got ""
+"#;
+
     #[test]
     fn what_is_wrong_is_named() {
-        for (given, words) in [
-            (json!({"height": -1}), "height: expected 1 to 4096, got -1"),
-            (
-                json!({"height": 16.0}),
-                "height: expected 1 to 4096, got 16.0",
-            ),
-            (json!({"height": "x"}), "height: expected 1 to 4096, got x"),
-            (
-                json!({"width": 4097}),
-                "width: expected 1 to 4096, got 4097",
-            ),
-            (
-                json!({"moves": null}),
-                "moves: expected 1 to 4096, got null",
-            ),
-            (
-                json!({"seed": -1}),
-                "seed: expected 0 to 18446744073709551615, got -1",
-            ),
-            (
-                json!({"worlds": 1u64 << 32}),
-                "worlds: expected 1 to 1024, got 4294967296",
-            ),
-            (
-                json!({"reveal_model": 1}),
-                "reveal_model: expected true or false, got 1",
-            ),
-            (json!({"model": 3}), "model: expected text, got 3"),
-            (
-                json!({"coverage": "some"}),
-                "coverage: expected path, full or client, got some",
-            ),
-            (
-                json!({"start": "north"}),
-                "start: expected corner, centre, random or ROW,COL, got north",
-            ),
-            (
-                json!({"wrolds": 2}),
-                "wrolds: expected the name of a setting (burn_in, coverage",
-            ),
-            (
-                json!({"task": "small", "robots": 1}),
-                "robots: expected to be left out, as the task decides it, got 1",
-            ),
-            (
-                json!({"states": "jacksboro", "height": 1}),
-                "height: expected to be left out, as the states file",
-            ),
-            (
-                json!({"task": ""}),
-                "task : expected a name or a file, got \"\"",
-            ),
-        ] {
-            let error = with(given).expect_err(words);
-            assert!(error.contains(words), "{error}");
+        for line in WRONG.trim().lines() {
+            let (given, words) = line.split_once(" => ").expect(line);
+            let error = with(serde_json::from_str(given).expect(line)).expect_err(line);
+            assert!(error.contains(words), "{line}: {error}");
         }
     }
 }

@@ -92,30 +92,17 @@ mod tests {
 
     #[test]
     fn results_that_stand_for_no_outcome_are_refused() {
-        let robot = RobotResult {
-            coverage: 2,
-            start_col: 4,
-            ..RobotResult::default()
-        };
+        let (mut robot, mut world) = (RobotResult::default(), WorldResult::default());
+        (robot.coverage, robot.start_col) = (2, 4);
         let outcome = robot_outcome(&robot).expect("full coverage");
         assert_eq!(robot_result(&outcome), robot);
-        let robot = RobotResult {
-            coverage: 3,
-            ..robot
-        };
+        robot.coverage = 3;
         let error = robot_outcome(&robot).expect_err("no coverage").to_string();
         assert_eq!(error, "coverage: expected 0, 1 or 2, got 3");
-        let world = WorldResult {
-            truncated: 1,
-            seed: 7,
-            ..WorldResult::default()
-        };
+        (world.truncated, world.seed) = (1, 7);
         let outcome = world_outcome(&world).expect("an end");
         assert_eq!(world_result(&outcome), world);
-        let world = WorldResult {
-            terminated: 2,
-            ..world
-        };
+        world.terminated = 2;
         let error = world_outcome(&world).expect_err("no flag").to_string();
         assert_eq!(error, "ends: expected 0 or 1, got 2");
     }

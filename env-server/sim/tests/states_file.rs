@@ -34,12 +34,20 @@ const WRONG_HEADERS: &str = "
 (2, 3, 4) => (2, 3, 4, 1) => expected three axes [K, H, W], got 4
 (2, 3, 4) => (24,) => expected three axes [K, H, W], got 1
 (2, 3, 4) => (0, 3, 4) => expected the array alone, got 24 bytes
+(2, 3, 4) => (1, 4, 6) => expected at least 2 recorded steps, got 1
 (2, 3, 4) => (2, 3, 5) => cut short: expected 6 bytes more
 2, 3 => 999999, 999999999 => cut short: expected
 2, 3 => 99999999999, 99999999999 => expected a NumPy array:
 'shape' => 'form' => expected a NumPy array:
 False => [[[[[[[[ => expected a NumPy array:
 ";
+
+/// Rows of a table.
+macro_rules! rows {
+    ($($bytes:expr => $words:expr;)*) => {
+        [$(($bytes, $words)),*]
+    };
+}
 
 fn sequence(first: usize, dim: (usize, usize, usize)) -> Array3<u8> {
     let mut states = (first..).map(|n| (n % 3) as u8);
@@ -104,224 +112,87 @@ fn archives_stored_or_deflated_are_read_in_the_order_of_names() {
         let file = read("lab.npz", &npz(&members, method)).expect("valid");
         assert_eq!(file.sequences.arrays, sequences);
         assert_eq!((file.shape.height(), file.shape.width()), (3, 4));
-        assert_eq!(
-            (&*file.description.step, file.model.n_states()),
-            ("10 min", 3)
-        );
+        assert_eq!(&*file.description.step, "10 min");
         checksums.push(file.sequences.checksum());
     }
-    let [_, second, third] = members.map(|(_, bytes)| bytes);
-    let others = read("lab.npz", &stored(&[("a.npy", second), ("b.npy", third)]));
-    checksums.push(others.expect("valid").sequences.checksum());
+    let other = read("lab.npz", &stored(&members[1..])).expect("valid");
     assert_eq!(checksums[0], checksums[1]);
-    assert_ne!(checksums[0], checksums[2]);
+    assert_ne!(checksums[0], other.sequences.checksum());
 }
 
 #[test]
-fn an_array_is_a_sequence_in_either_order_of_memory() {
-    let rows = sequence(0, (4, 3, 5));
-    let file = read("lab.npy", &npy(&rows)).expect("valid");
-    assert_eq!(file.sequences.arrays, std::slice::from_ref(&rows));
-    let mut columns = Array3::zeros(ndarray::ShapeBuilder::f(rows.dim()));
-    columns.assign(&rows);
-    let bytes = npy(&columns);
-    assert!(
-        bytes.windows(4).any(|word| word == b"True"),
-        "Fortran order"
-    );
-    let file = read("lab.npy", &bytes).expect("valid");
-    assert_eq!(file.sequences.arrays, [rows]);
-    assert!(file.sequences.arrays[0].is_standard_layout());
-}
-
-#[test]
-fn a_folder_is_read_in_the_order_of_its_files() {
+fn arrays_of_either_order_are_read_in_the_order_of_their_files() {
+    let sequences = [0, 1, 2].map(|n| sequence(n, (3, 4, 5)));
+    let [first, second, third] = &sequences;
+    let mut columns = Array3::zeros(ndarray::ShapeBuilder::f(second.dim()));
+    columns.assign(second);
+    let columns = npy(&columns);
+    assert!(columns.windows(4).any(|word| word == b"True"), "Fortran");
     let folder = TempDir::new().expect("a folder");
-    let [first, second, third] = [0, 1, 2].map(|n| sequence(n, (3, 2, 2)));
-    let place = |name: &str| folder.path().join(name);
-    write(place("2.npy"), npy(&second)).expect("write");
-    write(place("10.npz"), stored(&[("x.npy", npy(&first))])).expect("write");
-    write(place("3.npz"), stored(&[("x.npy", npy(&third))])).expect("write");
-    write(place("README.md"), "not read").expect("write");
-    write(place("states.toml"), DESCRIPTION).expect("write");
+    for (name, bytes) in [
+        ("2.npy", columns),
+        ("10.npz", stored(&[("x.npy", npy(first))])),
+        ("3.npy", npy(third)),
+        ("README.md", b"not read".to_vec()),
+        ("states.toml", DESCRIPTION.into()),
+    ] {
+        write(folder.path().join(name), bytes).expect("write");
+    }
     let file = StatesFile::read(folder.path()).expect("valid");
-    assert_eq!(file.sequences.arrays, [first, second, third]);
+    assert_eq!(file.sequences.arrays, sequences);
+    assert!(file.sequences.arrays[1].is_standard_layout());
 }
 
 #[test]
-fn broken_files_are_refused_each_by_its_problem() {
-    let whole = npy(&sequence(0, (2, 3, 4)));
-    let check = |name: &str, bytes: &[u8], words: &str| {
-        let error = read(name, bytes).expect_err(words);
+fn broken_arrays_are_refused_each_by_its_problem() {
+    let check = |bytes: &[u8], words: &str| {
+        let error = read("lab.npy", bytes).expect_err(words);
+        let expected = format!("array \"lab\": {words}");
         assert!(error.starts_with("states file /"), "{error}");
-        assert!(error.contains(words), "{error:?} does not say {words:?}");
-    };
-    let array = |bytes: &[u8], words: &str| {
-        check("lab.npy", bytes, &format!("array \"lab\": {words}"));
+        assert!(error.contains(&expected), "{error:?}: {expected:?}");
         let archive = stored(&[("one.npy", bytes.to_vec())]);
-        check("lab.npz", &archive, &format!("array \"one\": {words}"));
+        let error = read("lab.npz", &archive).expect_err(words);
+        let expected = format!("array \"one\": {words}");
+        assert!(error.contains(&expected), "{error:?}: {expected:?}");
     };
-    let header = |from: &str, to: &str| npy_with(&HEADER.replace(from, to));
-    let right = read("lab.npy", &npy_with(HEADER));
-    assert!(right.is_ok(), "but for what is replaced");
+    // The header is checked before the values are read.
+    let breaks_off = |header: &str, n_values: u64| {
+        let bytes = npy_with(header);
+        let start = &bytes[..10 + header.len()];
+        let n_bytes = start.len() as u64 + n_values;
+        let added = Sequences::new(3).add_array("one", n_bytes, start.chain(Broken));
+        added.expect_err("the values break off")
+    };
+    let header = |from: &str, to: &str| HEADER.replace(from, to);
+    assert!(read("lab.npy", &npy_with(HEADER)).is_ok());
+    let largest = header("(2, 3, 4)", "(64, 4096, 4096)");
+    assert_eq!(breaks_off(&largest, 1 << 30), "array \"one\": broken");
     for line in WRONG_HEADERS.trim_start().lines() {
         let mut parts = line.split(" => ");
         let [from, to, words] = [(); 3].map(|()| parts.next().expect(line));
-        array(&header(from, to), words);
+        check(&npy_with(&header(from, to)), words);
+        let error = breaks_off(&header(from, to), 24);
+        assert!(error.contains(words), "{error:?}: {words:?}");
     }
-    let short = "expected at least 2 recorded steps, got 1";
-    array(&npy(&sequence(0, (1, 3, 4))), short);
-    for (height, width) in [(0, 4), (1, 4097)] {
-        let got = format!("expected height and width in 1..=4096, got {height} x {width}");
-        let empty = npy(&sequence(0, (2, height, width)));
-        array(&empty, &format!("grid shape: {got}"));
+    for (dim, n_cells) in [
+        ("(1, 32768, 32768)", 1 << 30),
+        ("(1, 1, 1073741824)", 1 << 30),
+        ("(2, 0, 4)", 0),
+    ] {
+        let error = breaks_off(&header("(2, 3, 4)", dim), n_cells);
+        let words = "grid shape: expected height and width in 1..=4096, got";
+        assert!(error.contains(words), "{error}");
     }
-    let long = "expected a NumPy array with a header of at most 512 bytes, got 60058";
-    array(&header("False", &"[".repeat(60_000)), long);
-    let cut = &whole[..whole.len() - 1];
-    array(cut, "cut short: expected 1 bytes more");
-    array(b"", "expected a NumPy array: ");
-    array(b"PNG and so on", "expected a NumPy array: ");
     let mut fourth = sequence(0, (2, 3, 4));
     fourth[[1, 2, 3]] = 3;
-    let words =
-        "expected states below 3, as the description has, got 3 in cell (2, 3) of recorded step 1";
-    array(&npy(&fourth), words);
-    check("lab.npz", &whole, "expected a .npz archive: ");
-    check("lab.npz", b"", "expected a .npz archive: ");
-    let none = "expected at least one array, got none";
-    check("lab.npz", &stored(&[]), none);
-    let text = "expected arrays alone, got the member \"a.txt\"";
-    check("lab.npz", &stored(&[("a.txt", whole.clone())]), text);
-    let turned = npy(&sequence(0, (2, 4, 3)));
-    let two = stored(&[("a.npy", whole.clone()), ("b.npy", turned)]);
-    let words = "array \"b\": expected 3 x 4 cells as the first array has, got 4 x 3";
-    check("lab.npz", &two, words);
-    let deflated = npz(&[("a.npy", whole.clone())], CompressionMethod::Deflated);
-    let half = &deflated[..deflated.len() / 2];
-    check("lab.npz", half, "expected a .npz archive: ");
-    let place = deflated.len() / 4;
-    let mut damaged = deflated;
-    damaged[place] ^= 0xff;
-    check("lab.npz", &damaged, "array \"a\": ");
-    let mut twice = stored(&[("one.npy", whole.clone()), ("two.npy", whole.clone())]);
-    while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
-        twice[at..at + 7].copy_from_slice(b"one.npy");
+    for (bytes, words) in rows! {
+        npy(&fourth) => "expected states below 3, as the description has, got 3 in cell (2, 3) of recorded step 1";
+        npy_with(&header("False", &"[".repeat(60_000))) => "expected a NumPy array with a header of at most 512 bytes, got 60058";
+        b"".to_vec() => "expected a NumPy array: ";
+        b"PNG and so on".to_vec() => "expected a NumPy array: ";
+    } {
+        check(&bytes, words);
     }
-    let words = "expected 1 arrays, one of each name, got 2";
-    check("lab.npz", &twice, words);
-    let words = "expected a .npz or .npy file, or a folder of these, got \"lab.tif\"";
-    check("lab.tif", &whole, words);
-}
-
-/// What replaces a part of the description, and the problem then.
-const WRONG_DESCRIPTIONS: &str = r#"
-step = => pace = => unknown field `pace`
-step = "10 min" =>  => missing field `step`
-step = => kernel_size = => unknown field `kernel_size`
-reward = 1.0 => initial = 1.0 => unknown field `initial`
-[0.2, 0.8] => [0.2, 0.7] => state "burning": observed_as: expected a sum of 1
-[0.2, 0.8] => [1.0] => expected 2 probabilities, one per observation, got 1
-"burnt" => "burning" => state name "burning" stands twice
-#777777 => grey => expected #rrggbb, got grey
-step = => step => expected
-"#;
-
-#[test]
-fn descriptions_are_checked_as_model_files_are() {
-    let folder = TempDir::new().expect("a folder");
-    let path = file_in(&folder, "lab.npy", &npy(&sequence(0, (2, 3, 4))));
-    let place = path.with_extension("toml");
-    let check = |words: &str| {
-        let error = StatesFile::read(&path).expect_err(words).to_string();
-        let about = format!("description {}: ", place.display());
-        let is_named = error.contains(&about) && error.contains(words);
-        assert!(is_named, "{error:?}: {words:?}");
-    };
-    for line in WRONG_DESCRIPTIONS.trim().lines() {
-        let mut parts = line.split(" => ");
-        let [from, to, words] = [(); 3].map(|()| parts.next().expect(line));
-        assert!(DESCRIPTION.contains(from));
-        write(&place, DESCRIPTION.replace(from, to)).expect("write");
-        check(words);
-    }
-    std::fs::remove_file(&place).expect("remove");
-    check("No such file");
-}
-
-#[test]
-fn what_is_no_file_is_refused() {
-    let folder = TempDir::new().expect("a folder");
-    let check = |path: &Path, words: &str| {
-        let error = StatesFile::read(path).expect_err(words).to_string();
-        assert!(error.contains(words), "{error:?} does not say {words:?}");
-    };
-    let gone = folder.path().join("gone.npz");
-    check(&gone, "gone.npz: No such file");
-    write(gone.with_extension("toml"), DESCRIPTION).expect("write");
-    check(&gone, "gone.npz: No such file");
-    let empty = folder.path().join("empty");
-    create_dir(&empty).expect("make");
-    let words = "expected .npz or .npy files in the folder, got none";
-    check(&empty, words);
-    write(empty.join("a.npy"), npy(&sequence(0, (2, 3, 4)))).expect("write");
-    check(&empty, "empty/states.toml: No such file");
-    write(empty.join("states.toml"), DESCRIPTION).expect("write");
-    assert!(StatesFile::read(&empty).is_ok());
-    create_dir(empty.join("b.npy")).expect("make");
-    let other = "expected a regular file, got something else";
-    check(&empty, &format!("b.npy: {other}"));
-    std::fs::remove_file(empty.join("states.toml")).expect("remove");
-    create_dir(empty.join("states.toml")).expect("make");
-    check(&empty, &format!("states.toml: {other}"));
-}
-
-#[test]
-fn what_is_claimed_takes_no_memory_before_it_is_checked() {
-    // A member that says that it has 3 GiB, twice: neither is there.
-    let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
-    let bytes = npy_with(&header);
-    let claimed = (3_u32 << 30) + 10 + header.len() as u32;
-    let mut archive = stored(&[("a.npy", bytes.clone()), ("b.npy", bytes)]);
-    let central = archive.windows(4).position(|word| word == b"PK\x01\x02");
-    let mut at = central.expect("a directory");
-    for _ in 0..2 {
-        archive[at + 24..at + 28].copy_from_slice(&claimed.to_le_bytes());
-        at += 46 + "a.npy".len();
-    }
-    let error = read("lab.npz", &archive).expect_err("neither is there");
-    assert!(
-        error.contains(&format!("array \"a\": expected {claimed} bytes, got ")),
-        "{error}"
-    );
-}
-
-#[test]
-fn a_header_is_checked_before_the_values_are_read() {
-    let with = |bytes: &[u8]| {
-        let values = bytes.len() as u64 + (1 << 30);
-        let cut = bytes.chain(Broken);
-        let added = Sequences::new(3).add_array("one", values, cut);
-        added.expect_err("the values break off")
-    };
-    let zeros = |header: &str| npy_with(header)[..10 + header.len()].to_vec();
-    for (from, to, words) in [
-        ("|u1", "<f4", "expected dtype '|u1' (uint8), got '<f4'"),
-        (
-            "(2, 3, 4)",
-            "(2, 3)",
-            "expected three axes [K, H, W], got 2",
-        ),
-        ("(2, 3, 4)", "(2, 3, 4)", "expected the array alone, got "),
-        ("(2, 3, 4)", "(9, 32768, 32768)", "cut short: expected "),
-        ("(2, 3, 4)", "(1, 32768, 32768)", "grid shape: expected "),
-        ("(2, 3, 4)", "(1, 1, 1073741824)", "grid shape: expected "),
-    ] {
-        let error = with(&zeros(&HEADER.replace(from, to)));
-        assert!(error.contains(words), "{error:?} does not say {words:?}");
-    }
-    let right = with(&zeros(&HEADER.replace("(2, 3, 4)", "(64, 4096, 4096)")));
-    assert_eq!(right, "array \"one\": broken");
 }
 
 /// A reader that ends in an error.
@@ -331,6 +202,79 @@ impl Read for Broken {
     fn read(&mut self, _: &mut [u8]) -> std::io::Result<usize> {
         Err(std::io::Error::other("broken"))
     }
+}
+
+#[test]
+fn broken_archives_are_refused_each_by_its_problem() {
+    let whole = npy(&sequence(0, (2, 3, 4)));
+    let two = |name: &'static str, second: &[u8]| {
+        stored(&[("one.npy", whole.clone()), (name, second.to_vec())])
+    };
+    let deflated = npz(&[("a.npy", whole.clone())], CompressionMethod::Deflated);
+    let mut damaged = deflated.clone();
+    damaged[deflated.len() / 4] ^= 0xff;
+    let mut twice = two("two.npy", &whole);
+    while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
+        twice[at..at + 7].copy_from_slice(b"one.npy");
+    }
+    // A member that says that it has 3 GiB, twice: neither is there, and takes no memory.
+    let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
+    let bytes = npy_with(&header);
+    let claimed = (3_u32 << 30) + 10 + header.len() as u32;
+    let mut large = stored(&[("a.npy", bytes.clone()), ("b.npy", bytes)]);
+    let central = large.windows(4).position(|word| word == b"PK\x01\x02");
+    let first = central.expect("a directory") + 24;
+    for at in [first, first + 46 + "a.npy".len()] {
+        large[at..at + 4].copy_from_slice(&claimed.to_le_bytes());
+    }
+    let turned = npy(&sequence(0, (2, 4, 3)));
+    for (bytes, words) in rows! {
+        whole.clone() => "expected a .npz archive: ";
+        Vec::new() => "expected a .npz archive: ";
+        deflated[..deflated.len() / 2].to_vec() => "expected a .npz archive: ";
+        stored(&[]) => "expected at least one array, got none";
+        two("a.txt", &whole) => "expected arrays alone, got the member \"a.txt\"";
+        two("two.npy", &turned) => "array \"two\": expected 3 x 4 cells as the first array has, got 4 x 3";
+        damaged => "array \"a\": ";
+        twice => "expected 1 arrays, one of each name, got 2";
+        large => &*format!("array \"a\": expected {claimed} bytes, got ");
+    } {
+        let error = read("lab.npz", &bytes).expect_err(words);
+        assert!(error.contains(words), "{error:?} does not say {words:?}");
+    }
+    let error = read("lab.tif", &whole).expect_err("another ending");
+    let words = "expected a .npz or .npy file, or a folder of these, got \"lab.tif\"";
+    assert!(error.contains(words), "{error}");
+}
+
+#[test]
+fn what_is_no_file_or_has_no_description_is_refused() {
+    let folder = TempDir::new().expect("a folder");
+    let check = |path: &Path, words: &str| {
+        let error = StatesFile::read(path).expect_err(words).to_string();
+        assert!(error.contains(words), "{error:?} does not say {words:?}");
+    };
+    let other = "expected a regular file, got something else";
+    check(&folder.path().join("gone.npz"), "gone.npz: No such file");
+    let words = "expected .npz or .npy files in the folder, got none";
+    check(folder.path(), words);
+    write(folder.path().join("a.npy"), npy(&sequence(0, (2, 3, 4)))).expect("write");
+    let place = folder.path().join("states.toml");
+    let about = format!("description {}: ", place.display());
+    check(folder.path(), &format!("{about}No such file"));
+    write(&place, DESCRIPTION.replace("[0.2, 0.8]", "[0.2, 0.7]")).expect("write");
+    check(
+        folder.path(),
+        &format!("{about}model \"lab\": state \"burning\": observed_as: expected a sum of 1"),
+    );
+    write(&place, DESCRIPTION.replace("step", "pace")).expect("write");
+    check(folder.path(), &format!("{about}TOML parse error"));
+    write(&place, DESCRIPTION).expect("write");
+    create_dir(folder.path().join("b.npy")).expect("make");
+    check(folder.path(), &format!("b.npy: {other}"));
+    std::fs::remove_file(&place).expect("remove");
+    create_dir(&place).expect("make");
+    check(folder.path(), &format!("{about}{other}"));
 }
 
 #[test]
@@ -348,27 +292,22 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
     };
     let checked = config(3).check().expect("valid");
     let settings = &checked.config;
-    assert_eq!(
-        (settings.height, settings.width, settings.burn_in),
-        (3, 4, 0)
-    );
-    assert_eq!(settings.model, "");
+    let decided = (settings.height, settings.width, settings.burn_in);
+    assert_eq!((decided, &*settings.model), ((3, 4, 0), ""));
     let recorded = checked.recorded.expect("it is").recorded;
     assert_eq!((recorded.n_sequences(), recorded.n_steps()), (2, 1));
-    let error = config(4).check().expect_err("no step is left").to_string();
-    assert_eq!(
-        error,
-        "states_offset: expected 0 to 3, as the shortest sequence allows, got 4"
-    );
     let without = ServerConfig {
         states_symmetries: true,
         ..ServerConfig::default()
     };
-    let error = without.check().expect_err("no file").to_string();
-    assert!(
-        error.contains("expected none without a states file"),
-        "{error}"
-    );
+    let words = "states_offset: expected 0 to 3, as the shortest sequence allows, got 4";
+    for (config, words) in [
+        (config(4), words),
+        (without, "expected none without a states file"),
+    ] {
+        let error = config.check().expect_err(words).to_string();
+        assert!(error.contains(words), "{error}");
+    }
 }
 
 #[test]

@@ -39,15 +39,17 @@ mod tests {
     }
 
     #[test]
-    fn a_reason_is_short_whatever_it_quotes() {
-        for word in ["x".repeat(MAX_CONTROL_BYTES - 9), "é".repeat(100_000)] {
-            let reason = parse::<Request>(format!(r#"{{"op":"{word}"}}"#).as_bytes());
-            let reason = reason.expect_err("no operation");
-            assert!(
-                reason.chars().count() < MAX_REASON + 50,
-                "{} bytes",
-                reason.len()
-            );
+    fn requests_too_long_or_deep_are_refused_in_short() {
+        let op = |word: &str| format!(r#"{{"op":"{word}"}}"#);
+        for text in [
+            op(&"x".repeat(MAX_CONTROL_BYTES - 9)),
+            op(&"é".repeat(100_000)),
+            " ".repeat(MAX_CONTROL_BYTES + 1),
+            "[".repeat(200_000) + &"]".repeat(200_000),
+            r#"{"a":"#.repeat(200_000) + &"}".repeat(200_000),
+        ] {
+            let reason = parse::<Request>(text.as_bytes()).expect_err("no operation");
+            assert!(reason.chars().count() < MAX_REASON + 50, "{reason}");
         }
     }
 }

@@ -77,13 +77,7 @@ impl Backend for Script {
 
 /// A lease on robot 1, whose world is at step 4, and what its backend answers.
 fn lease(says: &[Say]) -> (Lease, Script) {
-    let info: ServerInfo = serde_json::from_str(
-        r#"{"protocol": 2, "build": "", "pid": 1, "height": 1, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 2,
-        "n_observations": 3, "observations": [], "model": null, "burn_in": 0, "max_steps": 0, "max_clients": 16,
-        "coverage": "path", "publish_truth": false, "lease_millis": 1, "deadline_millis": 0, "recorded_world": null,
-        "task": null}"#,
-    )
-    .expect("what a server says of itself");
+    let info = crate::server(1, 3, 1, 1);
     let lease = Lease::new(&info, 7, &(1..2));
     lease.note(0, 4);
     let says = says.iter().copied().collect();
@@ -92,11 +86,8 @@ fn lease(says: &[Say]) -> (Lease, Script) {
 }
 
 fn call(lease: &Lease, operation: Operation) -> Call<'static> {
-    let moves: &[u8] = if operation == Operation::Step {
-        &[3]
-    } else {
-        &[]
-    };
+    let is_step = operation == Operation::Step;
+    let moves: &[u8] = if is_step { &[3] } else { &[] };
     let request = lease.request(operation, &(1..2), 0);
     Call::new(request, moves, Duration::ZERO)
 }
@@ -133,26 +124,15 @@ fn check(
 }
 
 #[test]
-fn an_answer_ends_it() {
-    let asked = check(&[Step(5)], false, Ok(Some((5, 0))));
-    assert_eq!(asked, [(Operation::Step, Some(4))]);
-}
-
-#[test]
-fn paths_are_sent_again_for_the_same_step() {
-    let asked = check(&[Nothing, Step(4), Step(5)], false, Ok(Some((5, 0))));
+fn paths_are_sent_until_the_world_has_moved() {
     let (sent, look) = ((Operation::Step, Some(4)), (Operation::Observe, None));
-    assert_eq!(asked, [sent, look, sent]);
-}
-
-#[test]
-fn moved_worlds_end_it_without_another_send() {
+    let asked = check(&[Step(5)], false, Ok(Some((5, 0))));
+    assert_eq!(asked, [sent]);
+    let asked = check(&[Nothing, Step(4), Step(5)], false, Ok(Some((5, 0))));
+    assert_eq!(asked, [sent, look, sent], "for the same step");
     check(&[Nothing, Step(5)], false, Ok(Some((5, 0))));
     check(&[Nothing, Stayed(5, 0b01, 0)], false, Ok(Some((5, 0))));
-}
-
-#[test]
-fn it_can_be_given_up() {
+    // It can be given up.
     check(&[Nothing, Step(4), Nothing, Step(4)], false, Ok(None));
 }
 
@@ -162,10 +142,7 @@ fn paths_that_did_not_move_the_world_are_late() {
         check(&[Nothing, seen], false, Err(Status::Late));
     }
     check(&[Late], false, Err(Status::Late));
-}
-
-#[test]
-fn who_accepts_that_sees_how_the_world_stands() {
+    // Who accepts that sees how the world stands.
     check(&[Late, Step(7)], true, Ok(Some((7, 2))));
     check(&[Nothing, Step(6)], true, Ok(Some((6, 1))));
     check(&[Nothing, Stayed(5, 0, 0b10)], true, Ok(Some((5, 0))));

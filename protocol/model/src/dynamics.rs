@@ -225,10 +225,7 @@ mod tests {
                 dynamics.step(3, n, &mut states);
                 assert_eq!(states, portable);
             }
-            assert!(
-                states.iter().any(|&state| state == 2),
-                "{name}: no such state"
-            );
+            assert!(states.iter().any(|&state| state == 2), "{name}");
         }
     }
 }

@@ -151,19 +151,14 @@ mod tests {
     #[test]
     fn a_frame_is_accepted_whole_or_rejected_whole() {
         let shape = Shape::new(2, 2).expect("test shape");
-        let frame = Frame::from_bytes(shape, 3, &[0, 255, 2, 255]).expect("valid");
-        assert_eq!(frame.observed().collect::<Vec<_>>(), [(0, 0), (2, 2)]);
-        assert_eq!(
-            Frame::from_bytes(shape, 3, &[0, 3, 2, 255]),
-            Err(FrameError::Value {
-                index: 1,
-                value: 3,
-                n_observations: 3
-            })
-        );
-        assert!(matches!(
-            Frame::from_bytes(shape, 3, &[0; 3]),
-            Err(FrameError::Length { .. })
-        ));
+        let frame = |bytes: &[u8]| Frame::from_bytes(shape, 3, bytes);
+        let good = frame(&[0, 255, 2, 255]).expect("valid");
+        assert_eq!(good.observed().collect::<Vec<_>>(), [(0, 0), (2, 2)]);
+        let wrong = frame(&[0, 3, 2, 255]).expect_err("no observation");
+        let words = "frame: cell 1: expected an observation below 3 or 255, got 3";
+        assert_eq!(wrong.to_string(), words);
+        let short = frame(&[0; 3]).expect_err("too short");
+        let words = "frame: expected 4 bytes for a 2 x 2 grid, got 3";
+        assert_eq!(short.to_string(), words);
     }
 }

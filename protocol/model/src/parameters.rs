@@ -334,6 +334,3 @@ impl Model {
         self.file.states.iter().position(|state| state.name == name)
     }
 }
-
-#[cfg(test)]
-mod tests;

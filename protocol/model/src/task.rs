@@ -265,7 +265,9 @@ mod tests {
     use std::collections::BTreeSet;
 
     #[test]
-    fn built_in_tasks_have_their_names_and_a_model_or_states() {
+    fn built_in_tasks_have_names_worlds_places_and_ids_of_their_own() {
+        assert_eq!(Task::built_in_names().next(), Some("wildfire"));
+        let (mut places, mut ids) = (Vec::new(), BTreeSet::new());
         for name in Task::built_in_names() {
             let task = Task::named(name).expect(name);
             assert_eq!((&*task.name, &*task.source), (name, name));
@@ -273,50 +275,41 @@ mod tests {
             assert_eq!(model.is_none(), task.is_recorded(), "{name}");
             let is_states = state_names().any(|states| states == task.states);
             assert_eq!(is_states, task.is_recorded(), "{name}");
+            let listing = task.listing.expect(name);
+            places.push(listing.place);
+            assert!(ids.insert(listing.ids), "{name}");
         }
+        assert!(places.is_sorted_by(|a, b| a < b), "{places:?}");
     }
 
-    #[test]
-    fn built_in_tasks_have_places_and_ids_of_their_own() {
-        let tasks = Task::built_in_names().map(|name| Task::named(name).expect(name));
-        let listings: Vec<Listing> = tasks.filter_map(|task| task.listing).collect();
-        assert_eq!(listings.len(), TASKS.len());
-        assert!(listings.is_sorted_by(|a, b| a.place < b.place));
-        let ids: BTreeSet<&str> = listings.iter().map(|listing| &*listing.ids).collect();
-        assert_eq!(ids.len(), TASKS.len());
-    }
-
-    #[test]
-    fn the_default_world_is_the_first_task() {
-        assert_eq!(Task::built_in_names().next(), Some("wildfire"));
-    }
+    /// A built-in task, what replaces a part of it, and what is said then.
+    const WRONG: &str = r#"
+small => height => heigth => unknown field `heigth`
+small => moves = 16 =>  => missing field `moves`
+small => model => states = "a.npz", model => model and states: expected one
+jacksboro => moves = 64 => moves = 64, height = 3 => height: expected none
+jacksboro => moves = 64 => moves = 64, burn_in = 3 => burn_in: expected none
+small => max_steps = 300 => max_steps = 0 => max_steps: expected at least 1, got 0
+small => name = "small" => name = "" => name: expected 1 to 64
+small => name = "small" => name = "../small" => name: expected 1 to 64
+small => name = "small" => name = "a b" => name: expected 1 to 64
+small => name = "small" => name = ".a" => name: expected 1 to 64
+small => name = "small" => name = "/a" => name: expected 1 to 64
+small => end = 32 => end = 0 => test_seeds: expected 1 to 100000, got 0
+"#;
 
     #[test]
     fn wrong_tasks_are_refused_by_their_setting() {
-        let task = |name| TASKS.iter().find(|(known, _)| *known == name);
-        let text = |name| task(name).map(|(_, text)| *text).expect(name);
-        let check = |name, from: &str, to: &str, words: &str| {
-            let (before, text) = (text(name), text(name).replacen(from, to, 1));
-            assert_ne!(before, text);
-            let error = Task::from_toml(&text).expect_err(to);
-            assert!(error.contains(words), "{error}");
-        };
-        check("small", "height", "heigth", "unknown field `heigth`");
-        check("small", "moves = 16", "", "missing field `moves`");
-        let both = "states = \"a.npz\"\nmodel";
-        check("small", "model", both, "model and states: expected one");
-        let height = "moves = 64\nheight = 3";
-        check("jacksboro", "moves = 64", height, "height: expected none");
-        check("small", "max_steps = 300", "max_steps = 0", "at least 1");
-        for name in ["", "../small", "a b", ".a", "/a"] {
-            let name = format!("name = {name:?}");
-            check("small", "name = \"small\"", &name, "name: expected 1 to 64");
+        for line in WRONG.trim().lines() {
+            let mut parts = line.split(" => ");
+            let [name, from, to, words] = [(); 4].map(|()| parts.next().expect(line));
+            let task = TASKS.iter().find(|(known, _)| *known == name);
+            let (_, text) = task.expect(line);
+            assert!(text.contains(from), "{line}");
+            let changed = text.replacen(from, &to.replace(", ", "\n"), 1);
+            let error = Task::from_toml(&changed).expect_err(line);
+            assert!(error.contains(words), "{line}: {error}");
         }
-        check("small", "end = 32", "end = 0", "test_seeds: expected 1 to");
-    }
-
-    #[test]
-    fn what_is_neither_a_name_nor_a_file_is_told_the_names() {
         let error = Task::named("no/such").expect_err("no task").to_string();
         assert!(error.contains("task no/such: No such file"), "{error}");
         assert!(

@@ -47,42 +47,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_is_utf_8_with_or_without_a_byte_order_mark() {
-        for bytes in [
-            &b"\xEF\xBB\xBFname = \"\xC3\xA9\""[..],
-            b"name = \"\xC3\xA9\"",
+    fn text_is_utf_8_and_other_encodings_are_named() {
+        let wide = |text: &str, bytes: fn(u16) -> [u8; 2]| -> Vec<u8> {
+            text.encode_utf16().flat_map(bytes).collect()
+        };
+        let expected = "expected text in UTF-8, got";
+        let is_wide = format!("{expected} UTF-16 or UTF-32: save the file as UTF-8");
+        let is_other = format!("{expected} other bytes in line 2: save the file as UTF-8");
+        for (bytes, decodes_to) in [
+            (b"".to_vec(), Ok("")),
+            (b"\xEF\xBB\xBF".to_vec(), Ok("")),
+            (b"a = \"\xC3\xA9\"".to_vec(), Ok("a = \"\u{e9}\"")),
+            (
+                b"\xEF\xBB\xBFa = \"\xC3\xA9\"".to_vec(),
+                Ok("a = \"\u{e9}\""),
+            ),
+            (wide("a = 1", u16::to_le_bytes), Err(&is_wide)),
+            (wide("a = 1", u16::to_be_bytes), Err(&is_wide)),
+            (wide("\u{feff}a = 1", u16::to_le_bytes), Err(&is_wide)),
+            (wide("\u{feff}a = 1", u16::to_be_bytes), Err(&is_wide)),
+            (b"# ash\nname = \"\xE9\"".to_vec(), Err(&is_other)),
         ] {
-            assert_eq!(decoded(bytes).as_deref(), Ok("name = \"\u{e9}\""));
+            let expected = decodes_to.map(str::to_owned).map_err(String::clone);
+            assert_eq!(decoded(&bytes), expected, "{bytes:?}");
         }
-        assert_eq!(decoded(b""), Ok(String::new()));
-        assert_eq!(decoded(b"\xEF\xBB\xBF"), Ok(String::new()));
-    }
-
-    #[test]
-    fn other_encodings_are_named() {
-        let wide = |text: &str| text.encode_utf16().collect::<Vec<u16>>();
-        let little = |text: &str| {
-            wide(text)
-                .iter()
-                .flat_map(|it| it.to_le_bytes())
-                .collect::<Vec<u8>>()
-        };
-        let big = |text: &str| {
-            wide(text)
-                .iter()
-                .flat_map(|it| it.to_be_bytes())
-                .collect::<Vec<u8>>()
-        };
-        for text in ["a = 1", "\u{feff}a = 1"] {
-            for bytes in [little(text), big(text)] {
-                let error = decoded(&bytes).expect_err("no UTF-8");
-                assert!(
-                    error.contains("expected text in UTF-8, got UTF-16"),
-                    "{error}"
-                );
-            }
-        }
-        let error = decoded(b"# ash\nname = \"\xE9\"").expect_err("Latin-1");
-        assert!(error.contains("got other bytes in line 2: save"), "{error}");
     }
 }

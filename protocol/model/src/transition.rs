@@ -11,8 +11,8 @@
 //!
 //! If the model has zones, each cell has the weights of its zone.
 //!
-//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs` compute these sums directly, and compare them for
-//! random models and grids.
+//! `tests/model/models.rs` computes these sums directly, and `transition.rs` there compares them for random models and
+//! grids.
 //!
 //! Two optimisations keep the results. The belief is copied into planes with a margin, so that all cells are computed
 //! alike and many at once. And the beliefs of taps with equal weights are added before they are multiplied

@@ -4,7 +4,6 @@
 mod airspace;
 mod dynamics;
 mod models;
-mod own_state;
+mod refusals;
 mod statistics;
 mod transition;
-mod zones;

@@ -257,20 +257,17 @@ mod tests {
         let (root, prefix) = (&files.root, &files.prefix);
         create_dir(root).expect("a new folder");
         let mut config = node_config().expect("the usual configuration");
-        let path = root.as_os_str().as_encoded_bytes();
-        config
-            .global
-            .set_root_path(&IpcPath::new(path).expect("a path"));
+        let path = IpcPath::new(root.as_os_str().as_encoded_bytes());
+        config.global.set_root_path(&path.expect("a path"));
         config.global.prefix = FileName::new(prefix.as_bytes()).expect("a name");
         let node = NodeBuilder::new().config(&config).create::<Ipc>();
         let node = node.expect("a node");
-        let builder = node.service_builder(&"a/frames".try_into().expect("a name"));
-        let service = builder.publish_subscribe::<[u8]>().open_or_create();
-        let service = service.expect("a service");
+        let named = |name: &str| node.service_builder(&name.try_into().expect("a name"));
+        let service = named("a/frames").publish_subscribe::<[u8]>();
+        let service = service.open_or_create().expect("a service");
         let publisher = service.publisher_builder().create().expect("a publisher");
         let subscriber = service.subscriber_builder().create().expect("a subscriber");
-        let builder = node.service_builder(&"a/wake".try_into().expect("a name"));
-        let wake = builder.event().open_or_create().expect("a service");
+        let wake = named("a/wake").event().open_or_create().expect("a service");
         let listener = wake.listener_builder().create().expect("a listener");
 
         let minute = Duration::from_secs(60);
@@ -288,10 +285,14 @@ mod tests {
         std::fs::write(segment(format!("{port}_{dead}.connection")), "finished").expect("a file");
         let used = all(&files);
 
-        make(segment("node.0_10_1.global_mgmt".into()), 0o200);
-        make(segment(format!("{dead}.dynamic")), 0o200);
-        make(segment(format!("{old}.dynamic")), 0o600);
-        make(segment(format!("{old}_{dead}.connection_2")), 0o200);
+        for (name, mode) in [
+            ("node.0_10_1.global_mgmt".into(), 0o200),
+            (format!("{dead}.dynamic"), 0o200),
+            (format!("{old}.dynamic"), 0o600),
+            (format!("{old}_{dead}.connection_2"), 0o200),
+        ] {
+            make(segment(name), mode);
+        }
         for name in [
             format!("{dead}.data"),
             format!("{old}__mgmt.data"),
@@ -300,22 +301,20 @@ mod tests {
         ] {
             std::fs::write(segment(name), "finished").expect("a file");
         }
-        make(root.join(format!("{prefix}{dead}.event")), 0o600);
-        make(root.join(format!("services/{prefix}{hash}.service")), 0o600);
+        for (name, mode) in [
+            (format!("{prefix}{dead}.event"), 0o600),
+            (format!("services/{prefix}{hash}.service"), 0o600),
+            (format!("nodes/{prefix}{dead}.node_monitor_context"), 0o200),
+            (format!("nodes/{prefix}{old}.node_monitor"), 0o200),
+        ] {
+            make(root.join(name), mode);
+        }
         for id in [dead, old] {
             let folder = root.join(format!("nodes/{id}"));
             create_dir(&folder).expect("a folder");
             make(folder.join(format!("{prefix}{hash}.service_tag")), 0o600);
             make(folder.join(format!("{prefix}node.details")), 0o600);
         }
-        make(
-            root.join(format!("nodes/{prefix}{dead}.node_monitor_context")),
-            0o200,
-        );
-        make(
-            root.join(format!("nodes/{prefix}{old}.node_monitor")),
-            0o200,
-        );
         assert_eq!(files.remove_leftovers(&config).expect("all is read"), 14);
         assert_eq!(all(&files), used);
 

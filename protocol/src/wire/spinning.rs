@@ -68,77 +68,53 @@ impl Spinning {
 mod tests {
     use super::*;
 
-    /// A wait whose looks come at these microseconds after its beginning, in vain: at which it blocked.
-    fn blocks_at(spinning: &mut Spinning, begin: Instant, looks: &[u64]) -> Option<u64> {
-        spinning.begin(begin);
-        let micros = |at: u64| begin + Duration::from_micros(at);
-        looks
-            .iter()
-            .copied()
-            .find(|&at| !spinning.goes_on(micros(at)))
-    }
+    /// Waits: when each begins in microseconds, when it looks in vain from then on, at which look it blocks, and whether
+    /// something arrives then.
+    type Waits<'a> = &'a [(u64, &'a [u64], Option<u64>, bool)];
 
-    #[test]
-    fn a_wait_spins_for_a_while_then_blocks() {
-        let mut spinning = Spinning::default();
-        let blocked = blocks_at(&mut spinning, Instant::now(), &[1, 50, 99, 100]);
-        assert_eq!(blocked, Some(100));
-        assert!(!spinning.goes_on(Instant::now()));
-    }
-
-    #[test]
-    fn after_three_vain_spins_waits_block_at_once() {
-        let (mut spinning, begin) = (Spinning::default(), Instant::now());
-        for _ in 0..VAIN_SPINS {
-            assert_eq!(blocks_at(&mut spinning, begin, &[0, 100]), Some(100));
-        }
-        let paused = begin + Duration::from_micros(100);
-        assert_eq!(blocks_at(&mut spinning, paused, &[0]), Some(0));
-        let late = paused + PAUSE - Duration::from_micros(1);
-        assert_eq!(blocks_at(&mut spinning, late, &[0]), Some(0));
-        let again = paused + PAUSE;
-        assert_eq!(blocks_at(&mut spinning, again, &[0, 100]), Some(100));
-        let paused = again + Duration::from_micros(100);
-        assert_eq!(blocks_at(&mut spinning, paused, &[0]), Some(0));
-    }
-
-    #[test]
-    fn what_arrives_while_spinning_makes_up_for_spins_in_vain() {
-        let (mut spinning, begin) = (Spinning::default(), Instant::now());
-        for _ in 0..10 {
-            for _ in 1..VAIN_SPINS {
-                assert_eq!(blocks_at(&mut spinning, begin, &[0, 100]), Some(100));
+    fn check(waits: Waits<'_>) {
+        let (mut spinning, origin) = (Spinning::default(), Instant::now());
+        let micros = |at: u64| origin + Duration::from_micros(at);
+        for &(start, looks, blocked, arrives) in waits {
+            spinning.begin(micros(start));
+            let mut looks = looks.iter().copied();
+            let found = looks.find(|at| !spinning.goes_on(micros(start + at)));
+            assert_eq!(found, blocked, "from {start} on");
+            let after = looks.find(|at| spinning.goes_on(micros(start + at)));
+            assert_eq!(after, None, "it has blocked");
+            if arrives {
+                spinning.arrived();
             }
-            assert_eq!(blocks_at(&mut spinning, begin, &[0, 99]), None);
-            spinning.arrived();
         }
     }
 
     #[test]
-    fn what_arrives_after_blocking_does_not() {
-        let (mut spinning, begin) = (Spinning::default(), Instant::now());
-        for _ in 0..VAIN_SPINS {
-            assert_eq!(blocks_at(&mut spinning, begin, &[0, 100]), Some(100));
-            spinning.arrived();
-        }
-        let paused = begin + Duration::from_micros(100);
-        assert_eq!(blocks_at(&mut spinning, paused, &[0]), Some(0));
+    fn a_wait_spins_for_a_while_and_waits_block_at_once_after_three_in_vain() {
+        let in_vain = (0, &[1, 50, 99, 100, 101][..], Some(100), false);
+        check(&[
+            in_vain,
+            in_vain,
+            in_vain,
+            (100, &[0], Some(0), false),
+            (100_099, &[0], Some(0), false),
+            (100_100, &[0, 100], Some(100), false),
+            (100_200, &[0], Some(0), false),
+        ]);
+        // One lost core is enough.
+        let at_once = (4_001, &[0][..], Some(0), false);
+        check(&[(0, &[0, 5, 4_000], Some(4_000), false), at_once]);
+        // A look soon after a long block tells nothing.
+        let next = (9_000, &[0, 99][..], None, false);
+        check(&[(0, &[0, 100, 9_000], Some(100), false), next]);
     }
 
     #[test]
-    fn one_lost_core_is_enough() {
-        let (mut spinning, begin) = (Spinning::default(), Instant::now());
-        assert_eq!(blocks_at(&mut spinning, begin, &[0, 5, 4_000]), Some(4_000));
-        let paused = begin + Duration::from_micros(4_001);
-        assert_eq!(blocks_at(&mut spinning, paused, &[0]), Some(0));
-    }
-
-    #[test]
-    fn a_look_soon_after_a_long_block_tells_nothing() {
-        let (mut spinning, begin) = (Spinning::default(), Instant::now());
-        assert_eq!(blocks_at(&mut spinning, begin, &[0, 100]), Some(100));
-        assert!(!spinning.goes_on(begin + Duration::from_millis(9)));
-        let next = begin + Duration::from_millis(9);
-        assert_eq!(blocks_at(&mut spinning, next, &[0, 99]), None);
+    fn what_arrives_while_spinning_alone_makes_up_for_spins_in_vain() {
+        let in_vain = (0, &[0, 100][..], Some(100), false);
+        let arrives = (0, &[0, 99][..], None, true);
+        check(&[in_vain, in_vain, arrives].repeat(10));
+        let arrives_late = (0, &[0, 100][..], Some(100), true);
+        let at_once = (100, &[0][..], Some(0), false);
+        check(&[arrives_late, arrives_late, arrives_late, at_once]);
     }
 }

@@ -3,11 +3,12 @@ use crate::config::ServerConfig;
 use emberwatch_messages::client::{Claim, Client, Observation};
 use emberwatch_messages::control::{Request, WorldSeed};
 use emberwatch_model::path::Move;
+use serde_json::{Value, json};
 use std::fmt::Debug;
 
 const LONG: Duration = Duration::from_secs(60);
 
-fn embedded(n_worlds: u32, burn_in: u64) -> Embedded {
+fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
     let config = ServerConfig {
         worlds: n_worlds,
         height: 7,
@@ -17,11 +18,8 @@ fn embedded(n_worlds: u32, burn_in: u64) -> Embedded {
         model: "wildfire-small".into(),
         ..ServerConfig::default()
     };
-    Embedded::new(config.check().expect("settings")).expect("worlds")
-}
-
-fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
-    Client::acquire(embedded(n_worlds, burn_in), &Claim::new(0..n_worlds)).expect("a lease")
+    let worlds = Embedded::new(config.check().expect("settings")).expect("worlds");
+    Client::acquire(worlds, &Claim::new(0..n_worlds)).expect("a lease")
 }
 
 /// Flies one path with each robot.
@@ -68,21 +66,18 @@ fn a_snapshot_has_the_same_future() {
     step(&mut client).expect("a step");
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("worlds").display().to_string();
-    let (lease, first_world, n_worlds, from) = (client.lease(), 0, 2, 0);
-    let save = Request::Snapshot {
-        first_world,
-        n_worlds,
-        path: path.clone(),
-    };
-    client.backend().control(&save, LONG).expect("a file");
+    let request = |text: Value| serde_json::from_value::<Request>(text).expect("a request");
+    let save = json!({"op": "snapshot", "first_world": 0, "n_worlds": 2, "path": path});
+    client
+        .backend()
+        .control(&request(save), LONG)
+        .expect("a file");
     let future = step(&mut client).expect("a step");
-    let load = Request::Restore {
-        lease,
-        first_world,
-        n_worlds,
-        from,
-        path,
-    };
+    let lease = client.lease();
+    let load = request(
+        json!({"op": "restore", "lease": lease, "first_world": 0, "n_worlds": 2,
+        "from": 0, "path": path}),
+    );
     client.backend().control(&load, LONG).expect("worlds");
     client.observe(0..2).expect("worlds");
     assert_eq!(step(&mut client).expect("a step"), future);
@@ -92,18 +87,9 @@ fn a_snapshot_has_the_same_future() {
 fn refusals_are_those_of_a_server() {
     let mut client = client(1, 20);
     let lease = client.lease();
-    let fork = Request::Fork {
-        lease,
-        from: 0,
-        to: 3,
-    };
-    let forked = client.backend().control(&fork, LONG);
-    assert_eq!(status(forked), Status::NoSuchWorld);
     assert_eq!(status(client.reset(&reset(3, 1))), Status::NoSuchWorld);
-    assert_eq!(
-        status(client.step(0..1, &[vec![Move::Up; 3]])),
-        Status::WrongPathLength
-    );
+    let short = client.step(0..1, &[vec![Move::Up; 3]]);
+    assert_eq!(status(short), Status::WrongPathLength);
     let release = Request::Release { lease };
     client.backend().control(&release, LONG).expect("a lease");
     assert_eq!(status(step(&mut client)), Status::LeaseLost);

@@ -274,17 +274,16 @@ mod tests {
             step(&mut episode, &rules, &there_and_back, 0);
             let states = episode.states().as_slice().expect("row-major");
             let is_fire = |cell: &&usize| states[**cell] == 2;
-            let fires = flight.visited.iter().filter(is_fire).count();
+            let n_hits = flight.visited.iter().filter(is_fire).count();
             let (world, robot) = (episode.outcome(), episode.robots()[0].outcome());
-            for reward in [world.reward, robot.reward, robot.marginal] {
-                assert_eq!(reward, fires as f64);
-            }
-            assert_eq!((world.n_hits, robot.n_hits), (fires as u32, fires as u32));
-            let n_visited = flight.visited.len() as u32;
-            assert_eq!((world.n_visited, robot.n_visited), (n_visited, n_visited));
+            let rewards = [world.reward, robot.reward, robot.marginal];
+            assert_eq!(rewards, [n_hits as f64; 3]);
+            let counts = [world.n_hits, robot.n_hits, world.n_visited, robot.n_visited];
+            let [n_hits, n_visited] = [n_hits, flight.visited.len()].map(|it| it as u32);
+            assert_eq!(counts, [n_hits, n_hits, n_visited, n_visited]);
             let n_fires = states.iter().filter(|state| **state == 2).count();
             assert_eq!(world.n_target_cells as usize, n_fires);
-            total += fires;
+            total += n_hits;
         }
         assert!(total > 0, "the test saw no fire");
     }
@@ -292,27 +291,18 @@ mod tests {
     #[test]
     fn a_frame_shows_the_visited_cells_and_no_others() {
         let rules = rules(0, Start::Corner);
-        let mut episode = Episode::new(&rules, 1);
-        step(&mut episode, &rules, &[1, 3, 3], 0);
-        let seen = |episode: &Episode| episode.robots()[0].frame().clone();
-        let masked = seen(&episode);
+        let mut episodes = [Episode::new(&rules, 1), Episode::new(&rules, 1)];
+        step(&mut episodes[0], &rules, &[1, 3, 3], 0);
+        step(&mut episodes[1], &rules, &[0, 0, 0], 1);
+        let [masked, full] = episodes.each_ref().map(|it| it.robots()[0].frame());
         let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
         assert_eq!(cells, [20, 21, 22]);
-        let mut other = Episode::new(&rules, 1);
-        step(&mut other, &rules, &[0, 0, 0], 1);
-        assert_eq!(seen(&other).observed().count(), 240);
+        assert_eq!(full.observed().count(), 240);
+        // Neither readings nor states depend on the path.
         for (cell, value) in masked.observed() {
-            assert_eq!(
-                seen(&other).as_bytes()[cell],
-                value,
-                "a reading depends on the path"
-            );
+            assert_eq!(full.as_bytes()[cell], value);
         }
-        assert_eq!(
-            other.states(),
-            episode.states(),
-            "the world depends on the path"
-        );
+        assert_eq!(episodes[0].states(), episodes[1].states());
     }
 
     #[test]
@@ -320,9 +310,11 @@ mod tests {
         let mut rules = rules(0, Start::Corner);
         rules.n_robots = 4;
         let mut episode = Episode::new(&rules, 1);
-        let starts: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
-        let corners = [(0, 0), (11, 19), (0, 19), (11, 0)].map(|(row, col)| Cell { row, col });
-        assert_eq!(starts, corners);
+        let cells = |episode: &Episode| -> Vec<(usize, usize)> {
+            let cells = episode.robots().iter().map(Robot::cell);
+            cells.map(|Cell { row, col }| (row, col)).collect()
+        };
+        assert_eq!(cells(&episode), [(0, 0), (11, 19), (0, 19), (11, 0)]);
         let flown = Flown {
             moves: &path(&[1, 1, 0, 0, 2, 2, 3, 3]),
             ready: 0b0110,
@@ -331,44 +323,33 @@ mod tests {
             late: 0b1000,
         };
         episode.step(&rules, &flown);
-        let cells: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
-        let moved = [(0, 0), (9, 19), (0, 17), (11, 0)].map(|(row, col)| Cell { row, col });
-        assert_eq!(cells, moved);
-        let n_seen = |robot: &Robot| robot.frame().observed().count();
-        let n_seen: Vec<usize> = episode.robots().iter().map(n_seen).collect();
-        assert_eq!(n_seen, [0, 2, 2, 0]);
-        let n_moves = |robot: &Robot| robot.outcome().n_moves;
-        let n_moves: Vec<u32> = episode.robots().iter().map(n_moves).collect();
-        assert_eq!(n_moves, [0, 2, 2, 0]);
+        assert_eq!(cells(&episode), [(0, 0), (9, 19), (0, 17), (11, 0)]);
+        for (robot, expected) in episode.robots().iter().zip([0, 2, 2, 0]) {
+            assert_eq!(robot.frame().observed().count(), expected);
+            assert_eq!(robot.outcome().n_moves as usize, expected);
+        }
         assert_eq!((episode.outcome().hovered, episode.outcome().late), (1, 8));
     }
 
     #[test]
-    fn a_reset_repeats_the_episode_of_its_seed() {
-        let rules = rules(0, Start::Random);
+    fn a_reset_repeats_the_episode_of_its_seed_until_max_steps() {
+        let rules = rules(3, Start::Random);
         let mut episode = Episode::new(&rules, 9);
-        let first = episode.clone();
-        step(&mut episode, &rules, &[1, 1, 1], 0);
-        for seed in [9, 10, 9] {
+        let first = episode.robots()[0].cell();
+        for (number, seed) in (1..).zip([9, 10, 9]) {
+            for k in 1..=3 {
+                assert!(!episode.is_over());
+                step(&mut episode, &rules, &[1, 1, 1], 0);
+                assert_eq!(episode.outcome().step, k);
+                assert!(!episode.outcome().is_terminated);
+            }
+            assert!(episode.is_over());
             episode.reset(&rules, seed);
             assert_eq!(episode.states(), Episode::new(&rules, seed).states());
             let n_seen = episode.robots()[0].frame().observed().count();
             assert_eq!((episode.outcome().step, n_seen), (0, 0));
+            assert_eq!(episode.outcome().episode, number);
         }
-        assert_eq!(episode.robots()[0].cell(), first.robots()[0].cell());
-        assert_eq!(episode.outcome().episode, 3);
-    }
-
-    #[test]
-    fn an_episode_is_truncated_at_max_steps_and_never_terminated() {
-        let rules = rules(3, Start::Corner);
-        let mut episode = Episode::new(&rules, 1);
-        for k in 1..=3 {
-            assert!(!episode.is_over());
-            step(&mut episode, &rules, &[1], 0);
-            assert_eq!(episode.outcome().step, k);
-            assert!(!episode.outcome().is_terminated);
-        }
-        assert!(episode.is_over());
+        assert_eq!(episode.robots()[0].cell(), first);
     }
 }

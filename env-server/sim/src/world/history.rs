@@ -162,36 +162,29 @@ mod tests {
     use super::*;
     use crate::world::rules::Rules;
     use crate::world::{Episode, Flown};
-    use emberwatch_model::frame::UNOBSERVED;
+    use emberwatch_model::frame::{Frame, UNOBSERVED};
     use emberwatch_model::task::Start;
     use emberwatch_model::{Model, Move, Shape};
 
     #[test]
     fn the_last_frames_are_kept_as_they_were() {
         let shape = Shape::new(4, 6).expect("test shape");
-        let mut rules =
-            Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner).expect("valid model");
+        let rules = Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner);
+        let mut rules = rules.expect("valid model");
         (rules.history, rules.n_moves, rules.n_robots) = (3, 2, 3);
         let mut episode = Episode::new(&rules, 3);
         let mut frames = Vec::new();
         for step in 1..=5 {
-            let full = u64::from(step == 4);
-            episode.step(
-                &rules,
-                &Flown {
-                    moves: &[Move::Down; 6],
-                    ready: 0b101,
-                    full,
-                    hovered: 0b010,
-                    late: 0,
-                },
-            );
+            let flown = Flown {
+                moves: &[Move::Down; 6],
+                ready: 0b101,
+                full: u64::from(step == 4),
+                hovered: 0b010,
+                late: 0,
+            };
+            episode.step(&rules, &flown);
             let robots = episode.robots().iter();
-            frames.push(
-                robots
-                    .map(|robot| robot.frame().clone())
-                    .collect::<Vec<_>>(),
-            );
+            frames.push(robots.map(|it| it.frame().clone()).collect::<Vec<Frame>>());
         }
         assert_eq!(episode.history().len(), 3);
         assert_eq!(episode.recall(2).err(), Some(3));
@@ -210,18 +203,21 @@ mod tests {
 
     #[test]
     fn at_least_the_present_is_kept_and_no_more_than_there_is_room_for() {
-        let past = |n_values| PastStep {
-            outcome: WorldOutcome::default(),
-            robots: vec![PastRobot {
-                values: vec![0; n_values],
-                ..PastRobot::blank()
-            }],
-        };
-        let mut present = History::new(0, 1, 6);
-        (0..3).for_each(|_| present.keep(past(6)));
-        assert_eq!(present.all().len(), 1);
-        let mut few = History::new(256, 1, 64);
-        (0..5).for_each(|_| few.keep(past(1 << 19)));
-        assert_eq!((few.all().len(), few.n_bytes() >> 19), (1, 1));
+        let present = (History::new(0, 1, 6), 6);
+        for (mut history, n_values) in [present, (History::new(256, 1, 64), 1 << 19)] {
+            for _ in 0..5 {
+                let values = vec![0; n_values];
+                let robot = PastRobot {
+                    values,
+                    ..PastRobot::blank()
+                };
+                history.keep(PastStep {
+                    outcome: WorldOutcome::default(),
+                    robots: vec![robot],
+                });
+            }
+            assert_eq!(history.all().len(), 1);
+            assert_eq!(history.n_bytes() >> 19, n_values >> 19);
+        }
     }
 }

@@ -74,26 +74,21 @@ mod tests {
     use emberwatch_model::{Coverage, Model, Move, Shape};
     use std::collections::BTreeSet;
 
-    /// The reward of a set of cells.
-    fn reward(rules: &Rules, states: &[u8], cells: &BTreeSet<usize>) -> f64 {
-        let of_cell = |&cell: &usize| rules.reward[usize::from(states[cell])];
-        cells.iter().map(of_cell).sum()
-    }
-
     #[test]
     fn shares_and_marginal_rewards_are_those_of_sets_of_cells() {
         let shape = Shape::new(4, 5).expect("shape");
-        let model = Model::wildfire();
-        let mut rules = Rules::new(&model, shape, 0, 0, Start::Random).expect("valid model");
+        let rules = Rules::new(&Model::wildfire(), shape, 0, 0, Start::Random);
+        let mut rules = rules.expect("valid model");
         rules.reward = vec![-0.5, 0.25, 1.0];
         let mut counts = vec![0; shape.n_cells()];
-        for case in 0..2_000 {
-            let draw = |index: usize| split_mix(case, index as u64);
+        for case in 0..500 {
+            let draw = |index: usize| split_mix(case, index as u64) as usize;
             let states: Vec<u8> = (0..20).map(|cell| (draw(cell) % 3) as u8).collect();
             let fly = |r: usize| {
-                let mut robot = Robot::at(&rules.airspace, shape.cell(draw(100 + r) as usize % 20));
-                let n_moves = draw(200 + r) as usize % 8; // 0: it stays.
-                let moves = (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) >> 9));
+                let mut robot = Robot::at(&rules.airspace, shape.cell(draw(100 + r) % 20));
+                let n_moves = draw(200 + r) % 8; // 0: it stays.
+                let moves =
+                    (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) as u64 >> 9));
                 let moves: Vec<Move> = moves.collect();
                 robot.fly(
                     &rules.airspace,
@@ -108,25 +103,26 @@ mod tests {
             pay(&rules, &states, &mut robots, &mut counts, &mut team);
             assert!(counts.iter().all(|&count| count == 0));
 
-            let visited = |robots: &mut dyn Iterator<Item = &Robot>| -> BTreeSet<usize> {
-                robots.flat_map(|robot| robot.visited.clone()).collect()
+            // The distinct cells of all robots but one, and their reward.
+            let of_cell = |cell: &usize| rules.reward[usize::from(states[*cell])];
+            let without = |one: usize| {
+                let others = robots.iter().enumerate().filter(|(robot, _)| *robot != one);
+                let cells: BTreeSet<usize> = others
+                    .flat_map(|(_, robot)| robot.visited.clone())
+                    .collect();
+                (cells.len(), cells.iter().map(of_cell).sum::<f64>())
             };
-            let all = visited(&mut robots.iter());
-            let expected = reward(&rules, &states, &all);
-            assert!((team.reward - expected).abs() < 1e-12);
-            assert_eq!(team.n_visited as usize, all.len());
+            let (n_visited, expected) = without(usize::MAX);
             let shares: f64 = robots.iter().map(|robot| robot.outcome.reward).sum();
+            assert_eq!(team.n_visited as usize, n_visited);
+            assert!((team.reward - expected).abs() < 1e-12);
             assert!((shares - expected).abs() < 1e-12);
             for (r, robot) in robots.iter().enumerate() {
-                let mut others = robots.iter().enumerate().filter(|(o, _)| *o != r);
-                let without = visited(&mut others.by_ref().map(|(_, other)| other));
-                let marginal = expected - reward(&rules, &states, &without);
+                let marginal = expected - without(r).1;
                 assert!((robot.outcome.marginal - marginal).abs() < 1e-12);
-                let visitors =
-                    |cell: &usize| robots.iter().filter(|o| o.visited.contains(cell)).count();
-                let of_cell =
-                    |cell: &usize| rules.reward[usize::from(states[*cell])] / visitors(cell) as f64;
-                let share: f64 = robot.visited.iter().map(of_cell).sum();
+                let visitors = |cell| robots.iter().filter(|o| o.visited.contains(cell)).count();
+                let share_of_cell = |cell| of_cell(cell) / visitors(cell) as f64;
+                let share: f64 = robot.visited.iter().map(share_of_cell).sum();
                 assert!((robot.outcome.reward - share).abs() < 1e-12);
             }
         }

@@ -138,50 +138,49 @@ mod tests {
     use super::*;
     use crate::world::Rules;
     use emberwatch_model::randomness::{Purpose, stream};
-    use emberwatch_model::{CellMap, Pays};
-    use emberwatch_model::{Grid, Model};
+    use emberwatch_model::{CellMap, Model};
     use rand::RngExt;
-    use std::sync::Arc;
 
-    fn airspace(rows: &[&str]) -> Airspace {
-        let shape = Shape::new(rows.len(), rows[0].len()).expect("a shape");
-        let closed = |(row, col): (usize, usize)| rows[row].as_bytes()[col] == b'#';
-        let map = Grid::from_shape_fn(shape.dim(), closed);
-        Airspace::new(shape, Some(Arc::new(map)), 0, 1, Pays::Visited)
+    /// A model in which no robot may be where rows have `#`.
+    fn model(rows: [&str; 3]) -> Model {
+        let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
+        let mut file = Model::wildfire().file().clone();
+        file.no_fly = Some(CellMap::Rows(rows.map(of_row).to_vec()));
+        Model::new(file).expect("a model")
     }
 
     #[test]
     fn fixed_starts_in_a_pocket_are_named_with_what_they_reach() {
-        let pocket = airspace(&["..#...", "###...", "......"]);
+        let shape = Shape::new(3, 6).expect("a shape");
+        let pocket = model(["..#...", "###...", "......"]).airspace(shape);
+        let pocket = pocket.expect("the grid");
         let reach = |start| Reach::of(start, &pocket, 2).expect("a start that can be left");
         let corner = reach(Start::Corner);
         assert_eq!((corner.n_free, corner.n_cut_off), (14, 2));
-        let words = corner.closed_in[0].to_string();
-        assert!(
-            words.contains("(0, 0)") && words.contains("reach 2 of 14 free cells"),
-            "{words}"
-        );
         assert_eq!(corner.closed_in.len(), 1, "the other corner is outside");
-        let words = corner.cut_off().expect("a share");
-        assert!(words.contains("2 of 14 free cells (14.29 %)"), "{words}");
+        for (said, words) in [
+            (corner.closed_in[0].to_string(), "(0, 0)"),
+            (corner.closed_in[0].to_string(), "reach 2 of 14 free cells"),
+            (
+                corner.cut_off().expect("a share"),
+                "2 of 14 free cells (14.29 %)",
+            ),
+        ] {
+            assert!(said.contains(words), "{said}");
+        }
         assert!(reach(Start::Centre).closed_in.is_empty());
         assert!(reach(Start::Random).closed_in.is_empty());
-        let open = Reach::of(Start::Corner, &Airspace::open(pocket.shape()), 2);
+        let open = Reach::of(Start::Corner, &Airspace::open(shape), 2);
         assert_eq!(open.map(|it| it.cut_off()), Ok(None));
     }
 
     #[test]
     fn a_connected_map_has_the_random_starts_of_all_free_cells() {
         let rows = [".#....", ".####.", "......"];
-        let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
-        let mut file = Model::wildfire().file().clone();
-        file.no_fly = Some(CellMap::Rows(rows.map(of_row).to_vec()));
-        let model = Model::new(file).expect("a model");
         let shape = Shape::new(3, 6).expect("a shape");
-        let rules = Rules::new(&model, shape, 0, 0, Start::Random).expect("rules");
-        let free: Vec<usize> = (0..18)
-            .filter(|&at| rows[at / 6].as_bytes()[at % 6] == b'.')
-            .collect();
+        let rules = Rules::new(&model(rows), shape, 0, 0, Start::Random).expect("rules");
+        let is_free = |&at: &usize| rows.concat().as_bytes()[at] == b'.';
+        let free: Vec<usize> = (0..18).filter(is_free).collect();
         for (seed, robot) in (0..200).zip([0, 1].into_iter().cycle()) {
             let mut stream = stream(seed, Purpose::Start, robot as u64);
             let expected = shape.cell(free[stream.random_range(0..free.len())]);

@@ -124,93 +124,68 @@ mod tests {
         reclaimable: [&["total_inactive_file"], &["inactive_file"]],
     };
 
-    /// What is read where the system has these files: the folder, the limit and what is free, the innermost first.
-    fn check(name: &str, files: &[(&str, &str)], expected: &[(&str, u64, u64)]) {
+    /// Checks what is read where the system has these files, one a line, whose own lines end with `;`: the folder, the
+    /// limit and what is free, the innermost first.
+    fn check(name: &str, files: &str, expected: &[&str]) {
         let root = std::env::temp_dir().join(format!("emberwatch-{name}-{}", std::process::id()));
-        for (path, text) in files {
-            let path = root.join(path);
+        for line in files.trim().lines() {
+            let (path, text) = line.split_once(" = ").expect(line);
+            let path = root.join(path.trim());
             create_dir_all(path.parent().expect("a folder")).expect("make it");
-            write(path, text).expect("write a file");
+            write(path, text.replace(';', "\n")).expect("write a file");
         }
-        let found = limits(&root, &MEMORY);
-        let found = found.iter().map(|it| {
+        let found = limits(&root, &MEMORY).into_iter().map(|it| {
             let folder = it.file.parent().expect("a folder").strip_prefix(&root);
-            let folder = folder.expect("below the root").to_string_lossy();
-            (folder.into_owned(), it.limit, it.free)
+            let folder = folder.expect("below the root").display();
+            format!("{folder} {} {}", it.limit, it.free)
         });
-        let found: Vec<_> = found.collect();
-        let expected = expected.iter();
-        let expected: Vec<_> = expected.map(|it| (it.0.to_owned(), it.1, it.2)).collect();
-        assert_eq!(found, expected);
+        assert_eq!(found.collect::<Vec<_>>(), expected);
         remove_dir_all(&root).expect("clean up");
     }
 
     #[test]
     fn all_groups_around_a_process_count_in_version_2() {
-        let mount = "30 23 0:26 / /sys/fs/cgroup rw,nosuid - cgroup2 cgroup2 rw,nsdelegate";
-        let own = ("proc/self/cgroup", "0::/outer/inner\n");
-        let files = [
-            own,
-            ("proc/self/mountinfo", mount),
-            ("sys/fs/cgroup/outer/memory.max", "1000\n"),
-            ("sys/fs/cgroup/outer/memory.current", "900\n"),
-            (
-                "sys/fs/cgroup/outer/memory.stat",
-                "anon 1\ninactive_file 300\nslab 2\n",
-            ),
-            ("sys/fs/cgroup/outer/inner/memory.max", "max\n"),
-            ("sys/fs/cgroup/outer/inner/memory.current", "500\n"),
-        ];
-        check("v2", &files, &[("sys/fs/cgroup/outer", 1000, 400)]);
-        let mut both = files.to_vec();
-        both[5].1 = "600\n";
-        let inner = ("sys/fs/cgroup/outer/inner", 600, 100);
-        check(
-            "v2-both",
-            &both,
-            &[inner, ("sys/fs/cgroup/outer", 1000, 400)],
-        );
+        let outer = "
+            proc/self/cgroup = 0::/outer/inner;
+            proc/self/mountinfo = 30 23 0:26 / /sys/fs/cgroup rw,nosuid - cgroup2 cgroup2 rw,nsdelegate
+            sys/fs/cgroup/outer/memory.max = 1000;
+            sys/fs/cgroup/outer/memory.current = 900;
+            sys/fs/cgroup/outer/memory.stat = anon 1;inactive_file 300;slab 2;
+            sys/fs/cgroup/outer/inner/memory.current = 500;
+            sys/fs/cgroup/outer/inner/memory.max = ";
+        let expected = "sys/fs/cgroup/outer 1000 400";
+        check("v2", &format!("{outer}max;"), &[expected]);
+        let inner = "sys/fs/cgroup/outer/inner 600 100";
+        check("v2-both", &format!("{outer}600;"), &[inner, expected]);
         // In a namespace of its own, a process sees its group as the top, or its parent as "..".
         for own in ["0::/", "0::/../other"] {
-            let files = [
-                ("proc/self/cgroup", own),
-                ("proc/self/mountinfo", mount),
-                ("sys/fs/cgroup/memory.max", "1000"),
-                ("sys/fs/cgroup/memory.current", "1500"),
-            ];
-            check("v2-top", &files, &[("sys/fs/cgroup", 1000, 0)]);
+            let top = format!(
+                "proc/self/cgroup = {own}
+                proc/self/mountinfo = 30 23 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw
+                sys/fs/cgroup/memory.max = 1000
+                sys/fs/cgroup/memory.current = 1500"
+            );
+            check("v2-top", &top, &["sys/fs/cgroup 1000 0"]);
         }
     }
 
     #[test]
     fn a_group_is_found_below_the_top_of_a_mount_in_version_1() {
-        let mounts = "\
-            34 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset\n\
-            35 31 0:32 /docker/id /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory\n\
-            41 31 0:38 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw";
-        let files = [
-            (
-                "proc/self/cgroup",
-                "5:cpuset:/\n4:memory:/docker/id/job\n0::/\n",
-            ),
-            ("proc/self/mountinfo", mounts),
-            ("sys/fs/cgroup/memory/job/memory.limit_in_bytes", "800"),
-            ("sys/fs/cgroup/memory/job/memory.usage_in_bytes", "300"),
-            (
-                "sys/fs/cgroup/memory/job/memory.stat",
-                "total_inactive_file 100\ninactive_file 7",
-            ),
-            (
-                "sys/fs/cgroup/memory/memory.limit_in_bytes",
-                "9223372036854771712",
-            ),
-            ("sys/fs/cgroup/memory/memory.usage_in_bytes", "5"),
+        let mounts = [
+            "34 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset",
+            "35 31 0:32 /docker/id /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory",
+            "41 31 0:38 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw",
         ];
-        check("v1", &files, &[("sys/fs/cgroup/memory/job", 800, 600)]);
-    }
-
-    #[test]
-    fn without_cgroups_there_is_no_limit() {
-        check("none", &[("proc/self/cgroup", "garbage")], &[]);
+        let files = "
+            proc/self/cgroup = 5:cpuset:/;4:memory:/docker/id/job;0::/;
+            sys/fs/cgroup/memory/job/memory.limit_in_bytes = 800
+            sys/fs/cgroup/memory/job/memory.usage_in_bytes = 300
+            sys/fs/cgroup/memory/job/memory.stat = total_inactive_file 100;inactive_file 7
+            sys/fs/cgroup/memory/memory.limit_in_bytes = 9223372036854771712
+            sys/fs/cgroup/memory/memory.usage_in_bytes = 5
+            proc/self/mountinfo = ";
+        let files = format!("{files}{}", mounts.join(";"));
+        check("v1", &files, &["sys/fs/cgroup/memory/job 800 600"]);
+        check("none", "proc/self/cgroup = garbage", &[]);
     }
 }

@@ -4,7 +4,7 @@
 //! up once for all next states: 35 additions and 16 multiplications a cell where the formula has 54 of each.
 //!
 //! Why it is the same: `w x + w y = w (x + y)`. The sums of the formula, in double precision, are in
-//! `tests/model/transition.rs`, `own_state.rs` and `zones.rs`, which compare them for any models and grids.
+//! `tests/model/models.rs`; `transition.rs` there compares them for any models and grids.
 //!
 //! A weight that differs between zones has a *slot*: a number for each lane, by the zones of the cells there. Most
 //! weights of a land do not differ.

@@ -1,90 +1,155 @@
-//! The world's step draws what the operator `Phi` says, whatever the model, and looks like the authors' world.
+//! The world's step draws what the formula says, whatever the model, and looks like the authors' world.
 
 use super::models::{
-    check_draws, hash_after, model, one_hot, predicted, random_model, random_states, shape,
-    with_edge,
+    checked, formula, model, random_land, random_model, random_own_model, random_states, shape,
+    with_edge, zoned,
 };
 use super::statistics;
-use emberwatch_model::{Dynamics, Grid, Model};
+use emberwatch_model::{Dynamics, Grid, KernelEntry, Model, Shape};
+use ndarray::{Array3, Axis, array};
 
-/// Compares draws with `Phi` of the states, in double precision.
+fn burnout() -> Model {
+    Model::built_in("wildfire-burnout").expect("built in")
+}
+
+/// Steps `states` often and compares each cell's outcomes with their probabilities: 5 standard deviations are exceeded
+/// by chance with probability < 1e-3, and < 1e-5 for 100 degrees of freedom.
 fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
-    let phi = predicted(model, &one_hot(model.n_states(), states));
-    check_draws(model, states, n_draws, &phi);
+    let (height, width) = states.dim();
+    let mut dynamics = Dynamics::new(model, shape(height, width)).expect("test model");
+    let mut counts = Array3::<f64>::zeros((model.n_states(), height, width));
+    let mut next = states.clone();
+    for n in 0..n_draws {
+        next.assign(states);
+        dynamics.step(11, n, &mut next);
+        for ((row, col), &state) in next.indexed_iter() {
+            counts[[usize::from(state), row, col]] += 1.0;
+        }
+    }
+    let known = Array3::from_shape_fn(counts.dim(), |(state, row, col)| {
+        f64::from(usize::from(states[[row, col]]) == state)
+    });
+    let expected = formula(model, &known) * n_draws as f64;
+    let z = chi_square(&counts, &expected);
+    assert!(z.abs() < 5.0, "{}: {z} standard deviations", model.name());
 }
 
-#[test]
-fn wildfire_steps_are_drawn_from_phi() {
-    check(&Model::wildfire(), &random_states(1, 3, (5, 6)), 200_000);
-    check(&Model::wildfire(), &random_states(2, 3, (1, 6)), 100_000);
-    check(&Model::wildfire(), &Grid::from_elem((1, 1), 2), 200_000);
-}
-
-#[test]
-fn grids_of_several_chunks_and_bands_are_drawn_from_phi() {
-    check(&Model::wildfire(), &random_states(3, 3, (3, 70)), 40_000);
-    check(&Model::wildfire(), &random_states(16, 3, (92, 91)), 2_000);
-}
-
-#[test]
-fn random_models_are_drawn_from_phi() {
-    check(
-        &random_model(4, 4, [5, 5]),
-        &random_states(5, 4, (7, 5)),
-        200_000,
-    );
-    // A kernel larger than the grid.
-    check(
-        &random_model(6, 6, [3, 7]),
-        &random_states(7, 6, (4, 3)),
-        100_000,
-    );
-    check(
-        &random_model(8, 2, [1, 1]),
-        &random_states(9, 2, (2, 3)),
-        100_000,
-    );
-}
-
-#[test]
-fn cells_beyond_the_edge_in_a_state_are_drawn_from_phi() {
-    let latent = with_edge(&Model::wildfire(), 1);
-    check(&latent, &random_states(1, 3, (2, 6)), 200_000);
-    let random = with_edge(&random_model(6, 6, [3, 7]), 3);
-    check(&random, &random_states(7, 6, (4, 3)), 100_000);
-    // Where nothing is left of a cell's weights without its neighbours beyond the edge.
-    let weight = |to, from, row, _| f64::from(u8::from(row == 0 && to == from));
-    let shift_down = model(3, [3, 1], weight, |_| 0.0);
-    let error = Dynamics::new(&shift_down, shape(3, 2)).expect_err("no weight in row 0");
-    assert!(error.to_string().contains("(0, 0)"), "{error}");
-    let mut dynamics = Dynamics::new(&with_edge(&shift_down, 2), shape(3, 2)).expect("weights");
-    let mut states = ndarray::array![[0, 1], [1, 2], [2, 0]];
-    dynamics.step(1, 0, &mut states);
-    assert_eq!(states, ndarray::array![[2, 2], [0, 1], [1, 2]]);
-}
-
-#[test]
-fn models_of_very_many_weights_are_drawn_from_phi() {
-    // 102,400 of them, too many for tables.
-    check(
-        &random_model(14, 64, [5, 5]),
-        &random_states(15, 64, (2, 2)),
-        20_000,
-    );
-}
-
-#[test]
-fn a_state_that_mostly_changes_is_drawn_from_phi() {
-    let weight = |to, from, row, col| {
-        let likely = if to == (from + 1) % 3 { 0.9 } else { 0.05 };
-        likely * if (row, col) == (1, 1) { 1.0 } else { 0.2 }
+/// Chi-square of counts by cell and outcome, in standard deviations. Outcomes expected fewer than 10 times share a bin,
+/// impossible ones must not occur. Cells are independent, so statistics and degrees of freedom add up; with d degrees
+/// of freedom the sum has mean d and variance 2d.
+fn chi_square(counts: &Array3<f64>, expected: &Array3<f64>) -> f64 {
+    let (mut sum, mut freedom) = (0.0, 0.0);
+    let mut term = |observed: f64, expected: f64| {
+        sum += (observed - expected).powi(2) / expected;
+        freedom += 1.0;
     };
-    let cycle = model(3, [3, 3], weight, |_| 0.0);
-    check(&cycle, &random_states(10, 3, (5, 5)), 200_000);
+    for (observed, expected) in counts
+        .lanes(Axis(0))
+        .into_iter()
+        .zip(expected.lanes(Axis(0)))
+    {
+        let mut rare = (0.0, 0.0);
+        for (&observed, &expected) in observed.iter().zip(expected) {
+            if expected == 0.0 {
+                assert_eq!(observed, 0.0, "an impossible outcome");
+            } else if expected < 10.0 {
+                rare = (rare.0 + observed, rare.1 + expected);
+            } else {
+                term(observed, expected);
+            }
+        }
+        if rare.1 > 0.0 {
+            term(rare.0, rare.1);
+        }
+    }
+    freedom -= (counts.len() / counts.len_of(Axis(0))) as f64;
+    (sum - freedom) / (2.0 * f64::max(freedom, 1.0)).sqrt()
 }
 
 #[test]
-fn cells_that_reject_almost_every_parent_are_drawn_from_phi() {
+fn wildfires_are_drawn_from_the_formula() {
+    for model in [
+        Model::wildfire(),
+        burnout(),
+        with_edge(&Model::wildfire(), 1),
+    ] {
+        check(&model, &random_states(1, 3, (5, 6)), 100_000);
+        // Several chunks and bands.
+        check(&model, &random_states(3, 3, (3, 70)), 40_000);
+        check(&model, &random_states(16, 3, (92, 91)), 2_000);
+        for state in 0..3 {
+            check(&model, &Grid::from_elem((1, 1), state), 100_000);
+        }
+    }
+}
+
+#[test]
+fn random_models_are_drawn_from_the_formula() {
+    for (key, n_states, kernel_size, side, n_draws) in [
+        (4, 4, [5, 5], (7, 5), 100_000),
+        // A kernel larger than the grid.
+        (6, 6, [3, 7], (4, 3), 100_000),
+        (8, 2, [1, 1], (2, 3), 100_000),
+        // Too many weights for tables: kernels are summed.
+        (14, 64, [5, 5], (2, 2), 20_000),
+    ] {
+        let states = random_states(key + 1, n_states, side);
+        let model = random_model(key, n_states, kernel_size);
+        check(&model, &states, n_draws);
+        check(&with_edge(&model, 3), &states, n_draws);
+    }
+    for (key, n_states, kernel_size, side, n_draws) in [
+        (4, 4, [5, 5], (7, 5), 100_000),
+        (6, 6, [3, 7], (4, 3), 100_000),
+        (8, 2, [1, 1], (2, 3), 100_000),
+        (14, 24, [3, 3], (2, 2), 20_000),
+    ] {
+        let states = random_states(key + 1, n_states, side);
+        check(
+            &random_own_model(key, n_states, kernel_size),
+            &states,
+            n_draws,
+        );
+    }
+}
+
+#[test]
+fn lands_are_drawn_from_the_formula() {
+    let random = [random_model, random_own_model];
+    for (sees_own, n_states, n_zones, side, n_draws) in [
+        (0, 4, 3, (7, 5), 100_000),
+        (1, 4, 3, (7, 5), 100_000),
+        (0, 3, 9, (3, 140), 20_000),
+        (1, 3, 9, (3, 140), 20_000),
+        (1, 3, 1, (4, 4), 50_000),
+        // Too many weights for tables.
+        (1, 16, 5, (2, 3), 20_000),
+    ] {
+        let of_zone = |zone: u64| random[sees_own](7 + 1000 * zone, n_states, [3, 3]);
+        let models: Vec<Model> = (0..n_zones).map(of_zone).collect();
+        let states = random_states(8, n_states, side);
+        check(&random_land(7, &models, side), &states, n_draws);
+    }
+    // In a river no cell burns: bytes may be certain.
+    let mut river = burnout().file().clone();
+    let entry = |state: &String| KernelEntry {
+        zone: None,
+        own: Some(state.clone()),
+        from: state.clone(),
+        to: "unburnt".into(),
+        scale: 1.0,
+        weights: vec![vec![0.0; 3], vec![0.0, 1.0, 0.0], vec![0.0; 3]],
+    };
+    river.kernel = burnout().state_names().iter().map(entry).collect();
+    let river = checked(river);
+    for models in [[burnout(), river.clone()], [river, burnout()]] {
+        let states = random_states(5, 3, (6, 70));
+        check(&zoned(&models, 3, (6, 70)), &states, 20_000);
+    }
+}
+
+#[test]
+fn cells_that_reject_almost_every_parent_are_drawn_from_the_formula() {
     // State 0 weighs 1e-4 of state 1: a cell among zeros accepts a parent once in 10,000 draws.
     let weight = |to, from, row, col| {
         let scale = if from == 0 { 1e-4 } else { 1.0 };
@@ -97,49 +162,43 @@ fn cells_that_reject_almost_every_parent_are_drawn_from_phi() {
 
 #[test]
 fn deterministic_models_move_as_they_must() {
-    let weight = |to, from, row, _| f64::from(u8::from(row == 0 && to == from));
-    let shift_down = model(3, [3, 1], weight, |to| if to == 2 { 1e-20 } else { 0.0 });
-    let mut dynamics = Dynamics::new(&shift_down, shape(3, 2)).expect("a bias keeps row 0 alive");
-    let mut states = ndarray::array![[0, 1], [1, 2], [2, 0]];
-    dynamics.step(1, 0, &mut states);
-    assert_eq!(states, ndarray::array![[2, 2], [0, 1], [1, 2]]);
-}
-
-#[test]
-fn initial_states_follow_the_models_distribution() {
-    let dynamics = Dynamics::new(&Model::wildfire(), shape(64, 64)).expect("wildfire");
-    let worlds: Vec<Grid<u8>> = (0..50).map(|seed| dynamics.initial(seed)).collect();
-    let count = |state| worlds.iter().flatten().filter(|&&s| s == state).count() as f64;
-    // Latent with probability .01 in each of 204,800 cells: 2048 +- 45.
-    assert!((count(1) - 2048.0).abs() < 4.0 * 45.0, "{}", count(1));
-    assert_eq!(count(2), 0.0);
-    assert_ne!(worlds[0], worlds[1]);
-}
-
-#[test]
-fn a_step_depends_on_seed_and_step_alone() {
-    let new = || Dynamics::new(&Model::wildfire(), shape(9, 70)).expect("wildfire");
-    let start = random_states(13, 3, (9, 70));
-    let step = |dynamics: &mut Dynamics, seed, n| {
-        let mut states = start.clone();
-        dynamics.step(seed, n, &mut states);
-        states
+    let shift_down = |bias| {
+        let weight = |to, from, row, _| f64::from(row == 0 && to == from);
+        model(3, [3, 1], weight, |to| if to == 2 { bias } else { 0.0 })
     };
-    let (mut fresh, mut used) = (new(), new());
-    let other = step(&mut used, 8, 3);
-    assert_eq!(step(&mut fresh, 8, 4), step(&mut used, 8, 4));
-    assert_ne!(step(&mut fresh, 8, 4), other);
-    assert_ne!(step(&mut fresh, 9, 4), step(&mut used, 8, 4));
+    // Where nothing is left of a cell's weights without its neighbours beyond the edge.
+    let error = Dynamics::new(&shift_down(0.0), shape(3, 2)).expect_err("no weight in row 0");
+    assert!(error.to_string().contains("(0, 0)"), "{error}");
+    for model in [with_edge(&shift_down(0.0), 2), shift_down(1e-20)] {
+        let mut dynamics = Dynamics::new(&model, shape(3, 2)).expect("weights");
+        let mut states = array![[0, 1], [1, 2], [2, 0]];
+        dynamics.step(1, 0, &mut states);
+        assert_eq!(states, array![[2, 2], [0, 1], [1, 2]]);
+    }
+}
+
+/// FNV-1a (http://www.isthe.com/chongo/tech/comp/fnv) of a world after some steps, by dynamics that moved another one.
+fn hash_after(model: &Model, shape: Shape, n_steps: u64) -> u64 {
+    let mut dynamics = Dynamics::new(model, shape).expect("test model");
+    dynamics.step(8, 3, &mut dynamics.initial(8));
+    let mut states = dynamics.initial(7);
+    (0..n_steps).for_each(|n| dynamics.step(7, n, &mut states));
+    let hash = |hash: u64, &state: &u8| (hash ^ u64::from(state)).wrapping_mul(0x100_0000_01b3);
+    states.iter().fold(0xcbf2_9ce4_8422_2325, hash)
 }
 
 #[test]
 fn a_trajectory_is_the_same_on_every_platform() {
     // Pinned at version 0.1.0: if one changes, so does every published seed.
-    let wildfire = hash_after(&Model::wildfire(), shape(64, 64), 1000);
+    let grid = shape(64, 64);
+    let wildfire = hash_after(&Model::wildfire(), grid, 1000);
     assert_eq!(wildfire, 0x5b72_805c_3e44_c4a8);
-    // Escapes, redraws and summed kernels all take part in this one.
+    assert_eq!(hash_after(&burnout(), grid, 1000), 0xd2cf_307c_c03b_0b99);
+    // Escapes, redraws and summed kernels all take part in these.
     let random = hash_after(&random_model(4, 4, [5, 5]), shape(7, 5), 10_000);
     assert_eq!(random, 0x4974_9562_5f3d_1a6d);
+    let own = hash_after(&random_own_model(4, 4, [5, 5]), shape(7, 5), 10_000);
+    assert_eq!(own, 0xebbe_d7df_8cf5_68ca);
 }
 
 #[test]

@@ -20,8 +20,8 @@ const LAST_STEP: u64 = 35_000;
 /// Every tenth step is counted: states are correlated over thousands of steps.
 const EVERY: u64 = 10;
 
-const LATENT: u8 = 1;
-const FIRE: u8 = 2;
+const LATENT: usize = 1;
+const FIRE: usize = 2;
 const DIRECTIONS: [(&str, isize, isize); 4] = [
     ("above", -1, 0),
     ("below", 1, 0),
@@ -30,7 +30,7 @@ const DIRECTIONS: [(&str, isize, isize); 4] = [
 ];
 
 /// Value of each statistic in one run.
-pub type Statistics = BTreeMap<String, f64>;
+type Statistics = BTreeMap<String, f64>;
 
 /// A mean over runs.
 #[derive(Debug, Clone, Copy)]
@@ -50,15 +50,12 @@ impl Estimate {
 pub fn reference() -> BTreeMap<String, Estimate> {
     let json: serde_json::Value =
         serde_json::from_str(include_str!("../data/b_world_stats.json")).expect("JSON");
-    let statistics = json["reference_15000_35000"]
-        .as_object()
-        .expect("an object");
-    let number = |value: &serde_json::Value| value.as_f64().expect("a number");
+    let statistics = json["reference_15000_35000"].as_object();
     let entry = |(name, entry): (&String, &serde_json::Value)| {
-        let (mean, se) = (number(&entry["mean"]), number(&entry["se"]));
+        let [mean, se] = ["mean", "se"].map(|key| entry[key].as_f64().expect("a number"));
         (name.clone(), Estimate { mean, se })
     };
-    statistics.iter().map(entry).collect()
+    statistics.expect("an object").iter().map(entry).collect()
 }
 
 /// Our simulator, one run for each seed, each on its own thread.
@@ -70,14 +67,9 @@ pub fn simulate(seeds: std::ops::Range<u64>) -> BTreeMap<String, Estimate> {
     });
     let estimate = |name: &String| {
         let values: Vec<f64> = runs.iter().map(|run| run[name]).collect();
-        let se = standard_deviation(&values) / (values.len() as f64).sqrt();
-        (
-            name.clone(),
-            Estimate {
-                mean: mean(&values),
-                se,
-            },
-        )
+        let (mean, deviation) = moments(&values);
+        let se = deviation / (values.len() as f64).sqrt();
+        (name.clone(), Estimate { mean, se })
     };
     runs[0].keys().map(estimate).collect()
 }
@@ -88,162 +80,115 @@ fn run(seed: u64) -> Statistics {
     let mut states = dynamics.initial(seed);
     let mut counts = Counts::default();
     for n in 0..LAST_STEP {
-        if n >= FIRST_STEP && n.is_multiple_of(EVERY) {
-            let before = states.clone();
-            dynamics.step(seed, n, &mut states);
+        let is_counted = n >= FIRST_STEP && n.is_multiple_of(EVERY);
+        let before = is_counted.then(|| states.clone());
+        dynamics.step(seed, n, &mut states);
+        if let Some(before) = before {
             counts.count(&before, &states);
-        } else {
-            dynamics.step(seed, n, &mut states);
         }
     }
     counts.statistics()
 }
 
-/// How often something was the case, and how often it could have been.
-#[derive(Debug, Default, Clone, Copy)]
-struct Ratio {
-    hits: u64,
-    of: u64,
-}
-
-/// What one run has shown about one neighbour.
-#[derive(Debug, Default, Clone, Copy)]
-struct Neighbour {
-    fire_given_fire: Ratio,
-    fire_given_latent: Ratio,
-    fire_before_new_fire: Ratio,
-    latent_before_new_latent: Ratio,
-}
-
-#[derive(Debug, Default)]
+#[derive(Default)]
 struct Counts {
     /// Fraction of each state at each counted step.
     fractions: [Vec<f64>; 3],
-    transitions: [[u64; 3]; 3],
-    neighbours: [Neighbour; 4],
-    fire_by_half: [Ratio; 4],
-}
-
-impl Ratio {
-    fn add(&mut self, hit: bool) {
-        self.hits += u64::from(hit);
-        self.of += 1;
-    }
-
-    fn value(self) -> f64 {
-        self.hits as f64 / self.of as f64
-    }
+    /// Cells in state `from` that turn into `to`: `[from][to]`.
+    transitions: [[f64; 3]; 3],
+    /// The same of cells with a neighbour in a direction in a state: `[direction][neighbour][from][to]`.
+    neighbours: [[[[f64; 3]; 3]; 3]; 4],
+    /// Fires by quarter of the grid: `[lower half][right half]`.
+    fires: [[f64; 2]; 2],
 }
 
 impl Counts {
     fn count(&mut self, before: &Grid<u8>, after: &Grid<u8>) {
-        let mut cells = [0; 3];
+        let mut cells = [0.0; 3];
         for ((row, col), &state) in before.indexed_iter() {
-            let next = after[[row, col]];
-            cells[usize::from(state)] += 1;
-            self.transitions[usize::from(state)][usize::from(next)] += 1;
-            let [top, bottom, left, right] = &mut self.fire_by_half;
-            (if row < SIDE / 2 { top } else { bottom }).add(state == FIRE);
-            (if col < SIDE / 2 { left } else { right }).add(state == FIRE);
+            let [from, to] = [state, after[[row, col]]].map(usize::from);
+            cells[from] += 1.0 / (SIDE * SIDE) as f64;
+            self.transitions[from][to] += 1.0;
+            self.fires[row / (SIDE / 2)][col / (SIDE / 2)] += f64::from(from == FIRE);
             for (seen, (_, down, across)) in self.neighbours.iter_mut().zip(DIRECTIONS) {
-                let at = [
+                let (i, j) = (
                     row.wrapping_add_signed(down),
                     col.wrapping_add_signed(across),
-                ];
-                if let Some(&neighbour) = before.get(at) {
-                    seen.add(state, next, neighbour);
+                );
+                if let Some(&neighbour) = before.get([i, j]) {
+                    seen[usize::from(neighbour)][from][to] += 1.0;
                 }
             }
         }
-        for (fractions, n_cells) in self.fractions.iter_mut().zip(cells) {
-            fractions.push(f64::from(n_cells) / (SIDE * SIDE) as f64);
+        for (fractions, fraction) in self.fractions.iter_mut().zip(cells) {
+            fractions.push(fraction);
         }
     }
 
     fn statistics(&self) -> Statistics {
         let mut all = Statistics::new();
-        for (state, fractions) in self.fractions.iter().enumerate() {
-            all.insert(format!("mean_fraction_{state}"), mean(fractions));
-            let name = format!("within_run_sd_fraction_{state}");
-            all.insert(name, standard_deviation(fractions));
-        }
-        self.insert_transitions(&mut all);
-        self.insert_neighbours(&mut all);
-        let [top, bottom, left, right] = self.fire_by_half.map(Ratio::value);
-        all.insert("fire_fraction_rows_0_31".into(), top);
-        all.insert("fire_fraction_rows_32_63".into(), bottom);
-        all.insert("fire_bottom_minus_top".into(), bottom - top);
-        all.insert("fire_right_minus_left".into(), right - left);
-        all
-    }
-
-    fn insert_transitions(&self, all: &mut Statistics) {
         let n_steps = self.fractions[0].len() as f64;
         let mut changes = 0.0;
-        for (from, row) in self.transitions.iter().enumerate() {
-            let total: u64 = row.iter().sum();
-            for (to, &count) in row.iter().enumerate() {
-                let per_step = count as f64 / n_steps;
-                all.insert(format!("transitions_per_step_{from}to{to}"), per_step);
+        for from in 0..3 {
+            let (mean, deviation) = moments(&self.fractions[from]);
+            all.insert(format!("mean_fraction_{from}"), mean);
+            all.insert(format!("within_run_sd_fraction_{from}"), deviation);
+            let total: f64 = self.transitions[from].iter().sum();
+            for (to, count) in self.transitions[from].into_iter().enumerate() {
                 all.insert(
-                    format!("cond_prob_{from}to{to}"),
-                    count as f64 / total as f64,
+                    format!("transitions_per_step_{from}to{to}"),
+                    count / n_steps,
                 );
-                changes += if from == to { 0.0 } else { per_step };
+                all.insert(format!("cond_prob_{from}to{to}"), count / total);
+                changes += if from == to { 0.0 } else { count / n_steps };
             }
         }
         all.insert("changes_per_step".into(), changes);
+        self.insert_neighbours(&mut all);
+        let [top, bottom] = self.fires.map(|[left, right]| left + right);
+        let half = n_steps * (SIDE * SIDE / 2) as f64;
+        let right_minus_left: f64 = self.fires.iter().map(|[left, right]| right - left).sum();
+        all.insert("fire_fraction_rows_0_31".into(), top / half);
+        all.insert("fire_fraction_rows_32_63".into(), bottom / half);
+        all.insert("fire_bottom_minus_top".into(), (bottom - top) / half);
+        all.insert("fire_right_minus_left".into(), right_minus_left / half);
+        all
     }
 
     fn insert_neighbours(&self, all: &mut Statistics) {
         for (seen, (name, ..)) in self.neighbours.iter().zip(DIRECTIONS) {
-            for (what, ratio) in [
-                (format!("p_fire_{name}_given_fire"), seen.fire_given_fire),
-                (
-                    format!("p_fire_{name}_given_latent"),
-                    seen.fire_given_latent,
-                ),
-                (
-                    format!("new_fire_fraction_with_{name}_on_fire_before"),
-                    seen.fire_before_new_fire,
-                ),
-                (
-                    format!("new_latent_fraction_with_{name}_latent_before"),
-                    seen.latent_before_new_latent,
-                ),
-            ] {
-                all.insert(what, ratio.value());
-            }
+            // The share of the cells of some states, before and after, whose neighbour is in a state.
+            let share = |neighbour: usize, is_counted: &dyn Fn(usize, usize) -> bool| {
+                let mut counts = [0.0; 3];
+                for (neighbour, from, to) in ndarray::indices((3, 3, 3)) {
+                    counts[neighbour] +=
+                        f64::from(is_counted(from, to)) * seen[neighbour][from][to];
+                }
+                counts[neighbour] / counts.iter().sum::<f64>()
+            };
+            let given = |state| share(FIRE, &|from, _| from == state);
+            let new = |state| share(state, &|from, to| from != state && to == state);
+            all.insert(format!("p_fire_{name}_given_fire"), given(FIRE));
+            all.insert(format!("p_fire_{name}_given_latent"), given(LATENT));
+            all.insert(
+                format!("new_fire_fraction_with_{name}_on_fire_before"),
+                new(FIRE),
+            );
+            all.insert(
+                format!("new_latent_fraction_with_{name}_latent_before"),
+                new(LATENT),
+            );
         }
-        let [above, below, ..] = self
-            .neighbours
-            .map(|seen| seen.fire_before_new_fire.value());
+        let [above, below] = ["above", "below"]
+            .map(|name| all[&format!("new_fire_fraction_with_{name}_on_fire_before")]);
         all.insert("new_fire_above_minus_below".into(), above - below);
     }
 }
 
-impl Neighbour {
-    /// Counts one cell with a neighbour on the grid.
-    fn add(&mut self, state: u8, next: u8, neighbour: u8) {
-        match state {
-            FIRE => self.fire_given_fire.add(neighbour == FIRE),
-            LATENT => self.fire_given_latent.add(neighbour == FIRE),
-            _ => {}
-        }
-        match next {
-            FIRE if state != FIRE => self.fire_before_new_fire.add(neighbour == FIRE),
-            LATENT if state != LATENT => self.latent_before_new_latent.add(neighbour == LATENT),
-            _ => {}
-        }
-    }
-}
-
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
-}
-
-fn standard_deviation(values: &[f64]) -> f64 {
-    let centre = mean(values);
-    let squares: f64 = values.iter().map(|value| (value - centre).powi(2)).sum();
-    (squares / (values.len() - 1) as f64).sqrt()
+/// Mean and standard deviation.
+fn moments(values: &[f64]) -> (f64, f64) {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (mean, (squares / (n - 1.0)).sqrt())
 }

@@ -1,34 +1,27 @@
-//! `Phi` on beliefs against its formula (paper eqs. 2-4), for any model and grid.
+//! `Phi` on beliefs against its formula, for any model and grid.
 
-use super::models::{check_predictions, random_belief, random_model, shape, with_edge};
+use super::models::{
+    formula, random_belief, random_land, random_model, random_own_model, shape, with_edge,
+};
 use emberwatch_model::{Model, Transition};
-use ndarray::{Array3, Axis};
+use ndarray::{Array3, Axis, NdFloat};
 use proptest::prelude::*;
 
-/// The formula of eqs. 2-4 as it stands.
-fn formula(model: &Model, belief: &Array3<f64>) -> Array3<f64> {
-    let (n_states, height, width) = belief.dim();
-    let (.., kernel_height, kernel_width) = model.kernel().dim();
-    let mut out = Array3::from_shape_fn((n_states, height, width), |(to, row, col)| {
-        let mut weight = model.bias()[to];
-        for from in 0..n_states {
-            for (a, c) in ndarray::indices((kernel_height, kernel_width)) {
-                let (i, j) = (row + a, col + c);
-                let (up, left) = (kernel_height / 2, kernel_width / 2);
-                let belief = if (up..height + up).contains(&i) && (left..width + left).contains(&j)
-                {
-                    belief[[from, i - up, j - left]]
-                } else {
-                    f64::from(u8::from(model.edge() == Some(from)))
-                };
-                weight += model.kernel()[[to, from, a, c]] * belief;
-            }
-        }
-        weight
-    });
-    let sums = out.sum_axis(Axis(0));
-    out /= &sums;
+/// `Phi` of a belief, by an operator that has been applied to another before.
+fn predicted<T: NdFloat>(model: &Model, belief: &Array3<T>) -> Array3<T> {
+    let (_, height, width) = belief.dim();
+    let mut out = Array3::ones(belief.dim());
+    let mut transition = Transition::new(model, shape(height, width)).expect("test model");
+    let mut other = Array3::zeros(belief.dim());
+    other.index_axis_mut(Axis(0), 0).fill(T::one());
+    transition.apply(&other, &mut out);
+    transition.apply(belief, &mut out);
     out
+}
+
+fn assert_close(got: &Array3<f64>, expected: &Array3<f64>, bound: f64) {
+    let differences = got - expected;
+    assert!(differences.iter().all(|it| it.abs() < bound));
 }
 
 proptest! {
@@ -36,28 +29,41 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]
-    fn apply_equals_the_formula_and_keeps_beliefs_on_the_simplex(
+    fn predictions_are_those_of_the_formula(
         key in 0_u64..1_000_000,
         n_states in 2_usize..7,
         half_kernel in (0_usize..4, 0_usize..4),
-        side in (1_usize..20, 1_usize..40),
+        n_zones in prop_oneof![Just(0), 1_u64..6],
+        (sees_own, has_edge) in any::<(bool, bool)>(),
+        side in (1_usize..12, 1_usize..70),
     ) {
         let kernel_size = [2 * half_kernel.0 + 1, 2 * half_kernel.1 + 1];
-        let model = random_model(key, n_states, kernel_size);
-        let model = if key.is_multiple_of(2) { with_edge(&model, key) } else { model };
+        let random = if sees_own { random_own_model } else { random_model };
+        let of_zone = |zone| random(key + 1000 * zone, n_states, kernel_size);
+        let models: Vec<Model> = (0..n_zones.max(1)).map(of_zone).collect();
+        let land = if n_zones == 0 { models[0].clone() } else { random_land(key, &models, side) };
+        let model = if has_edge { with_edge(&land, key) } else { land };
         let belief = random_belief(key, n_states, side);
-        check_predictions(&model, &belief, &formula(&model, &belief));
+        let expected = formula(&model, &belief);
+        assert_close(&predicted(&model, &belief), &expected, 1e-12);
+        let single = predicted(&model, &belief.mapv(|p| p as f32));
+        prop_assert!(single.iter().all(|&p| (0.0..=1.0 + 1e-6).contains(&p)));
+        let mut sums = single.sum_axis(Axis(0)).into_iter();
+        prop_assert!(sums.all(|sum| (sum - 1.0).abs() < 1e-6));
+        assert_close(&single.mapv(f64::from), &expected, 2e-6);
     }
 }
 
 #[test]
-fn apply_leaves_nothing_of_the_belief_before() {
-    let beliefs = [1, 2].map(|key| random_belief(key, 3, (3, 17)));
-    let mut used = Transition::new(&Model::wildfire(), shape(3, 17)).expect("wildfire");
-    let mut fresh = used.clone();
-    let [mut after_another, mut alone] = [Array3::zeros((3, 3, 17)), Array3::zeros((3, 3, 17))];
-    used.apply(&beliefs[0], &mut after_another);
-    used.apply(&beliefs[1], &mut after_another);
-    fresh.apply(&beliefs[1], &mut alone);
-    assert_eq!(after_another, alone);
+fn a_prediction_is_that_of_the_python_filter() {
+    let json: serde_json::Value =
+        serde_json::from_str(include_str!("../data/own_state.json")).expect("JSON");
+    let array = |key: &str| {
+        let numbers = serde_json::from_value::<Vec<Vec<Vec<f64>>>>(json[key].clone());
+        let numbers = numbers.expect("numbers").concat().concat();
+        Array3::from_shape_vec((3, 4, 5), numbers).expect("3 x 4 x 5 numbers")
+    };
+    let model = Model::built_in("wildfire-burnout").expect("built in");
+    let (belief, expected) = (array("belief"), array("prediction"));
+    assert_close(&predicted(&model, &belief), &expected, 1e-12);
 }
