@@ -9,10 +9,8 @@ mod messages;
 mod requests;
 mod worlds;
 
+use messages::Seed;
 use std::path::{Path, PathBuf};
-
-/// A file of a corpus: name and bytes.
-pub type Seed = (&'static str, Vec<u8>);
 
 /// A decoder under attack.
 #[derive(Debug, Clone, Copy)]

@@ -1,6 +1,6 @@
 //! What the programs read from files: models, checkpoints.
 
-use super::Seed;
+use super::messages::Seed;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_learning::beliefs::LEARNED;

@@ -1,6 +1,5 @@
 //! What a client, an observer or a learner reads: answers, frames, replies.
 
-use super::Seed;
 use bytemuck::{Pod, bytes_of};
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
 use emberwatch_protocol::control::{Reply, parse};
@@ -16,6 +15,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::collections::HashSet;
 use std::fmt::Debug;
+
+/// A file of a corpus: name and bytes.
+pub type Seed = (&'static str, Vec<u8>);
 
 /// Observations of the model that frames are of.
 const N_OBSERVATIONS: usize = 3;

@@ -1,11 +1,10 @@
 //! What the server reads: requests of attackers.
 
-use super::Seed;
 use super::besieged::{
     ATTACKERS, N_MOVES, N_ROBOTS, N_THEIRS, N_WORLDS, SHARED, Siege, WorldSeen, check_answer,
     on_siege, step_request,
 };
-use super::messages::{split_header, survives};
+use super::messages::{Seed, split_header, survives};
 use crate::wire::step_body;
 use bytemuck::bytes_of;
 use emberwatch_protocol::control::{Reply, Request, parse};

@@ -1,6 +1,6 @@
 //! Files of worlds: snapshots, recordings and recorded states.
 
-use super::Seed;
+use super::messages::Seed;
 use crate::harness::recorded_info;
 use emberwatch_protocol::Move;
 use emberwatch_protocol::message::{FrameHeader, RobotResult, VERSION};

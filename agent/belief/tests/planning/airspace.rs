@@ -101,7 +101,9 @@ proptest! {
             let plan = planner.plan(&problem);
             let flown = score(objective, &field, &air, &[&plan.moves]);
             prop_assert!((plan.score - flown).abs() < 1e-4, "{} {flown}", plan.score);
-            prop_assert!(!is_exact || (plan.score - best).abs() < 1e-4, "{} {best}", plan.score);
+            // With revisits, paths to the same cells are worth different sums, of which beam search keeps one.
+            let is_best = (plan.score - best).abs() < 1e-4;
+            prop_assert!(!is_exact || revisits || is_best, "{} {best}", plan.score);
             prop_assert!(avoids(&air, start, &plan.moves));
         }
         // Teammates gain nothing from what another sees or visits.

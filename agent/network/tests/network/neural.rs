@@ -201,14 +201,14 @@ fn worlds_are_predicted_together_as_each_alone() {
 fn it_learns_alone_and_corrects_the_distributions_of_another() {
     let base = base();
     for (lessons, base, at_first, n_updates) in [
-        (lessons(40), None, Some(3_f64.ln()), 120),
-        (with_bases(lessons(40)), Some(&base), None, 80),
+        (lessons(60), None, Some(3_f64.ln()), 150),
+        (with_bases(lessons(60)), Some(&base), None, 100),
     ] {
         let mut network = neural();
-        let last = &lessons[30..];
+        let last = &lessons[50..];
         let loss = |network: &NeuralBelief| numbers(&network.loss(last).expect("a loss"))[0];
         let belief = |network: &NeuralBelief| {
-            let belief = network.predict(&lessons[30].before, base);
+            let belief = network.predict(&lessons[50].before, base);
             belief.expect("a belief")
         };
         let seen = || last.iter().flat_map(|lesson| &lesson.frame);
@@ -222,7 +222,7 @@ fn it_learns_alone_and_corrects_the_distributions_of_another() {
             assert!(differences.fold(0.0, |worst: f32, d| worst.max(*d)) < 1e-5);
         }
         for update in 0..n_updates {
-            let batch = &lessons[update % 20..][..10];
+            let batch = &lessons[update % 40..][..10];
             network.update(5e-3, batch).expect("finite");
         }
         // Half of the cells always show 1, the others one of two values: ln 2 / 2 if nothing else is known.
