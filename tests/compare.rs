@@ -49,7 +49,7 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     for (name, words) in [
         ("ladder.svg", ">beam exploit"),
         ("rewards.svg", ">beam exploit"),
-        ("snapshot.svg", ">beam exploit"),
+        ("snapshot.svg", ">wildfire, step k"),
         ("agent.toml", "beam_width = 4"),
     ] {
         let text = folder.text(&format!("figures/{name}"));
