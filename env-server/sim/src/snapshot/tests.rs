@@ -113,7 +113,9 @@ macro_rules! changes {
     };
 }
 
-const MISFITS: &[(fn(&mut SavedWorld), &str)] = changes! { world:
+type Change = fn(&mut SavedWorld);
+
+const MISFITS: &[(Change, &str)] = changes! { world:
     { world.states[3] = 3; } "states: expected states below 3, got 3"
     { world.first_states.truncate(14); } "first states: expected 15, got 14"
     { world.robots[0].frame[0] = 3; } "expected an observation below 3 or 255"
