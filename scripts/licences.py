@@ -33,7 +33,7 @@ def allowed(expression: str) -> bool:
 command = ["cargo", "metadata", "--locked", "--all-features", "--format-version", "1"]
 packages = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)["packages"]
 wrong = [
-    f"{package['name']} {package['version']}: expected a licence of {__file__} and crates.io, "
+    f"{package['name']} {package['version']}: expected crates.io and a licence that scripts/licences.py allows, "
     f"got {package['license']!r} from {package['source']}"
     for package in packages
     if not allowed(package["license"] or "none") or package["source"] not in (SOURCE, None)

@@ -39,7 +39,7 @@ fn a_killed_agents_world_is_free_and_unchanged() {
         frames.extend(frames_until(&observer, 0, at + 4));
         server.program.stop();
         agent.kill();
-        // The first request that the server finds when it goes on.
+        // The first request that the server finds when it resumes.
         let text = serde_json::to_vec(&acquire_request(0..1)).expect("requests serialise");
         let pending = next.send_control(control_header(1), &text).expect("send");
         server.program.signal(Signal::CONT);

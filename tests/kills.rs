@@ -17,7 +17,7 @@ use tests::meter::all_under;
 /// A small server that is ready at once.
 const FLAGS: &str = "--burn-in 0 --height 8 --width 8 --moves 4";
 
-/// Kills so many programs; returns the instances, all of processes that have ended, and the ids of these.
+/// Kills programs; returns their instances and process ids. All of these processes have ended.
 fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, HashSet<u32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();

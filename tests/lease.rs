@@ -41,7 +41,7 @@ fn a_takeover_ends_the_lease_and_keeps_the_world() {
     next.release().expect("release");
     check(former.step(0..1, &path), Status::LeaseLost, us);
     check(former.release(), Status::LeaseLost, us);
-    // A renewal tells of the robots that are still held.
+    // The answer to a renewal lists the robots that are still held.
     let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
         panic!("expected a lease");
     };

@@ -20,7 +20,7 @@ use tests::wire::{RawClient, Wire, control_header};
 
 const N_MOVES: usize = 6;
 
-/// The next few observations of a client's worlds, on paths of its own.
+/// The next few observations of a client's worlds, on random paths.
 fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
     let (mut paths, robots) = (Paths::new(seed), client.robots());
     let mut step = || {
@@ -97,7 +97,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
     let at = |robot: u32| server.observe(robot);
     assert_eq!(at(0), at(1));
-    // A fork has the future of its world, and a life of its own.
+    // A fork has the same future as its world, and is independent of it.
     server.command("fork 1 2").check(0);
     refused(&server, "fork 7 2", "no such world");
     assert_eq!(at(2), at(1));

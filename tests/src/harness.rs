@@ -260,7 +260,7 @@ pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
     client.step(robots, &[path]).expect("step").remove(0)
 }
 
-/// Flies so many random paths with a client's only robot.
+/// Flies random paths, one a step, with a client's only robot.
 pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation> {
     let paths = Paths::new(seed)
         .take(client.info().n_moves, n_steps)

@@ -15,7 +15,7 @@ pub struct Heat {
     pub png: Vec<u8>,
 }
 
-/// Draws probabilities, light for 0, dark for 1.
+/// Draws probabilities of shape `[H, W]`, light for 0 and NaN, dark for 1. The picture's height and width are in pixels.
 ///
 /// # Errors
 ///

@@ -24,7 +24,7 @@ _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 def write_recording(file: Path, n_robots: int, n_steps: int, nanos: int = 0) -> None:
     """Writes steps of robots that begin seven rows and ten columns apart, round the grid.
 
-    Frames come so many nanoseconds after what tells of the server.
+    Frames are published this many nanoseconds after the description of the server.
     """
     cells = np.array([(4 + 7 * robot, 5 + 10 * robot) for robot in range(n_robots)])
     cells %= (HEIGHT, WIDTH)

@@ -73,7 +73,7 @@ def same_arrivals(f: Path) -> list[tuple[object, ...]]:
         (netcdf(f / "hours.nc", at=with_never(NEVER, 1 / 60), unit="hours"),),
         (f / "fire.npy", *minutes),
         (changed(scaled, scales=[5.0], offsets=[-10.0]), *minutes),
-        # The first step is that of the earliest arrival.
+        # The first step is the earliest arrival's.
         (geotiff(f / "later.tif", with_never(NEVER) + 1234 * (ARRIVAL != NEVER)), *minutes),
         (geotiff(f / "none.tif", nodata=None), *minutes, "--nodata", -1, "--nodata", NEVER),
     ]

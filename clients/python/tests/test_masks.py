@@ -62,7 +62,7 @@ def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
         env = wrap(make(MOVES, **world))
         assert is_mask(env.reset(seed=1000)[1]["action_mask"])
         assert is_mask(env.get_wrapper_attr("action_masks")())
-    # A mask in the observation is that of the info.
+    # The observation and the info hold the same mask.
     with no_warnings():
         env = make(MOVES, observation=("robot", "action_mask"), **world)
         assert env.observation_space["action_mask"] == gymnasium.spaces.Box(0, 1, (4,), np.int8)

@@ -17,7 +17,7 @@ from processes import at_once, script, server
 
 import emberwatch
 
-#: Forks while a thread opens connections and steps; each child flies a robot of its own.
+#: Forks while a thread opens connections and steps; each child flies another robot.
 FORKS = """
 import os, sys, threading, time
 from emberwatch.client.client import connect

@@ -104,7 +104,7 @@ pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     layout.fields.iter().flat_map(of_field).collect()
 }
 
-/// The bytes of a worked example, after comparing those of each number with the value beside it.
+/// The bytes of a worked example. Compares each number's bytes with the value written next to them.
 pub fn worked_example(name: &str) -> Vec<u8> {
     let mut blocks = fences("hex").into_iter();
     let (_, text) = blocks.find(|(title, _)| title.trim() == name).expect(name);

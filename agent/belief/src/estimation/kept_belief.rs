@@ -204,7 +204,7 @@ mod tests {
             .write(&belief)
             .expect_err("a folder in its place");
         let left = std::fs::read_dir(folder.path().join("new"));
-        assert_eq!(left.expect("listed").count(), 1, "nothing beside it");
+        assert_eq!(left.expect("listed").count(), 1, "the folder alone");
     }
 
     #[test]

@@ -101,7 +101,7 @@ proptest! {
             let plan = planner.plan(&problem);
             let flown = score(objective, &field, &air, &[&plan.moves]);
             prop_assert!((plan.score - flown).abs() < 1e-4, "{} {flown}", plan.score);
-            // With revisits, paths to the same cells are worth different sums, of which beam search keeps one.
+            // With revisits, two paths over the same cells can have different scores; beam search keeps only one of them.
             let is_best = (plan.score - best).abs() < 1e-4;
             prop_assert!(!is_exact || revisits || is_best, "{} {best}", plan.score);
             prop_assert!(avoids(&air, start, &plan.moves));

@@ -1,4 +1,4 @@
-//! What no model can be is refused, each entry by its name; what fits is accepted as it is written.
+//! Invalid entries of a model file are refused by name; valid ones are kept as they are written.
 
 use super::models::{checked, shape};
 use emberwatch_model::{KernelEntry, Model, ModelError, StateEntry, ZoneEntry};
