@@ -14,7 +14,7 @@ STATES = ("flew", "hovered", "late")
 #: Eight cells right and four down, and back.
 THERE, BACK = [3] * 8 + [1] * 4, [0] * 4 + [2] * 8
 
-#: Of each record of a recording (PROTOCOL.md).
+#: The header of a record, without its checksum (PROTOCOL.md).
 _RECORD = struct.Struct("=QIII")
 _FRAME = struct.Struct("=IIQIIIIQQQdQQIIIHH")
 _ROBOT = struct.Struct("=ddIIIIIIII")
@@ -24,7 +24,7 @@ _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 def write_recording(file: Path, n_robots: int, n_steps: int, nanos: int = 0) -> None:
     """Writes steps of robots that begin seven rows and ten columns apart, round the grid.
 
-    Frames are published this many nanoseconds after the description of the server.
+    Frames have the time `nanos`, in nanoseconds after the server's record.
     """
     cells = np.array([(4 + 7 * robot, 5 + 10 * robot) for robot in range(n_robots)])
     cells %= (HEIGHT, WIDTH)

@@ -4,9 +4,10 @@ import tomllib
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from conftest import ROOT
-from emberwatch import TruthReader
+from emberwatch import Observer, TruthReader
 from running import PATIENCE, eventually
 
 STEPS = 30
@@ -63,15 +64,20 @@ def test_panels_show_what_was_published(programs, open_page):
     server = programs.server(model=model, publish_truth=True, **world)
     look = open_page(programs.dashboard(server.instance))
     look.eventually(lambda: look.text("state") == "serving", "serving")
-    with TruthReader(server.instance) as truths:
+    with TruthReader(server.instance) as truths, Observer(server.instance) as frames:
         programs.agent(server.instance, steps=STEPS)
         while (truth := truths.receive(PATIENCE)).step < STEPS:
+            pass
+        while (frame := frames.receive(PATIENCE)).result.step < STEPS:
             pass
     look.eventually(
         lambda: look.picture(".shown.step") == STEPS and look.has("belief", "truth"),
         f"step {STEPS} with its belief",
     )
     assert (look.array("truth") == truth.states.ravel()).all()
+    result = frame.robots[0].result
+    assert look.picture(".shown.robots")[0]["cell"] == [result.row, result.col]
+    assert (look.array("frame") == frame.frame.ravel()).all()
     assert look.number("step") == STEPS
     check_marks(look)
     unseen = UNSEEN | {"light": "484848"}  # apart from its states' colours
@@ -129,3 +135,24 @@ def check_panels(look, theme, states, observations, unseen) -> None:
         check_pixels(look, f"panel-belief-{state}", ramp(BELIEF[theme], levels))
     entropy = look.array("entropy").reshape(grid)
     check_pixels(look, "panel-entropy", ramp(ENTROPY[theme], entropy))
+
+
+@pytest.mark.parametrize("stops", [*BELIEF.values(), *ENTROPY.values()])
+def test_ramps_are_perceptually_even(stops):
+    lightness = [oklab_lightness(rgb(stop) / 255) for stop in stops.split()]
+    steps = np.diff(lightness)
+    # Stops are rounded to bytes and kept within the screen's gamut.
+    assert np.abs(steps - steps.mean()).max() < 0.1 * abs(steps.mean())
+
+
+def oklab_lightness(color: np.ndarray) -> float:
+    """L of OKLab, of an sRGB colour."""
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    cones = np.array(
+        [
+            [0.4122214708, 0.5363325363, 0.0514459929],
+            [0.2119034982, 0.6806995451, 0.1073969566],
+            [0.0883024619, 0.2817188376, 0.6299787005],
+        ]
+    )
+    return float(np.array([0.2104542553, 0.7936177850, -0.0040720468]) @ np.cbrt(cones @ linear))

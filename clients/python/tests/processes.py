@@ -247,7 +247,8 @@ def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo
     """Interrupts what the main thread does in this context, once `wait` has returned."""
 
     def interrupt() -> None:
-        wait()
+        # Otherwise there is no Ctrl-C, and the main thread's own timeout fails the test.
+        assert wait() is not False
         os.kill(os.getpid(), signal.SIGINT)
 
     thread = threading.Thread(target=interrupt)

@@ -287,3 +287,6 @@ def test_a_start_in_a_pocket_is_warned_of(tmp_path: Path) -> None:
         assert env.reset(seed=1)[0]["robot"].tolist() == [4, 4]
         make(**pocket, start="centre").reset(seed=1)
     assert not [each for each in found if "start" in str(each.message)], "once, when it is made"
+    env = make(**pocket, start="random")
+    starts = {tuple(env.reset(seed=seed)[0]["robot"].tolist()) for seed in range(200)}
+    assert len(starts) > 50 and not starts & {(4, 4), (4, 5)}

@@ -76,14 +76,14 @@ def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
     for change in CHANGED:
         token = SHAPE.set((4,) if "env" in change else ())
         first, (rows, said) = rows, go(file, **change)
+        _, again = go(file, **change)
         SHAPE.reset(token)
+        assert f"mine: 3 rows kept in {file}, not run again. What a policy reads" in again, change
         assert f"mine: 3 rows already in {file} run again: of another policy or other set" in said
         for one, other in zip(rows, first, strict=True):
             assert one.policy_fingerprint != other.policy_fingerprint, change
             assert one.worlds_fingerprint == other.worlds_fingerprint, change
         assert read(file) == rows
-    _, said = go(file, **change)
-    assert f"mine: 3 rows kept in {file}, not run again. What a policy reads from else" in said
     file.unlink()
     rows, _ = go(file)
     again, said = go(file, env=MOVES, start="corner", sensor_radius=0, batch=2)

@@ -93,7 +93,7 @@ WRONG_ACTIONS = [
     (np.full(6, 2**64 - 1, np.uint64), f"got {2**64 - 1}"),
 ]
 
-#: The same of two robots.
+#: Wrong actions for a lease on two robots.
 WRONG_PAIRS = [
     (np.zeros(6, int), r"expected shape \(2, 6\), got \(6,\)"),
     (np.zeros((3, 6), int), r"expected shape \(2, 6\), got \(3, 6\)"),

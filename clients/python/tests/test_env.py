@@ -224,7 +224,7 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     ),
 ]
 
-#: The same of `make_vec`.
+#: Keywords that `make_vec` refuses.
 IMPOSSIBLE_VECTORS: list[tuple[dict[str, Any], str]] = [
     *(({"n_worlds": it}, f"^num_envs: expected 1 to 1024, got {it}$") for it in (0, 1025)),
     ({"n_worlds": 5120, "robots": 5}, "^num_envs: expected 1 to 4096, got 5120$"),

@@ -217,7 +217,7 @@ def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -
     assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
-def test_a_recording_is_shown_as_far_as_it_goes(studio: Studio) -> None:
+def test_cut_changed_and_repeated_records_are_shown_once(studio: Studio) -> None:
     words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
     assert "warning" in words and "cut short" in words
     assert len(studio.millis()) == 2

@@ -239,6 +239,7 @@ CASES: list[tuple[str, Case]] = [
     (r"has its letters, such as LC_ALL=C.UTF-8, got '\udcff'", arrivals("--name", "\udcff")),
     ("a.tif: expected a GeoTIFF, got",
         lambda f: ((f / "a.tif").symlink_to("a.tif") or f, *ARRIVALS)),
+    ("a.tif: expected a GeoTIFF, got", lambda f: (text(f / "a.tif", "hello"), *ARRIVALS)),
     ("invalid choice: 'fire'", lambda f: (geotiff(f / "a.tif"), "--kind", "fire")),
     ("expected three different numbers, got a,b,c",
         lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "a,b,c")),

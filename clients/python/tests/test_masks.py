@@ -54,6 +54,11 @@ def test_a_lone_robot_s_mask_is_in_infos_and_samples(world: dict[str, Any]) -> N
         assert is_mask(info["action_mask"], expected)
 
 
+def test_a_robot_without_a_way_may_choose_any_move() -> None:
+    alone = make(MOVES, height=1, width=1, burn_in=0)
+    assert is_mask(alone.reset(seed=1000)[1]["action_mask"], [1, 1, 1, 1])
+
+
 def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
     for wrap in (
         lambda env: FrameStackObservation(env, 2),

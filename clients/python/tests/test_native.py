@@ -77,7 +77,14 @@ def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
     assert beliefs[0, 0, 0, 0] == 1 / 3
 
 
-def test_work_on_no_grid_is_refused() -> None:
+def test_a_lease_flies_no_robots_of_others() -> None:
+    lease = server(worlds=4).connect().acquire(1, 2)
+    for first, n in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
+        with refuses("step: expected robots of worlds 1..3"):
+            lease.native.step(np.zeros((n, 6), np.uint8), first, n, 0, 5.0)
+
+
+def test_numbers_out_of_range_are_refused() -> None:
     right = {"height": 2, "width": 2, "burn_in": 0}
     for wrong, words in (
         ({"height": 0}, "height: expected an integer within 1 to 4096, got 0"),

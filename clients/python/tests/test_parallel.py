@@ -175,8 +175,13 @@ def test_actions_of_other_agents_are_refused() -> None:
         env.step({"robot_0": 1, "robot_1": [1, 2]})
     with refuses("action: expected 0 to 3, got 4"):
         env.step({"robot_0": 1, "robot_1": 4})
-    drawn = [[env.action_space(it).sample() for _ in range(30)] for it in env.possible_agents]
-    assert drawn[0] != drawn[1], "each draws its own"
+
+
+def test_each_agent_draws_its_own_samples() -> None:
+    env = team(robots=2)
+    for space in (env.action_space, env.observation_space):
+        one, other = ([repr(space(it).sample()) for _ in range(30)] for it in env.possible_agents)
+        assert one != other
 
 
 def alone(instance: str, robot: int, **keywords: Any) -> Any:
@@ -218,7 +223,7 @@ def test_a_late_path_is_not_flown_and_told() -> None:
         # From there on it flies again.
         flown, _ = at_once(lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1]))
         assert flown[4]["n_missed"] == 0 and flown[4]["step"] == 4 and flown[4]["n_visited"] > 0
-        # Ages and beliefs go through the steps that are missed.
+        # Missed steps count in the ages.
         for _ in range(2):
             quick.step([1, 1, 1, 1])
         seen, *_, info = slow.step([3, 3, 3, 3])

@@ -105,7 +105,7 @@ def test_a_task_is_its_settings_by_hand(name: str) -> None:
                 env.close()
 
 
-def test_the_team_s_robots_fly_together() -> None:
+def test_the_team_task_passes_pettingzoo_and_refuses_one_robot() -> None:
     with no_warnings():
         env = emberwatch.parallel_env(task="team")
         assert len(env.possible_agents) == 4
@@ -154,6 +154,11 @@ def test_a_running_server_must_have_the_task() -> None:
 CHANGED = {
     "small": [
         ("moves = 16", "moves = 15", "moves of task 'own': expected 16, as the server"),
+        (
+            "max_steps",
+            "sensor_radius = 1\nmax_steps",
+            "sensor_radius of task 'own': expected 0, as",
+        ),
         ("burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected 3000, as"),
         ("max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected 300"),
         ("wildfire-small", "wildfire", "states of task 'own': expected those that the"),

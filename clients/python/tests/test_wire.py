@@ -89,10 +89,8 @@ def test_a_result_is_laid_out_as_documented() -> None:
     kinds = {"u16": "<u2", "u32": "<u4", "u64": "<u8", "f64": "<f8"}
     for name, (packed, dtype, kind) in RESULTS.items():
         layout = LAYOUTS[name]
-        assert (packed.format, packed.size, dtype.itemsize) == (
-            *(layout.format, layout.size),
-            layout.size,
-        )
+        assert packed.format == layout.format
+        assert packed.size == dtype.itemsize == layout.size
         fields = {field.name: (np.dtype(kinds[field.of]), field.offset) for field in layout.fields}
         assert dict(dtype.fields) == fields
         assert [*kind._fields] == list(fields)
