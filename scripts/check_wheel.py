@@ -1,6 +1,6 @@
-"""What a user does first with the installed package; `scripts/wheel` leaves no compiler in PATH.
+"""Tries the first steps of a user of the installed package. `scripts/wheel` removes compilers from PATH.
 
-Needs Pillow, for the Python of README.md, which it runs.
+Runs the Python code of README.md, which needs Pillow.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ PROGRAMS = ("emberwatch-server", "emberwatch-agent", "emberwatch-dashboard")
 
 
 def find(name: str) -> str:
-    """The path of an installed program."""
+    """Returns the path of an installed program."""
     return str(Path(sys.prefix, "bin", name))
 
 
 def output(*command: str) -> str:
-    """What a command prints, once it has succeeded."""
+    """Runs a command that must succeed. Returns its output."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, f"{command}: {done.stderr}"
     return done.stdout
 
 
 def check_place() -> None:
-    """No compiler, and the package is the installed one."""
+    """PATH has no compiler, and the imported package is the installed one."""
     for name in ("cargo", "rustc", "cc", "gcc", "clang"):
         assert shutil.which(name) is None, f"{name} is on the PATH"
     assert Path(emberwatch.__file__).is_relative_to(sys.prefix), emberwatch.__file__
 
 
 def check_versions() -> None:
-    """One version of package and programs."""
+    """Package and programs have the same version."""
     version = output(sys.executable, "-m", "emberwatch", "--version").split()[-1]
     for name in PROGRAMS:
         assert output(find(name), "--version").split() == [name, version]
 
 
 def check_readme() -> None:
-    """The Python of README.md draws a picture."""
+    """The Python code of README.md draws a picture."""
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert code is not None
     exec(code[1], {})
@@ -57,7 +57,7 @@ def check_readme() -> None:
 
 
 def check_vector() -> None:
-    """Many worlds, one message."""
+    """A vector environment steps many worlds."""
     envs = gymnasium.make_vec("emberwatch/WildfireMoves-v0", num_envs=8)
     envs.reset(seed=1000)
     for _ in range(64):

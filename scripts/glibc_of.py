@@ -1,4 +1,4 @@
-"""Prints the newest version of glibc that the files of a wheel ask for."""
+"""Prints the newest version of glibc that the files of a wheel require."""
 
 import re
 import sys

@@ -24,7 +24,7 @@ SOURCE = "registry+https://github.com/rust-lang/crates.io-index"
 
 
 def allowed(expression: str) -> bool:
-    """Whether an SPDX expression can be met; `/` is an older way to write OR."""
+    """Returns whether an SPDX expression can be met. `/` is an older way to write OR."""
     words = re.findall(r"[()]|AND|OR|[^\s()]+(?: WITH \S+)?", expression.replace("/", " OR "))
     operators = {"AND": "and", "OR": "or", "(": "(", ")": ")"}
     return bool(eval(" ".join(operators.get(word) or str(word in ALLOWED) for word in words)))

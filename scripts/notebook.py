@@ -1,7 +1,7 @@
-"""Runs a notebook's code, cell by cell: `notebook.py FILE` checks that it shows what the file says.
+"""Runs a notebook's code, cell by cell: `notebook.py FILE` compares the outputs with the outputs in the file.
 
-It must write the same words, whatever the numbers, and draw pictures of the same size. With
-`--write` the file gets what it shows now. The package must be installed, and Pillow.
+The code must write the same words, with any numbers, and draw pictures of the same size. `--write` stores the new
+outputs in the file. The package and Pillow must be installed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from PIL import Image
 
 
 def shown(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs a cell; what it prints, and the value of its last line, as a notebook keeps them."""
+    """Runs a cell. Returns its printed text and the value of its last line, as notebooks store them."""
     body = ast.parse(source).body
     last = body.pop() if body and isinstance(body[-1], ast.Expr) else None
     printed, value = io.StringIO(), None
@@ -38,7 +38,7 @@ def shown(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def data_of(value: Any) -> dict[str, Any]:
-    """A value as a notebook keeps it: a picture, or its words."""
+    """Returns a value as notebooks store it: as a picture, or as text."""
     if not isinstance(value, Image.Image):
         return {"text/plain": [repr(value)]}
     file = io.BytesIO()
@@ -48,7 +48,7 @@ def data_of(value: Any) -> dict[str, Any]:
 
 
 def words(outputs: list[dict[str, Any]]) -> str:
-    """What is compared: texts without their numbers, and the sizes of pictures."""
+    """Returns what is compared: texts without their numbers, and the sizes of pictures."""
     texts = list[str]()
     for output in outputs:
         data = output.get("data", {})
@@ -69,7 +69,7 @@ def main() -> None:
         if "--write" not in sys.argv and words(got) != words(cell["outputs"]):
             raise SystemExit(
                 f"{path.name}: expected {words(cell['outputs'])!r}, got {words(got)!r} from\n"
-                f"{source}\n(after a change on purpose: scripts/notebook.py {path} --write)"
+                f"{source}\n(after an intended change: scripts/notebook.py {path} --write)"
             )
         cell["outputs"] = got
     if "--write" in sys.argv:

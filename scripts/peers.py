@@ -1,8 +1,8 @@
-"""The peers that `scripts/bench` holds Emberwatch against, measured in the same run.
+"""The peers with which `scripts/bench` compares Emberwatch, measured in the same run.
 
-- Gymnasium's AsyncVectorEnv with shared memory, around a trivial environment with the same spaces
-  (4 KiB of observation, 64 integers of action): what a process boundary costs there.
-- The wildfire's transition, the known-model filter and shooting, written plainly in numpy.
+- Gymnasium's AsyncVectorEnv with shared memory, around a trivial environment with the same spaces (4 KiB of
+  observation, 64 integers of action): the cost of its process boundary.
+- The wildfire's transition, the known-model filter and the shooting planner, written in plain numpy.
 
 Prints medians with minimum and maximum over rounds. Needs gymnasium and numpy.
 """
@@ -55,7 +55,7 @@ def async_vector_env(n_envs, n_steps):
 
 
 def wildfire_kernel():
-    """w[to, from, row, col], as config/models/wildfire.toml."""
+    """Returns w[to, from, row, col], as in config/models/wildfire.toml."""
     around = np.full((3, 3), 0.1)
     around[1, 1] = 1.0
     drift = around * np.array([[1.2], [1.0], [0.8]])
@@ -68,7 +68,7 @@ def wildfire_kernel():
 
 
 def phi(kernel, belief):
-    """Paper eqs. 2 to 4 on probabilities of shape [S, H, W]."""
+    """Applies eqs. 2 to 4 of the paper to probabilities of shape [S, H, W]."""
     _, height, width = belief.shape
     padded = np.pad(belief, ((0, 0), (1, 1), (1, 1)))
     total = np.zeros_like(belief)

@@ -1,13 +1,12 @@
 """PyTorch on the same CPU: the peer of `agent/network/benches/network.rs`, measured in the same run.
 
-The dynamic autoencoder from the layer table of REPRODUCTION.md and a DQN, with torch's own layers:
-hidden 16, windows of 1,000 frames of 64 x 64 cells; and the network of the neural belief, whose
-updates are of 16 grids. Two threads; single inputs and the neural belief with one as well.
-Everything is measured twice: with glibc's allocator as it is, and with one that keeps its memory
-and uses huge pages.
+Measures three networks with torch's own layers: the dynamic autoencoder of REPRODUCTION.md's layer table (hidden size
+16, windows of 1,000 frames of 64 x 64 cells), a DQN, and the neural belief's network (updates on 16 grids). Uses two
+threads; single inputs and the neural belief are also measured with one. Everything is measured twice: with glibc's
+default allocator, and with an allocator that keeps its memory and uses huge pages.
 
-Prints medians with minimum and maximum over rounds, and the mean processor time, which says more
-on a busy machine. Needs torch. Words on the command line choose what is measured.
+Prints medians with minimum and maximum over rounds, and the mean processor time, which is more reliable on a busy
+machine. Needs torch. Arguments select the measurements whose names contain one of them.
 """
 
 import os
@@ -26,7 +25,7 @@ N_VISITED = 33
 N_THREADS = 2
 DQN_INPUTS, DQN_ACTIONS, DQN_BATCH, DQN_REPLAY = 16, 4, 64, 1000
 
-# glibc reads these at start, so each setting is a process of its own.
+# glibc reads these at start, so each setting runs in its own process.
 AS_IS = {}
 TUNED = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
@@ -42,7 +41,7 @@ def conv(before, after, stride=1, dilation=1):
 
 
 class UNet(nn.Module):
-    """Features of cells to the logits of what will be seen there."""
+    """Maps features of cells to the logits of the next observations there."""
 
     def __init__(self):
         super().__init__()
@@ -73,7 +72,7 @@ class UNet(nn.Module):
 
 
 class Autoencoder(nn.Module):
-    """Frames to predictors of the next: encoder, recurrence, decoder, observation matrix."""
+    """Maps frames to predictors of the next frames: encoder, recurrence, decoder, observation matrix."""
 
     def __init__(self):
         super().__init__()
@@ -95,17 +94,17 @@ class Autoencoder(nn.Module):
         self.observation = nn.Parameter(torch.randn(N_STATES, N_STATES))
 
     def forward(self, frames, hidden):
-        """Predictors after each of some consecutive frames, and the last hidden vector."""
+        """Returns the predictor after each of consecutive frames, and the last hidden vector."""
         track, hidden = self.recurrence(self.encoder(frames), hidden)
         return self.decoder(track[..., None, None]), hidden
 
     def observed(self, predictors):
-        """Predicted observations at each cell."""
+        """Returns the predicted observation probabilities of each cell."""
         return torch.einsum("os,tshw->tohw", self.observation.softmax(0), predictors)
 
 
 def frames(share):
-    """One-hot frames of which a share of the cells is visited, and where."""
+    """Returns one-hot frames in which a share of the cells is visited, and the mask of visited cells."""
     values = torch.randint(N_STATES, (N_FRAMES, SIDE, SIDE))
     visited = torch.rand(N_FRAMES, SIDE, SIDE) < share
     one_hot = functional.one_hot(values, N_STATES).permute(0, 3, 1, 2).float()
@@ -115,7 +114,7 @@ def frames(share):
 def autoencoder_update(share):
     network, (seen, visited) = Autoencoder(), frames(share)
     optimiser = torch.optim.Adam(network.parameters(), 1e-3, betas=(0.5, 0.9))
-    # The loss needs visited cells only, which is what a careful user of torch would write.
+    # Computes the loss only in visited cells, as a careful user of torch would.
     step, row, col = visited[1:].nonzero(as_tuple=True)
     goal = seen[1:][step, :, row, col]
 
@@ -215,7 +214,7 @@ def dqn_act():
 
 
 def report(what, make, rounds, inner=1, threads=N_THREADS):
-    """Times `rounds` rounds of `inner` calls each of what `make` makes."""
+    """Times the function that `make` returns, over `rounds` rounds of `inner` calls each."""
     words = [word for word in sys.argv[1:] if not word.startswith("--")]
     if words and not any(word in what for word in words):
         return

@@ -1,8 +1,8 @@
 """Draws the pictures of the environments' pages, docs/environments/*.png.
 
-The package must be installed, and Pillow.
+The package and Pillow must be installed.
 
-That of Wildfire is the one that the Python of README.md draws.
+The picture of Wildfire is the one that README.md's Python code draws.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ SHOWN: dict[str, Any] = {"truth": True, "render_mode": "rgb_array"}
 
 
 def save(name: str, picture: Any) -> None:
-    """Writes a picture of few colours."""
+    """Saves a picture with a reduced palette."""
     Image.fromarray(picture).quantize(64).save(FOLDER / f"{name}.png", optimize=True)
 
 
 def wildfire() -> None:
-    """What README.md draws."""
+    """Draws the picture of README.md."""
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
     assert code is not None
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
@@ -41,7 +41,7 @@ def wildfire() -> None:
 
 
 def moves() -> None:
-    """The last path, and part of the next."""
+    """Draws the last path, and part of the next path."""
     parts = ("belief", "robot")
     env = gymnasium.make("emberwatch/WildfireMoves-v0", observation=parts, **SMALL, **SHOWN)
     seen, _ = env.reset(seed=1000)
@@ -56,7 +56,7 @@ def moves() -> None:
 
 
 def objective() -> None:
-    """A path that the agent planned for fire."""
+    """Draws a path that the agent planned for fire."""
     env = gymnasium.make("emberwatch/WildfireObjective-v1", **SMALL, **SHOWN)
     env.reset(seed=1000)
     for _ in range(30):
@@ -66,7 +66,7 @@ def objective() -> None:
 
 
 def team() -> None:
-    """Four robots, each of which flies by what it knows itself."""
+    """Draws four robots, each of which plans on its own belief."""
     env = emberwatch.parallel_env(
         robots=4, action="path", observation=("belief", "robot"), start="random", **SMALL, **SHOWN
     )

@@ -1,4 +1,4 @@
-"""Searches the built documentation site, opened as files: `search_site.py FOLDER`.
+"""Tests the search of the built documentation site, opened from files: `search_site.py FOLDER`.
 
 Needs Chromium.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, TimeoutError, sync_playwright
 
-#: Pages to search from, words, and a page that must be found.
+#: A page to search from, the words, and a page that the search must find.
 SEARCHES = (
     ("index.html", "attaching and swapping", "attaching.html"),
     ("environments/wildfire.html", "autoreset", "environments/moves.html"),
@@ -22,11 +22,11 @@ SEARCHES = (
 
 
 def finds(page: Page, words: str, expected: str) -> bool:
-    """Whether the site's search lists a page."""
+    """Returns whether the site's search lists a page."""
     box = page.get_by_role("textbox", name="Search")
     link = page.locator(f".md-search-result__link[href*='{expected}']").first
     box.click()
-    # The page ignores what is typed before its index is there.
+    # The page ignores input before it has loaded its index.
     for _ in range(15):
         box.fill("")
         box.press_sequentially(words, delay=50)

@@ -1,7 +1,7 @@
-"""Puts the pages of the documentation site into a folder: `site.py FOLDER`.
+"""Writes the pages of the documentation site to a folder: `site.py FOLDER`.
 
-They are `docs` and the repository's other documents as they are, so that nothing is written twice:
-only links become links of the site, and a notebook becomes a page.
+The pages are `docs` and the repository's other documents, so that nothing is written twice. Links are rewritten for the
+site, and a notebook becomes a page.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ OUTSIDE = {
     "config/landscapes/jacksboro/README.md": "jacksboro.md",
 }
 
-#: An index for readers of the repository; the site has its navigation.
+#: An index for readers of the repository, which the site's navigation replaces.
 LEFT_OUT = {"docs/README.md"}
 
-#: A paragraph of the first page for readers of the repository.
+#: A paragraph of the first page that is only for readers of the repository.
 OF_REPOSITORY = re.compile(r"^All documents: .*?\n\n", re.MULTILINE | re.DOTALL)
 
-#: The home page has no list of pages at its side.
+#: Hides the list of pages at the side of the home page.
 HOME = "---\nhide: [navigation]\n---\n\n"
 
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
-#: What follows the language of a fence means something to tests alone.
+#: The language of a fence, and words after it, which are only for tests.
 INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
-#: A number's error or interval, which stays on its line.
+#: The space before a number's error or interval, at which lines must not break.
 SPREAD = re.compile(r"(?<=\d)( ± (?=\d)| \[-?[\d.]+, -?[\d.]+\])")
 
 
 def pages() -> dict[str, str]:
-    """Each file that the site has, by its place in the repository: its place on the site."""
+    """Returns the path on the site of each file, by its path in the repository."""
     found = dict(OUTSIDE)
     for path in sorted((ROOT / "docs").rglob("*")):
         source = path.relative_to(ROOT).as_posix()
@@ -61,7 +61,7 @@ def pages() -> dict[str, str]:
 
 
 def linked(text: str, source: str, found: dict[str, str]) -> str:
-    """A document with links of the site; a link to what the site lacks stays as its words."""
+    """Rewrites a document's links for the site. A link to a file outside the site becomes plain text."""
     here, n_pictures = posixpath.dirname(found[source]) or ".", 0
 
     def link(match: re.Match[str]) -> str:
@@ -70,10 +70,10 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         n_pictures += bool(mark)
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         if path in found:
-            # All pictures but the first are loaded when they come into sight.
+            # All pictures but the first are loaded when they scroll into view.
             later = "{loading=lazy}" if mark and n_pictures > 1 else ""
             shown = f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
-            # A picture opens alone, as large as it is: on a phone its words are small.
+            # A click opens a picture at full size, because its text is small on a phone.
             return f"[{shown}]({posixpath.relpath(found[path], here)})" if mark else shown
         if (ROOT / path).exists():
             return words
@@ -97,7 +97,7 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
 
 
 def page_of(notebook: dict[str, Any], name: str) -> str:
-    """A notebook as Markdown: texts, code, and below it what it wrote and drew."""
+    """Converts a notebook to Markdown: texts, code, and the code's outputs below it."""
     parts = list[str]()
     for cell in notebook["cells"]:
         text = "".join(cell["source"])
@@ -107,7 +107,7 @@ def page_of(notebook: dict[str, Any], name: str) -> str:
 
 
 def shown(output: dict[str, Any]) -> str:
-    """What a cell wrote or drew."""
+    """Converts a cell's output to HTML."""
     result = output.get("data", {"text/plain": output.get("text", "")})
     if "image/png" in result:
         picture = "".join(result["image/png"]).replace("\n", "")

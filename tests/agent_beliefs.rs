@@ -1,4 +1,4 @@
-//! What agents show of their beliefs, to readers of their channel.
+//! The beliefs that agents publish to readers of their channel.
 
 use crate::trainings::on;
 use emberwatch_protocol::agent_belief::AgentBelief;
@@ -18,7 +18,7 @@ fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief
     Some(shown)
 }
 
-/// Reads until beliefs about all these worlds have come.
+/// Reads until a belief about each of these worlds has arrived.
 fn until_all(observer: &Observer<AgentHeader>, worlds: std::ops::Range<u32>) -> Vec<AgentBelief> {
     let (mut all, start) = (Vec::<AgentBelief>::new(), Instant::now());
     let mut missing: BTreeSet<u32> = worlds.collect();
@@ -62,7 +62,7 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
         .last()
         .expect("an observer that was there before the agent meets it");
     assert_eq!(last.header.step, 500);
-    // The posterior is sure of what was seen on the last path: 98 of 100 fires look like one.
+    // The posterior is nearly certain of cells on the last path: a fire is observed as fire with probability 0.98.
     let surest = last.belief.iter().copied().fold(0.0, f32::max);
     assert!(surest > 0.9, "{surest}");
 }

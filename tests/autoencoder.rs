@@ -1,4 +1,4 @@
-//! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1, small.
+//! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1 on small worlds.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, on};
@@ -43,7 +43,7 @@ fn a_training_that_stopped_goes_on_as_if_it_had_not() {
         let parts = Server::start(&flags);
         let part = |steps: &str| format!("{} {steps}", on(&parts));
         place.learn("parts", &part("--steps 11"));
-        place.refuse("parts", &part("--steps 11"), "--out | expected --resume");
+        place.refuse("parts", &part("--steps 11"), "--out | add --resume");
         assert_eq!(whole, place.learn("parts", &part("--steps 13 --resume")));
         let [whole, parts] = ["whole", "parts"].map(|out| {
             let mut contents = place.contents(out);
@@ -112,10 +112,10 @@ fn a_checkpoint_keeps_hidden_vectors_goes_on_and_is_acted_on() {
     check(
         AGENT,
         &other,
-        "expected a network for 7 x 9 cells | got one for 6 x 9",
+        "expected a network for the world's grid, 7 x 9 | got one for 6 x 9",
     );
 
-    // Another world is begun again; what a kill leaves of the metrics goes: a row after the checkpoint, and half of one.
+    // A resume with another world starts a new episode, and drops rows newer than the checkpoint or cut short.
     let metrics = place.folder.text("out/metrics.csv");
     let last = metrics
         .lines()
@@ -147,7 +147,7 @@ fn episodes_that_end_are_begun_again() {
     let rows = place.learn("out", &format!("{} --steps 30", on(&server)));
     assert!(!rows[29][LOSS].is_empty() && !rows[29][DQN_LOSS].is_empty());
     assert_eq!(server.step_of(0), 30 % 7);
-    // An agent that stopped at an episode's end leaves a world that only a reset goes on from.
+    // After an agent that stopped at the end of an episode, the world needs a reset before its next step.
     let mut client = server.acquire(0..1);
     for _ in 30 % 7..7 {
         fly(&mut client, vec![Move::Up; 5]);
@@ -155,7 +155,7 @@ fn episodes_that_end_are_begun_again() {
     client.release().expect("released");
     place.learn("out", &format!("{} --steps 3 --resume", on(&server)));
     assert_eq!(server.step_of(0), 3);
-    // A window may be a whole episode.
+    // A window of frames may cover a whole episode.
     let server = Server::start(&format!("{WORLD} --coverage client --max-steps 3"));
     let rows = place.learn("whole", &format!("{} --steps 9", on(&server)));
     assert!(!rows[8][LOSS].is_empty());

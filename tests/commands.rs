@@ -1,14 +1,14 @@
-//! Wrong input to every command: an exit code, one line that says what was expected, no panic.
+//! Wrong input to every command leads to an exit code and one line of error, never to a panic.
 
 use emberwatch_learning::policy;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, Folder, Program, SERVER, SMALL, Server, new_instance, run};
 
-/// A comparison of a moment, on worlds of its own.
+/// Flags of a very short comparison on its own worlds.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
                     --policies coverage --baseline coverage";
 
-/// Flags, and the words of their refusal.
+/// Flags of the server, and words of their refusal.
 const WRONG_SERVER_FLAGS: &str = r#"
 --instance a/b => instance name | "a/b"
 --worlds 1025 => worlds: expected 1 to 1024, got 1025
@@ -34,18 +34,18 @@ status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
 "#;
 
-/// The same for the agent.
+/// Flags of the agent, and words of their refusal.
 const WRONG_AGENT_FLAGS: &str = r#"
 run --instance nobody --wait 0 => no server on instance "nobody"
-run --wait soon => --wait | expected seconds
+run --wait soon => --wait | expected a number of seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
-run --steps-per-second 0.5 => --steps-per-second | expected steps a second, 1 or more, got "0.5"
+run --steps-per-second 0.5 => --steps-per-second | expected 1 or more steps per second, got "0.5"
 run --robots 0..2 => --team
 run --team --robots 3..3 => --robots | FIRST below END
 run --team --share => --share | --team
 run --robot 1 --robots 0..2 --team => '--robot <ROBOT>' cannot be used with '--robots
-run --model no.toml => model file no.toml | No such file: expected one, or | wildfire, wildfire-burnout
+run --model no.toml => model file no.toml | No such file: expected a model file, or one of | wildfire, wildfire-burnout
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
 run --config no.toml => config file no.toml | No such file
 run --preset lab => --preset | default, paper
@@ -56,8 +56,8 @@ run --instance nobody --policy known/beam/ash --wait 0 => no server on instance 
 run --instance nobody --policy known/beam/ash --model wildfire => "known/beam/ash": goal: expected one of | fire, got "ash"
 prior => --model | --height | --width | --burn-in | --out
 prior --model ash --height 4 --width 4 --burn-in 1 --out o => model file ash: No such file
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out / => --out: expected a file, got /
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out /no/such/p.npy => --out: expected a file in a folder that can be written to
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out / => --out: expected the path of a regular file, got /
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out /no/such/p.npy => --out: expected a file in a writable folder
 prior --model wildfire --height 4 --width 4 --burn-in 1 --out /proc/p.npy => /proc/p.npy
 prior --model wildfire --height 0 --width 4 --burn-in 1 --out o => height and width in 1..=4096, got 0 x 4
 prior --model wildfire --height 4 --width 4 --burn-in 1 --out o --worlds 0 => --worlds | 1..=10000
@@ -75,10 +75,10 @@ compare --instance nobody --policies coverage,ash => policy: expected one of ran
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: write /: expected a regular file, got a folder
-compare TINY --figures /proc => create /proc: expected a folder that can be written to
+compare TINY --figures /proc => create /proc: expected a writable folder
 "#;
 
-/// Runs a program and checks that it refuses in one line that holds all these words, which ` | ` separates.
+/// Runs a program and checks that it refuses with one line that contains all words; ` | ` separates them.
 pub fn check(program: &str, arguments: &str, words: &str) {
     let Ended {
         code,
@@ -96,14 +96,14 @@ pub fn check(program: &str, arguments: &str, words: &str) {
     }
 }
 
-/// Runs a command of the agent that succeeds.
+/// Runs a command of the agent and checks that it succeeds.
 pub fn agent(arguments: &str) -> Ended {
     let ended = run(AGENT, arguments).check(0);
     assert!(!ended.stderr.contains("ERROR"), "{}", ended.stderr);
     ended
 }
 
-/// Checks every line `flags => words | words`; `TINY` stands for [`TINY`].
+/// Checks every line `flags => words | words` of a table, after replacing `TINY` by [`TINY`].
 pub fn check_table(program: &str, table: &str) {
     for line in table.trim().lines() {
         let (flags, words) = line.split_once(" => ").expect("flags and words");
@@ -131,9 +131,9 @@ run SERVER => does not reveal its model | --model FILE",
         ),
         (
             "--publish-truth",
-            "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, it has 1
+            "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, got 1
 compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
-run SERVER --robot 1 => robots: expected some of the world's 0..1, got 1..2
+run SERVER --robot 1 => robots: expected a part of the world's robots 0..1, got 1..2
 run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"
 run SERVER --policy clairvoyant_beam => only `compare` has them",
         ),
@@ -176,7 +176,7 @@ fn the_documented_prior_is_written() {
     let command = command
         .expect("the command")
         .replace("FILE", &folder.word("prior.npy"));
-    // Fewer and younger worlds than documented: it is the flags that are checked.
+    // Uses fewer worlds and a shorter burn-in than documented, because only the flags are checked.
     agent(&command.replace("--burn-in 10000", "--burn-in 10 --worlds 1"));
     assert!(folder.path("prior.npy").is_file());
 }
@@ -190,17 +190,17 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
         let instance = new_instance();
         let flags = format!("{command} --wait 60 --instance {}", instance.name());
         let agent = Program::start(AGENT, &flags);
-        agent.wait_for_words("waiting for it");
+        agent.wait_for_words("waiting up to");
         let _server = Server::start_on(&instance, &format!("{SMALL} --worlds 2 --publish-truth"));
         let ended = agent.ends(0);
         assert_eq!(
-            ended.stderr.matches("waiting for it").count(),
+            ended.stderr.matches("waiting up to").count(),
             1,
             "{command}"
         );
     }
     let agent = Program::agent(&new_instance(), "--wait 1e18");
-    agent.wait_for_words("waiting for it");
+    agent.wait_for_words("waiting up to");
     agent.finish();
 }
 
@@ -209,7 +209,7 @@ fn an_agent_acts_as_slowly_as_it_is_told() {
     let server = Server::start(SMALL);
     let start = Instant::now();
     Program::agent(&server.instance, "--steps 3 --steps-per-second 2").ends(0);
-    // Without pauses it takes a fraction of that.
+    // Without pauses, three steps take a fraction of a second.
     assert!(start.elapsed() >= Duration::from_secs(1), "two pauses");
 }
 

@@ -1,4 +1,4 @@
-//! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
+//! `emberwatch-agent compare` from end to end: comparisons repeat bit for bit, also with a second model.
 
 use crate::commands::{TINY, agent, check};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
@@ -9,16 +9,16 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 use tests::harness::{AGENT, Folder, Program, Server, repository};
 
-/// What is compared; the worlds come on top.
+/// The flags of a comparison, without the worlds.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
 
-/// The worlds, as flags of the private server.
+/// The worlds, as flags of the agent's private server.
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
-/// Worlds where something happens.
+/// Worlds with many fires.
 const LIVELY: &str = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
 
-/// The rows of a comparison, without the time that plans took.
+/// Returns the rows of a comparison, without the planning times.
 fn compare(flags: &str) -> Vec<PolicyRun> {
     let folder = Folder::default();
     agent(&format!("{WHAT} --csv {} {flags}", folder.word("out.csv")));
@@ -36,7 +36,7 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let [csv, figures] = ["new/out.csv", "figures"].map(|name| folder.word(name));
     let ended = agent(&format!("{WHAT} {WORLDS} --csv {csv} --figures {figures}"));
     let rows = read_runs(&folder.path("new/out.csv")).expect("rows");
-    // Fifteen policies of the wildfire's ladder, two seeds each.
+    // The default comparison of the wildfire has fifteen policies, with two seeds each.
     assert_eq!(rows.len(), 15 * 2, "{rows:?}");
     for pair in rows.as_chunks::<2>().0 {
         ended.check_prints(&pair[0].policy);
@@ -182,13 +182,13 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(server.step_of(0), 40);
     let figures = Folder::default();
     let rows = compare(&format!("{flags} --figures {}", figures.word("figures")));
-    // Sixteen policies: the ladder has one for each of three states beside the one that pays.
+    // Sixteen policies: the default comparison has one policy for each of the three states without a reward.
     assert_eq!(rows.len(), 16 * 2, "{rows:?}");
     assert!(figures.path("figures/snapshot.svg").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");
     Program::agent(&hidden.instance, &flags).ends(0);
-    // All its states last: the least seen in 160 looks was 1 % of 960 cells.
+    // All of the model's states persist: in 160 samples, the rarest state never covered less than 1 % of 960 cells.
     let model = Model::from_toml(include_str!("../config/models/road-ice.toml")).expect("a model");
     let dynamics = Dynamics::new(&model, Shape::new(24, 40).expect("a shape"));
     let source = Source::Simulated(dynamics.expect("it fits"));

@@ -1,4 +1,4 @@
-//! What every client may rely on: the handshake, echoes, and refusals that change nothing. One suite,
+//! Guarantees of the protocol for every client: the handshake, echoes, and refusals that change nothing. The suite runs
 //! through the Rust crate and through `wire_reference.py`.
 
 use crate::python::PythonWire;
@@ -16,13 +16,13 @@ use emberwatch_protocol::payload::split_step_payload;
 use tests::harness::{SMALL, Server};
 use tests::wire::{RawClient, Wire, control_header, observe_header, step_body, step_header};
 
-/// Moves of a path on a [`SMALL`] server.
+/// Number of moves in a path on a [`SMALL`] server.
 const N_MOVES: u32 = 6;
 
-/// Cells of a [`SMALL`] server.
+/// Number of cells of a world on a [`SMALL`] server.
 const N_CELLS: usize = 35;
 
-/// Whose bytes are sent.
+/// The implementation of the client.
 #[derive(Clone, Copy)]
 enum Client {
     Rust,
@@ -30,7 +30,7 @@ enum Client {
 }
 
 impl Client {
-    /// Opens both channels of an instance; what a test says next need not be a handshake.
+    /// Opens both channels of an instance without a handshake.
     fn open(self, instance: &Instance) -> Box<dyn RawClient> {
         match self {
             Self::Rust => Box::new(Wire::open(instance)),
@@ -39,7 +39,7 @@ impl Client {
     }
 }
 
-/// Makes a test of each fact and client.
+/// Generates a test for each fact and client.
 macro_rules! suite {
     ($($fact:ident),* $(,)?) => {
         mod rust {
@@ -70,7 +70,7 @@ suite! {
     a_client_that_shuts_the_server_down_is_answered,
 }
 
-/// Three worlds of two robots: five of these held by one client, the last by another.
+/// A server with three worlds of two robots. One client holds five robots, another client the last one.
 struct Table {
     server: Server,
     ours: Box<dyn RawClient>,
@@ -105,14 +105,14 @@ impl Table {
         }
     }
 
-    /// Everything that a refusal must not change: k, robots, holders, frames and results.
+    /// Returns everything that a refusal must not change: k, robots, holders, frames and results.
     fn everything(&self) -> (String, Vec<u8>) {
         let (reply, payload) = self.theirs.step(observe_header(0..6), &[]);
         assert_eq!(reply.status, Status::Ok as u32, "observing needs no lease");
         (format!("{:?}", self.server.status().worlds), payload)
     }
 
-    /// Sends a step of world 0 that is right but for a change, and checks that it is refused.
+    /// Applies a change to a correct step request for world 0, and checks that it is refused.
     fn check(&self, change: impl Fn(&mut StepRequest), status: Status, detail: u64) {
         self.check_body(change, &step_body(&[1], &[1; 12]), status, detail);
     }
@@ -256,7 +256,7 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(second, &one, Incomplete, 0);
     let both = step_body(&[1, 0], &[0; 18]);
     steps.check_body(|h| h.n_robots = 3, &both, Incomplete, 3);
-    // All of its own, of several worlds, where another client holds a robot of one.
+    // All robots that the client holds, in several worlds; in one of them another client holds a robot.
     let all = step_body(&[1, 0, 0], &[0; 30]);
     steps.check_body(|h| h.n_robots = 5, &all, Incomplete, 5);
     for (k, status) in [(0, Late), (2, Early), (u64::MAX, Early)] {
@@ -266,8 +266,8 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(|h| h.n_robots = 4, &second, Early, 0);
 }
 
-/// Requests, the status and detail of their refusal, and words of it. `OURS`, `THEIRS` and `ENDED`
-/// stand for leases, `US` and `THEM` for processes.
+/// Requests, the status and detail of their refusal, and words of its message. `OURS`, `THEIRS` and `ENDED` stand for
+/// leases, `US` and `THEM` for processes.
 const REFUSED: &str = r#"
  => Malformed 0 malformed control message
 { => Malformed 0 malformed control message
@@ -374,7 +374,7 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
 fn a_client_that_shuts_the_server_down_is_answered(client: Client) {
     let server = Server::start(SMALL);
     let wire = client.open(&server.instance);
-    // A server that ends takes its answers' memory along: the client must know it by then.
+    // The memory of answers disappears with the server. This request makes the client map it before the server ends.
     wire.ask(&Request::Status {});
     assert_eq!(wire.ask(&Request::Shutdown {}), Reply::Done);
     server.program.ends(0);

@@ -1,4 +1,4 @@
-//! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
+//! Agents that are killed or stopped in the middle of a step. Their world must not change.
 
 use emberwatch_protocol::channels::{ChannelError, Instance};
 use emberwatch_protocol::client::Claim;
@@ -20,7 +20,7 @@ use tests::wire::{
 /// A grid on which planning takes most of a step.
 const FLAGS: &str = "--height 12 --width 9 --moves 8 --burn-in 50";
 
-/// An agent that acts without end, some tens of milliseconds a step.
+/// Starts an agent that acts until it is stopped, with tens of milliseconds per step.
 fn start_agent(instance: &Instance, flags: &str) -> Program {
     let slow = "--policy coverage --shooting-samples 100000";
     Program::agent(instance, &format!("{slow} {flags}"))
@@ -33,13 +33,13 @@ fn a_killed_agents_world_is_free_and_unchanged() {
     let mut frames = frames_until(&observer, 0, 0);
     for _ in 0..3 {
         let next = Wire::open(&server.instance);
-        // No more steps than an observer is kept, however late it reads.
+        // No more steps than an observer's buffer holds, so that none is lost if it reads late.
         let agent = start_agent(&server.instance, "--steps 50");
         let at = frames[frames.len() - 1].header.result.step;
         frames.extend(frames_until(&observer, 0, at + 4));
         server.program.stop();
         agent.kill();
-        // The first request that the server finds when it resumes.
+        // This is the first request that the server finds when it resumes.
         let text = serde_json::to_vec(&acquire_request(0..1)).expect("requests serialise");
         let pending = next.send_control(control_header(1), &text).expect("send");
         server.program.signal(Signal::CONT);
@@ -86,7 +86,7 @@ fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
     let mut next = Client::acquire(server.connect(), &long).expect("acquire");
     let before = next.observe(0..1).expect("observe");
     agent.signal(Signal::CONT);
-    // To us, or to nobody, where it had been paused for so long before.
+    // The lease went to this test, or expired if the agent had been paused for long before.
     agent.ends(3).check_says("lease lost");
     let after = next.observe(0..1).expect("observe");
     assert_eq!(after, before, "it stepped nothing");
@@ -129,7 +129,7 @@ fn an_abandoned_step_is_made_at_most_once() {
     );
     drop(pending);
     server.program.signal(Signal::CONT);
-    // Of two paths for k = 0 one is flown.
+    // Only one of the two paths for k = 0 is flown.
     for k in 0..8 {
         let (reply, _) = wire.step(step(2 + k), &step_body(&[k], &[1; 8]));
         assert_eq!(reply.sequence, 2 + k);
@@ -142,7 +142,7 @@ fn an_abandoned_step_is_made_at_most_once() {
     }
 }
 
-/// The instance of the private server that a program has started.
+/// Returns the instance of the private server that a program has started.
 fn private_instance(owner: u32) -> Instance {
     let (mut name, exit_with) = (None, format!("--exit-with\0{owner}\0"));
     let find = || {

@@ -1,7 +1,7 @@
-//! Every decoder on the files of its corpus, and on damaged copies of them. A process of its own, as it measures memory.
+//! Runs every decoder on the files of its corpus and on damaged copies of them. This is a separate test program,
+//! because it measures the memory of its process.
 //!
-//! `PROPTEST_CASES` sets the number of copies: 40 times as many for each decoder, 10,240 by default. Coverage-guided
-//! fuzzing of the same decoders is in `fuzz/`.
+//! Each decoder gets 40 * `PROPTEST_CASES` copies, by default 10,240. `fuzz/` fuzzes the decoders by coverage.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -22,23 +22,23 @@ const MAX_SECONDS: i64 = 1;
 /// Maximum growth of the process's peak memory over all inputs of a decoder, in KiB.
 const MAX_GROWTH: u64 = 64 << 10;
 
-/// Integers at which lengths, counts and signs break; each is also taken one and two larger.
+/// Limits of lengths, counts and signs. Each number is also tried plus one and plus two.
 #[rustfmt::skip]
 const INTEGERS: [u64; 9] =
     [0, 7, 0x7f, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, u64::MAX >> 1];
 
-/// Texts on which readers of TOML, JSON and numbers stumble.
+/// Texts that are difficult for parsers of TOML, JSON and numbers.
 const WORDS: &str = r#"0 1 -1 -0.0 255 65536 4294967296 9007199254740993 9223372036854775807 18446744073709551615 1e400
     1e-400 1e308 1e100 1e30 1e-30 1e-320 nan -inf inf null true " \u0000 \ud800 """ { } [ ] [[ = , é"#;
 
-/// A change to a file. Its place is taken modulo the number of places in the file.
+/// A change to a file. Its position counts modulo the number of positions in the file.
 #[derive(Debug, Clone)]
 enum Change {
-    /// Replaces some bytes by others.
+    /// Replaces a range of bytes by others.
     Splice(usize, usize, Vec<u8>),
-    /// Writes an integer of 1, 2, 4 or 8 bytes where one may be: at a multiple of its length.
+    /// Writes an integer of 1, 2, 4 or 8 bytes at a multiple of its length.
     Overwrite(usize, Vec<u8>),
-    /// Replaces the next number of a text.
+    /// Replaces the next number in a text.
     Number(usize, Vec<u8>),
 }
 
@@ -82,7 +82,7 @@ fn apply(change: &Change, bytes: &mut Vec<u8>) {
     bytes.truncate(MAX_BYTES);
 }
 
-/// The first run of digits and points after a place.
+/// Returns the first run of digits and points after a position.
 fn number_after(bytes: &[u8], at: usize) -> Range<usize> {
     let is_number = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
     let begin = bytes[at..].iter().position(is_number);
@@ -91,7 +91,7 @@ fn number_after(bytes: &[u8], at: usize) -> Range<usize> {
     start..length.map_or(bytes.len(), |length| start + length)
 }
 
-/// Decodes one input; returns whether the decoder accepted it.
+/// Decodes one input and returns whether the decoder accepted it.
 fn decode(target: &Target, bytes: &[u8]) -> Result<bool, TestCaseError> {
     let start = clock_gettime(ClockId::ThreadCPUTime);
     let is_accepted = (target.body)(bytes);

@@ -1,4 +1,4 @@
-//! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
+//! A world is a function of model, seed and k. It does not depend on other worlds, threads, clients or observers.
 
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::observer::Observer;
@@ -6,19 +6,19 @@ use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
 use tests::harness::{PATIENCE, Paths, Server, fly, reset};
 
-/// Seeds, one world each.
+/// Number of seeds, with one world each.
 const N_SEEDS: u32 = 8;
 
-/// Steps flown on each world.
+/// Number of steps flown on each world.
 const N_STEPS: usize = 12;
 
-/// A grid on which a batch takes one thread.
+/// A grid so small that one thread steps a batch.
 const SMALL: &str = "--height 9 --width 14 --burn-in 200";
 
-/// 8 x 128 x 128 cells: the size from which on a batch is stepped by several threads.
+/// 8 worlds of 128 x 128 cells: large enough that several threads step a batch.
 const LARGE: &str = "--height 128 --width 128 --burn-in 3";
 
-/// What a world showed, step by step.
+/// The observations of a world, step by step.
 type Trajectory = Vec<Observation>;
 
 fn start(flags: &str) -> Server {
@@ -34,7 +34,7 @@ fn without_episode(mut observation: Observation) -> Observation {
     observation
 }
 
-/// One world after the other on a server of one world, thread and client, and nobody looking.
+/// Runs one world after the other on a server with one world, one thread, one client and no observers.
 fn reference(size: &str) -> Vec<Trajectory> {
     let server = start(&format!("{size} --worlds 1 --threads 1"));
     let mut client = server.acquire(0..1);
@@ -48,7 +48,7 @@ fn reference(size: &str) -> Vec<Trajectory> {
     (0..N_SEEDS).map(&mut trajectory).collect()
 }
 
-/// All worlds at once.
+/// Steps all worlds in one request.
 fn batches(client: &mut Client, steps: Range<usize>, trajectories: &mut [Trajectory]) {
     let all: Vec<_> = (0..N_SEEDS).map(paths).collect();
     for step in steps {
@@ -103,7 +103,7 @@ fn worlds_do_not_notice_who_acts_on_them_or_where_robots_fly() {
     assert!(stale.is_err(), "a lost lease steps nothing");
     batches(&mut third, 8..N_STEPS, &mut trajectories);
     assert!(trajectories == reference(SMALL));
-    // Full frames show the world and its noise.
+    // Full frames show all states with their observation noise.
     let flags = format!("{SMALL} --coverage full");
     let servers = [start(&flags), start(&format!("{flags} --start random"))];
     let mut clients = servers.each_ref().map(|server| server.acquire(0..1));

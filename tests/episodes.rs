@@ -1,4 +1,4 @@
-//! Resets, episode ends and coverage, as every client sees them.
+//! Resets, ends of episodes, and coverage, as clients observe them.
 
 use crate::random_robot::fly_at_random;
 use emberwatch_protocol::control::{Reply, Request, WorldInfo, WorldSeed};
@@ -8,10 +8,10 @@ use emberwatch_protocol::{Coverage, UNOBSERVED};
 use tests::harness::{SMALL, Server, seed};
 use tests::wire::{RawClient, Wire, step_body, step_header};
 
-/// Moves of a path on a [`SMALL`] server.
+/// Number of moves in a path on a [`SMALL`] server.
 const N_MOVES: u32 = 6;
 
-/// Cells of a [`SMALL`] server.
+/// Number of cells of a world on a [`SMALL`] server.
 const N_CELLS: usize = 35;
 
 fn reset(wire: &Wire, lease: u64, worlds: &[WorldSeed]) -> Vec<WorldInfo> {
@@ -43,7 +43,7 @@ fn a_reset_starts_an_empty_frame_in_the_corner_and_answers_in_order() {
     assert_eq!(frame, [UNOBSERVED; N_CELLS]);
     assert_eq!(robot.coverage, Coverage::Empty as u32);
     assert_eq!((world.reward, world.n_visited), (0.0, 0));
-    // Without a seed each reset has another.
+    // Without a given seed, each reset chooses a new one.
     let mut seeds = Vec::from_iter((0..4).map(|_| reset(&wire, lease, &[seed(0, None)])[0].seed));
     seeds.sort_unstable();
     seeds.dedup();

@@ -1,4 +1,4 @@
-//! Settings and model files: wrong ones are refused by path and entry, right ones run.
+//! Settings files and model files. Errors in wrong ones name the path and the entry; correct ones are accepted.
 
 use crate::commands::{TINY, check};
 use emberwatch_protocol::Model;
@@ -7,7 +7,7 @@ use tests::harness::{AGENT, Folder, SERVER, SMALL, Server, repository, run};
 #[test]
 fn wrong_files_are_refused_by_path_and_entry() {
     let folder = Folder::default();
-    // A cell's weights come from the cell above it alone: the top row has none.
+    // All weights of the kernel are on the cell above, which the top row lacks.
     let above = r##"
         name = "from-above"
         kernel_size = [3, 1]
@@ -81,7 +81,7 @@ fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
         wildfire.replace("reward = 1.0", "reward = -1.0"),
     );
     let free = folder.write("free.toml", wildfire.replace("reward = 1.0", ""));
-    let none_burns = "no cell is in the state that pays most";
+    let none_burns = "no cell is in the state with the highest reward";
     let lively = "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in";
     for (flags, words, n_warnings) in [
         (format!("{SMALL} --model {pays}"), "no state pays", 0),

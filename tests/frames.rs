@@ -1,4 +1,4 @@
-//! Observers: what `frames` and `truth` show, to whom, and that nobody waits for them.
+//! Observers: the content of `frames` and `truth`, who receives it, and that the server never waits for observers.
 
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use emberwatch_protocol::message::{FrameHeader, VERSION};
@@ -9,7 +9,7 @@ use tests::harness::{
     robots_of, seen_by, seen_in, service_files,
 };
 
-/// Cells of a [`SMALL`] server.
+/// Number of cells of a world on a [`SMALL`] server.
 const N_CELLS: usize = 35;
 
 fn observe(server: &Server) -> Observer<FrameHeader> {
@@ -64,7 +64,7 @@ fn a_late_observer_gets_the_current_frame_of_every_world_at_once() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let paths = vec![Paths::new(0).next(6); 3];
     server.acquire(0..3).step(0..3, &paths).expect("step");
-    // The second and third come when another has just gone: the number of observers stays one.
+    // The second and third observers connect right after another has left, so that the number of observers stays one.
     for _ in 0..3 {
         let observer = observe(&server);
         for world in 0..3 {
@@ -147,14 +147,14 @@ fn hidden_states_come_on_request_and_agree_with_what_is_told() {
         );
         let rewards = [world.reward, robot.reward, robot.marginal];
         assert_eq!(rewards, [f64::from(robot.n_hits); 3]);
-        // A normal or burning cell looks like itself with .98.
+        // A normal or burning cell is observed as such with probability 0.98.
         let seen = payload.iter().zip(told.frame.as_bytes());
         for (state, seen) in seen.filter(|(state, _)| **state != 1) {
             n_right += u32::from(state == seen);
             n_cells += 1;
         }
     }
-    // Binomial: .98 +- 6 standard errors of at most sqrt(.98 * .02 / n).
+    // Binomial: 0.98 +- 6 standard errors of at most sqrt(0.98 * 0.02 / n).
     let share = f64::from(n_right) / f64::from(n_cells);
     let bound = 6.0 * (0.98 * 0.02 / f64::from(n_cells)).sqrt();
     assert!((share - 0.98).abs() < bound, "{share} of {n_cells}");

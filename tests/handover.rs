@@ -1,4 +1,4 @@
-//! What the next agent believes: what the last one left, or what the kept frames tell.
+//! The belief of an agent that takes over: the former agent's stored belief, or one computed from the kept frames.
 
 use emberwatch_agent::client::left_belief::{leave_belief, left_belief};
 use emberwatch_belief::estimation::belief::Belief;
@@ -10,33 +10,33 @@ use emberwatch_protocol::{Client, Model, Move};
 use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, fly, frames_until, path_of, seed};
 use tests::wire::{RawClient, Wire, recall_header, step_body};
 
-/// A world with fires to find, and room for all their frames.
+/// A world with many fires.
 const FLAGS: &str =
     "--model wildfire-small --height 16 --width 16 --moves 12 --burn-in 300 --seed 3";
 
-/// Room for all frames of these tests.
+/// A history that keeps all frames of these tests.
 const ALL: &str = "--history 100000";
 
-/// What an agent says before it simulates one.
+/// The log line of an agent that must simulate its first belief.
 const FIRST_BELIEF: &str = "simulating the first belief";
 
 fn run(server: &Server, flags: &str) -> Program {
     Program::agent(&server.instance, flags)
 }
 
-/// Asks for what was left of a robot.
+/// Returns a request for the stored belief of a robot.
 fn ask(robot: u32) -> Request {
     Request::Belief { robot, offset: 0 }
 }
 
-/// The last paths flown until step `last`: as many as an observer is kept, more than 40.
+/// Returns the paths flown up to step `last`, as far back as an observer's buffer reaches: more than 40.
 fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
     let samples = frames_until(observer, 0, last);
     let flown = samples.iter().filter(|it| it.header.result.step > 0);
     flown.map(path_of).collect()
 }
 
-/// What one agent flies that nobody disturbs.
+/// Returns the paths of an agent that flies undisturbed.
 fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
@@ -57,8 +57,8 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         first.ends(3);
         let second = second.ends(0);
         second.check_says(FIRST_BELIEF);
-        second.check_says("the frames that were kept");
-        // The third comes after a release, and finds the second's belief.
+        second.check_says("the frames that the server keeps");
+        // The third agent attaches after a release and finds the second agent's belief.
         let third = run(&server, &format!("{policy} --steps 20")).ends(0);
         third.check_says("the belief that was left");
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
@@ -100,7 +100,7 @@ fn an_agent_that_finds_only_some_frames_makes_do_with_them() {
     let forgetful = Server::start(&format!("{FLAGS} --history 1"));
     run(&forgetful, walk).ends(0);
     let ended = run(&forgetful, "--steps 2").ends(0);
-    assert!(!ended.stderr.contains("going on from"), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("the belief was"), "{}", ended.stderr);
 }
 
 #[test]
@@ -172,7 +172,7 @@ fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
             "{robot} {step} {offset} {length} {data}"
         );
     }
-    // Half a belief is none, and what is refused takes nothing away.
+    // A partial belief is not returned, and a refused part changes nothing.
     assert_eq!(leave(1, 0, 0, 2, "AA=="), Reply::Done);
     assert_eq!(wire.ask(&ask(1)).status(), Status::NotKept);
     assert_eq!(leave(1, 0, 0, 1, "AAAA").status(), Status::Malformed);
@@ -193,7 +193,7 @@ fn an_agent_told_to_stop_leaves_its_belief() {
     let Ok(Reply::Belief { info, .. }) = belief else {
         panic!("expected a belief, got {belief:?}");
     };
-    // Three states, and when each cell was seen; two rewards and a count.
+    // Per cell three probabilities and the time of the last observation; then two rewards and a count.
     assert_eq!(info.length, (3 + 1) * 16 * 16 * 4 + 16);
     assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

@@ -1,5 +1,5 @@
-//! Clients of the right types and the wrong intentions: whatever they send, the server lives and
-//! other clients' worlds go on as if nothing had been.
+//! Clients with the right message types and hostile content. Whatever they send, the server survives and the worlds of
+//! other clients continue undisturbed.
 //!
 //! `cargo test -p tests -- --ignored` sends a million messages.
 
@@ -66,7 +66,7 @@ fn a_server_recovers_when_it_has_descriptors_again() {
     server.connect();
 }
 
-/// The header of a correct step of robot 1.
+/// Returns the header of a correct step of robot 1.
 fn second_robot(lease: u64) -> StepRequest {
     StepRequest {
         first_robot: 1,
@@ -74,12 +74,12 @@ fn second_robot(lease: u64) -> StepRequest {
     }
 }
 
-/// The payload of a step of one world.
+/// Returns the payload of a step of one world.
 fn body(k: u64) -> Vec<u8> {
     step_body(&[k], &[3; 6])
 }
 
-/// Steps robot 1 of a server from where it is.
+/// Steps robot 1 from its world's current step.
 fn fly_second(server: &Server, wire: &Wire, lease: u64) -> Status {
     wire.status_of(second_robot(lease), &body(server.step_of(1)))
         .0
@@ -91,7 +91,7 @@ fn requests_whose_answers_nobody_reads_disturb_nobody() {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         for round in 0..1_000 {
-            // The first may be flown; what comes after it is late.
+            // Only the first may be flown; all later ones are late.
             let step = wire.send_step(second_robot(lease), &body(0)).expect("send");
             let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
             let refused = wire.send_step(second_robot(lease), &body(0));
@@ -155,7 +155,7 @@ fn held_samples_limit_only_their_holder() {
         let lease = wire.acquire(1..2).lease;
         let mut held = Vec::new();
         for _ in 0..200 {
-            // As soon as it holds too many, the client cannot send, or gets no answer.
+            // A client that holds too many samples cannot send, or receives no answer.
             let Ok(pending) = wire.send_step(second_robot(lease), &body(held.len() as u64)) else {
                 break;
             };
@@ -181,7 +181,7 @@ fn old_leases_and_numbers_open_nothing_again() {
         for k in 0..10 {
             let lease = wire.acquire(1..3).lease;
             let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
-            // The very same request again comes too late.
+            // An identical request is late.
             assert_eq!(status(&wire), Status::Ok);
             assert_eq!(status(&wire), Status::Late);
             assert_eq!(status(&other), Status::NoLease);
@@ -193,7 +193,7 @@ fn old_leases_and_numbers_open_nothing_again() {
                 assert_eq!([status, renewed], [Status::LeaseLost; 2]);
             }
         }
-        // All three worlds with a lease on two of them, and the victim's with its own lease.
+        // All three worlds with a lease on two of them, then the victim's world with this lease.
         let lease = wire.acquire(1..3).lease;
         let all = StepRequest {
             n_robots: 3,
@@ -212,7 +212,7 @@ fn half_open_connections_use_only_their_own_slots() {
     besiege(|server, _| {
         for _ in 0..4 {
             let mut ports = Vec::new();
-            // The victim has one of the places.
+            // The victim occupies one of the client slots.
             for _ in 1..MAX_CLIENTS {
                 let node = create_node().expect("a node");
                 let services = Services {
@@ -257,7 +257,7 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
             assert!(server.step_of(1) <= step + 1, "it is stopped");
             agent.signal(Signal::CONT);
         }
-        // And dies so.
+        // The agent is killed while it is stopped.
         agent.signal(Signal::STOP);
         drop(agent);
         let is_free = || Client::acquire(server.connect(), &Claim::new(1..2)).is_ok();

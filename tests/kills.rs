@@ -1,4 +1,4 @@
-//! Programs that are killed at any moment of their start or end: the next ones find nothing in their way.
+//! Programs that are killed at any moment of their start or end. Their remains must not block later programs.
 
 use emberwatch_protocol::channels::{Instance, SHARED_MEMORY};
 use rand::RngExt;
@@ -14,16 +14,16 @@ use tests::harness::{
 };
 use tests::meter::all_under;
 
-/// A small server that is ready at once.
+/// A small server that is ready immediately.
 const FLAGS: &str = "--burn-in 0 --height 8 --width 8 --moves 4";
 
-/// Kills programs; returns their instances and process ids. All of these processes have ended.
+/// Starts and kills programs. Returns their instances and the ids of their processes, all of which have ended.
 fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, HashSet<u32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();
     let began = Instant::now();
     let running = Server::start(FLAGS);
-    // As long as starts take here, else none would be killed in the middle of one.
+    // At least as long as a start takes on this machine, so that some programs are killed while they start.
     let longest = (began.elapsed().as_micros() as u64).max(60_000);
     let folder = Folder::default();
     let mut killed = HashSet::new();
@@ -51,7 +51,7 @@ fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, Ha
     (instances, killed)
 }
 
-/// A client, an observer, one that acts, or a Python client that has been loaded.
+/// Starts a client, an observer, an agent, or a Python client that has loaded its modules.
 fn connect(instance: &Instance, folder: &Folder, kind: u32) -> Program {
     let name = instance.name();
     match kind {
@@ -74,7 +74,7 @@ fn connect(instance: &Instance, folder: &Folder, kind: u32) -> Program {
     }
 }
 
-/// Kills a program some microseconds from now; returns its process id.
+/// Kills a program after a random number of microseconds. Returns its process id.
 fn kill_after(program: Program, rng: &mut ChaCha8Rng, micros: Range<u64>) -> u32 {
     let pid = program.pid();
     std::thread::sleep(Duration::from_micros(rng.random_range(micros)));
@@ -82,7 +82,7 @@ fn kill_after(program: Program, rng: &mut ChaCha8Rng, micros: Range<u64>) -> u32
     pid
 }
 
-/// Whether a file of channels has the id of one of these processes in its name.
+/// Returns whether the name of a channel's file contains the id of one of these processes.
 fn is_of(path: &Path, pids: &HashSet<u32>) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let mut words = name.split(['_', '.']);
@@ -102,7 +102,7 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
             killed.extend(pids);
         }
     });
-    // A program, as that could take without end.
+    // Runs as a separate program, because it could hang.
     let flags = format!("status --instance {}", new_instance().name());
     run(SERVER, &flags).check_says("no server on");
     for instance in &instances {

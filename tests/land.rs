@@ -1,5 +1,5 @@
-//! A land and a sensor like real ones on a running server: what robots see and earn, from the paths, the hidden states
-//! and `hello` alone.
+//! Zones, no-fly cells and a wide sensor on a running server. The tests derive what robots must see and earn from only
+//! the paths, the hidden states and the reply to `hello`.
 
 use crate::commands::{agent, check};
 use crate::trainings::on;
@@ -10,13 +10,13 @@ use tests::harness::{Folder, PATIENCE, Paths, SERVER, Server, reset, run};
 
 const N_MOVES: usize = 6;
 
-/// A map of 7 x 9 cells as TOML.
+/// Returns a map of 7 x 9 cells as TOML.
 fn map(value: impl Fn(usize, usize) -> usize) -> String {
     let row = |row| Vec::from_iter((0..9).map(|col| value(row, col)));
     format!("{:?}", Vec::from_iter((0..7).map(row)))
 }
 
-/// A model in three zones, with two observation matrices and a wall that has a gap.
+/// Writes a model with three zones, two observation matrices and a wall of no-fly cells with a gap.
 fn write_model(folder: &Folder, pays: &str) -> String {
     let wildfire = Model::built_in("wildfire-small").expect("built in");
     let mut file = wildfire.file().clone();
@@ -64,7 +64,7 @@ fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
         let mut client = server.acquire(0..2);
         reset(&mut client, 1000);
         let (mut paths, mut total) = (Paths::new(3), 0.0);
-        // Of each observation matrix: cells seen, and those seen as they are.
+        // For each observation matrix: the number of observed cells, and of those observed in their true state.
         let (mut n_seen, mut n_right) = ([0; 2], [0; 2]);
         for _ in 0..200 {
             let starts = client.observe(0..2).expect("observe");
@@ -173,18 +173,18 @@ fn a_land_that_cannot_be_is_refused_and_pockets_are_told_of() {
         folder.write("land.toml", format!("{head}no_fly = {no_fly}\n{rest}"));
         check(SERVER, &format!("{land} --start {start}"), words);
     }
-    // A pocket of two cells.
+    // A map with an enclosed pocket of two cells.
     let pocket = map(|row, col| {
         usize::from(row < 3 && col < 4 && (row, col) != (1, 1) && (row, col) != (1, 2))
     });
     folder.write("land.toml", format!("{head}no_fly = {pocket}\n{rest}"));
-    let share = "no-fly cells close off 2 of 53 free cells (3.77 %)";
+    let share = "no-fly cells cut off 2 of 53 free cells (3.77 %)";
     let random = run(SERVER, &format!("--check {land} --start random")).check(0);
     random.check_says(share).check_prints("start = \"random\"");
     assert!(!random.stderr.contains("WARN"), "{}", random.stderr);
     let closed_in = run(SERVER, &format!("--check {land} --start 1,2")).check(0);
     closed_in.check_says(share).check_says(
-        "start: no-fly cells close in (1, 2): robots that start there reach 2 of 53 free cells",
+        "start: no-fly cells enclose (1, 2): robots that start there reach 2 of 53 free cells",
     );
     let server = Server::start(&format!("{land} --start random"));
     server.program.wait_for_words(share);

@@ -1,10 +1,10 @@
-//! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
+//! Tests of the real programs, `emberwatch-server` and `emberwatch-agent`, as a user runs them.
 //!
-//! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! What they share is in `src`; `python` lets `wire_reference.py` speak the protocol, `random_robot` is the example of a
-//! client; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own.
-//! `cargo test -p tests -- --ignored` adds what takes minutes, such as deaths at random moments, and what needs Python
-//! (`scripts/test` installs it).
+//! Run `cargo build --workspace` first, because Cargo does not build another package's programs for a test. `src` has
+//! shared code, `python` speaks the protocol through `wire_reference.py`, and `random_robot` is the example client.
+//! Every other module tests one topic. Each test has its own instance, folder and deadline.
+//! `cargo test -p tests -- --ignored` runs the tests that take minutes, such as deaths at random moments, or that need
+//! Python (`scripts/test` installs it).
 
 mod agent_beliefs;
 mod autoencoder;

@@ -1,17 +1,17 @@
-//! Where the channels are: what happens when it cannot be used, or is taken away.
+//! Shared memory and channel directories that are unusable or removed while programs run.
 //!
-//! In a mount namespace of its own, as that is everybody's; where none may be made, those tests say so and pass, but
-//! in CI they fail.
+//! These tests run in a separate mount namespace, because all programs share the real directories. Where a process may
+//! not create one, the tests print that and pass, except in CI, where they fail.
 
 use std::io::Write;
 use std::process::Command;
 use tests::harness::{SMALL, program_path};
 
-/// Waits in a script until the server answers.
+/// A shell line that waits until the server answers.
 const ANSWERS: &str = "until $S status >/dev/null 2>&1; do sleep 0.01; done";
 
-/// Runs a shell script where `/dev/shm` is its own; `$S` is the server. What it said, on both outputs; `None` if there
-/// may be no such place.
+/// Runs a shell script in a namespace with its own `/dev/shm`; `$S` is the server program. Returns its output and error
+/// output, or `None` if this process may not create a namespace.
 fn apart(script: &str) -> Option<String> {
     let run = |script: &str| {
         let is_root = rustix::process::getuid().is_root();
@@ -40,7 +40,7 @@ fn apart(script: &str) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Runs a script in which each of these words must be said.
+/// Runs a script and checks that its output contains all expected words.
 fn check(script: &str, expected: &[&str]) {
     let Some(said) = apart(script) else { return };
     for words in expected {
@@ -98,7 +98,7 @@ fn servers_in_other_pid_namespaces_are_called_so_and_go_on() {
     let Some(said) = apart(&script) else { return };
     assert!(said.contains("it ended with 0"), "{said}");
     assert_eq!(said.matches(refusal).count(), 3, "{said}");
-    // Two with process id 1.
+    // Two servers that both have process id 1, each in its own namespace.
     let other = "unshare -p -f --kill-child --mount-proc $S";
     check(
         &format!(

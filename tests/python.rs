@@ -1,5 +1,5 @@
-//! The protocol byte by byte through a client that shares no code with the others: `wire_reference.py` sends what it
-//! is told, and checks the answers itself.
+//! The protocol byte by byte through a client that shares no code with the others: `wire_reference.py` sends the given
+//! bytes and checks the answers itself.
 
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use emberwatch_protocol::channels::Instance;
@@ -19,7 +19,7 @@ pub struct PythonWire {
 }
 
 impl PythonWire {
-    /// Opens both channels of an instance; it says hello by itself.
+    /// Opens both channels of an instance. The Python client sends `hello` itself.
     pub fn open(instance: &Instance) -> Self {
         let python = python();
         let program = repository().join("tests/wire_reference.py");
@@ -36,7 +36,7 @@ impl PythonWire {
         }
     }
 
-    /// Waits for one answer; the client ends if none comes in time, or a wrong one.
+    /// Sends a request and waits for the answer. The client fails if the answer is wrong or late.
     fn exchange<R: AnyBitPattern>(
         &self,
         service: &str,
@@ -76,7 +76,7 @@ impl RawClient for PythonWire {
 
 impl Drop for PythonWire {
     fn drop(&mut self) {
-        // At the end of its requests it closes its channels and ends.
+        // The Python client ends when its standard input is closed.
         self.requests.take();
         let process = self.process.get_mut();
         if !eventually(PATIENCE, || matches!(process.try_wait(), Ok(Some(_)))) {

@@ -1,4 +1,4 @@
-//! Recorded worlds: what was recorded is what the truth channel shows, and agents act there without a model.
+//! Recorded worlds: the truth channel shows the recorded states, and agents act there without a known model.
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::on;
@@ -15,7 +15,7 @@ use tests::meter::memory;
 
 const N_MOVES: usize = 4;
 
-/// States that stay as they are, each observed as itself.
+/// A model whose states never change and are observed without noise.
 const STILL: &str = r##"
 name = "lab"
 kernel_size = [1, 1]
@@ -36,7 +36,7 @@ kernel = [
 ]
 "##;
 
-/// The same without what a description of recorded states has not.
+/// Returns [`STILL`] as a description of recorded states, which has no kernel.
 fn description() -> String {
     let (states, _) = STILL.split_once("kernel = [").expect("a model");
     let states = states.replace("kernel_size = [1, 1]", "step = \"10 min\"");
@@ -45,7 +45,7 @@ fn description() -> String {
         .replace("initial = 0.3, ", "")
 }
 
-/// Sequences of such lengths in a folder; no two recorded steps are alike.
+/// A folder with recorded sequences, in which all recorded steps differ.
 struct Place {
     folder: Folder,
     sequences: Vec<Array3<u8>>,
@@ -55,7 +55,7 @@ impl Place {
     fn new(lengths: &[usize], (height, width): (usize, usize)) -> Self {
         let folder = Folder::default();
         let sequence = |(index, &length): (usize, &usize)| {
-            // Digits to the base 3 of a hash: no symmetry, and no step like another.
+            // Base-3 digits of a hash: no step is symmetric, and no two steps are equal.
             Array3::from_shape_fn((length, height, width), |(k, row, col)| {
                 let number = ((index * 97 + k) * height + row) * width + col;
                 let hash = (number as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -82,7 +82,7 @@ impl Place {
         format!("--states {folder} --moves {N_MOVES} --publish-truth {more}")
     }
 
-    /// A recorded step of the sequence that a seed has where symmetries are off.
+    /// Returns a recorded step of the sequence that a seed selects without symmetries.
     fn states(&self, seed: u64, recorded_step: usize) -> Grid<u8> {
         let sequence = &self.sequences[seed as usize % self.sequences.len()];
         sequence.index_axis(Axis(0), recorded_step).to_owned()
@@ -95,7 +95,7 @@ fn truth_of(server: &Server) -> TruthFeed {
     TruthFeed::open(&server.instance, shape).expect("truth")
 }
 
-/// What the truth channel and full frames show of a whole episode; it ends truncated.
+/// Flies a whole episode, which ends truncated. Returns the states that both the truth channel and full frames show.
 fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
     reset(client, seed);
     let mut shown = truth.states(0..1, &[seed], 0).expect("truth");
@@ -229,7 +229,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     ] {
         let ended = act(&format!("run --policy {policy} --steps 70 {checkpoint}"));
         ended.check_says("steps=70");
-        let n_ends = ended.stderr.matches("the next begins").count();
+        let n_ends = ended.stderr.matches("the next one starts").count();
         assert!(n_ends >= 2, "{policy}: {}", ended.stderr);
     }
     let figures = results.word("figures");
@@ -255,7 +255,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         ),
         (
             "compare --seeds 0..1 --steps 24",
-            "--steps: expected at most 23, as the shortest episode has, got 24",
+            "--steps: expected at most 23, the length of the shortest episode, got 24",
         ),
     ] {
         check(AGENT, &format!("{words} {}", on(&server)), expected);
@@ -319,7 +319,7 @@ train STATES --out x --burn-in 3 => --states <NAME|FILE|FOLDER> | cannot be used
     let table =
         "STATES --model wildfire => model: expected to be left out, as the states file decides it
 STATES --states-offset 5 => states_offset: expected 0 to 4
---states-offset 3 => expected none without a states file
+--states-offset 3 => expected false and 0 without a states file
 --states no/such.npz => states file no/such.npz: No such file";
     check_table(SERVER, &table.replace("STATES", &states));
 }

@@ -1,4 +1,4 @@
-//! Recorders: what they keep, and what they and their files say when something is missing.
+//! Recorders: what they record, and how they and their files report missing samples.
 
 use crate::commands::check_table;
 use emberwatch_protocol::channels::Instance;
@@ -16,7 +16,7 @@ use tests::harness::{
     recorded_info,
 };
 
-/// A folder of a test's own, and a file in it that is not there yet.
+/// Creates a temporary folder. Returns it and the path of a file in it that does not exist yet.
 pub fn new_file() -> (TempDir, PathBuf) {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("test.recording");
@@ -45,7 +45,7 @@ pub fn stop(recorder: Program) -> Ended {
     ended
 }
 
-/// The whole records of a file, and the error that ends them, if any.
+/// Returns the intact records of a file, and the error after them, if any.
 pub fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     let mut reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
     let mut error = None;
@@ -89,7 +89,7 @@ fn wait_for_step(recorder: &Program, file: &Path, step: u64) {
     });
 }
 
-/// Reads so many samples.
+/// Reads `n_samples` samples.
 pub fn take<H: Header>(observer: &Observer<H>, n_samples: usize) -> Vec<Sample<H>> {
     let next = |index| {
         let sample = observer.receive(PATIENCE).expect("receive");
@@ -98,7 +98,7 @@ pub fn take<H: Header>(observer: &Observer<H>, n_samples: usize) -> Vec<Sample<H
     (0..n_samples).map(next).collect()
 }
 
-/// A recording of frames of 2 x 3 cells, so many milliseconds apart.
+/// Writes a recording of `n_frames` frames of 2 x 3 cells, `millis_apart` milliseconds apart.
 pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sample<FrameHeader>> {
     let mut writer = Writer::new(File::create(file).expect("create")).expect("begin");
     let info = recorded_info(1, 1);
@@ -145,7 +145,7 @@ fn a_killed_recorder_leaves_whole_records() {
     let recorder = start_recorder(&server.instance, &file, "");
     let mut client = server.acquire(0..1);
     fly_on(&mut client, 0, 30);
-    // Written within a second or so, though nobody asks for it.
+    // The recorder writes the frame within about a second without being asked to.
     wait_for_step(&recorder, &file, 30);
     recorder.kill();
     let (records, error) = read(&file);
@@ -171,9 +171,9 @@ fn a_recorder_stopped_twice_keeps_what_was_published() {
     let mut client = server.acquire(0..1);
     recorder.stop();
     fly_on(&mut client, 0, 20);
-    server.info(); // told after the last step was published
+    server.info(); // answered only after the last step was published
     recorder.signal(Signal::TERM);
-    recorder.signal(Signal::INT); // as when `timeout` signals a process and its group
+    recorder.signal(Signal::INT); // `timeout` also signals both a process and its group
     recorder.signal(Signal::CONT);
     recorder.ends(0);
     let recorded = frames(&read_whole(&file));
@@ -274,7 +274,7 @@ fn a_damaged_recording_is_replayed_up_to_the_damage() {
     let good = frames(&records);
     assert!(matches!(error, Some(RecordingError::Damaged { .. })));
     assert!((1..5).contains(&good.len()) && good[..] == samples[..good.len()]);
-    // The first frame is that of a reset.
+    // The first frame belongs to a reset.
     let words = format!("good before it: {} steps", good.len() - 1);
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
@@ -328,7 +328,7 @@ replay / => recording /: Is a directory
 replay FOREIGN => not a recording | got "a text t"
 replay DAMAGED => damaged at byte 16: checksum: expected
 replay START => cut short: expected a whole record at byte 16, got 0 bytes; good before it: 0 steps
-replay GOOD --from 9 => expected samples from 9s on, got none
+replay GOOD --from 9 => expected samples after the first 9s, got none
 replay GOOD --from x => --from | expected seconds
 replay GOOD --instance a/b => instance name | "a/b"
 replay GOOD --speed 0 => --speed | above 0, or max

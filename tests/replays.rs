@@ -1,4 +1,4 @@
-//! Replays: what observers get of a recording, when, and what clients are told.
+//! Replays: what observers receive of a recording and when, and how clients are answered.
 
 use crate::commands::check;
 use crate::recording::{
@@ -66,7 +66,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     let info = connection.info();
     assert_eq!((info.height, info.n_moves, info.pid), (2, 1, replay.pid()));
     let observer = Observer::frames(&instance).expect("observe");
-    // Round and round: after the last comes the first.
+    // With `--loop`, the first sample follows the last.
     let steps = take(&observer, 7)
         .into_iter()
         .map(|it| it.header.result.step);
@@ -84,7 +84,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
         Err(ConnectionError::Refused { status, .. }) => assert_eq!(status, Status::NotPermitted),
         other => panic!("expected a refusal, got {other:?}"),
     }
-    // A round begins with the server, whose world follows.
+    // Each round begins with the server's record, before its world's frames.
     let shows_world = || match connection.control(&Request::Status {}, PATIENCE) {
         Ok(Reply::Status(status)) => {
             assert_eq!(status.pid, replay.pid());
@@ -116,7 +116,7 @@ fn a_replay_keeps_the_recorded_time_times_its_speed() {
     let observer = Observer::frames(&instance).expect("observe");
     let replay = start_replay(&instance, &file, "--speed 10");
     assert_eq!(take(&observer, 1), samples[..1]);
-    // It answers while it waits for the second, which comes in six minutes.
+    // The replay answers requests while it waits for the second sample, which is due in six minutes.
     run(SERVER, &format!("stop --instance {}", instance.name())).check(0);
     replay.ends(0);
     assert_eq!(observer.try_receive().expect("receive"), None);
@@ -134,7 +134,7 @@ fn a_long_replay_at_full_speed_reaches_an_observer_that_reads() {
     assert_eq!(got.last(), samples.last());
     assert!(got.is_sorted_by_key(|sample| sample.header.sequence));
     replay.ends(0);
-    // Without an observer it begins only when told.
+    // Without an observer, the replay starts only with `--no-wait`.
     write_recording(&file, 2, 0);
     start_replay(&new_instance(), &file, "--no-wait").ends(0);
     let waiting = start_replay(&new_instance(), &file, "");

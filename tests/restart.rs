@@ -1,4 +1,4 @@
-//! Servers that end: by signal, by kill, and what their agents and successors make of it.
+//! Servers that end by a signal or a kill, and the behaviour of their agents and successors.
 
 use emberwatch_protocol::channels::{ChannelError, Instance, create_node};
 use emberwatch_protocol::connection::{Connection, ConnectionError};
@@ -28,11 +28,11 @@ fn an_agent_says_that_its_server_is_gone_and_goes_on_with_the_next() {
     let acts = |server: &Server| is_held_by(server, &agent) && server.status().n_steps > 0;
     agent.until(|| acts(&server));
     server.kill();
-    agent.wait_for_words("is gone; waiting for it to come back");
+    agent.wait_for_words("is gone; waiting for the server to come back");
     let server = Server::start_on(&instance, SMALL);
     agent.until(|| acts(&server));
     server.command("stop").check(0);
-    // An agent without a server stops when told.
+    // An agent without a server still stops on a signal.
     agent.finish();
 }
 
@@ -69,7 +69,7 @@ fn clients_learn_of_a_killed_server_and_the_next_takes_its_place() {
     let is_told = matches!(refused, Err(ServerGone { .. } | Refused { .. }));
     assert!(is_told, "{refused:?}");
     let mut next = second.acquire(0..1);
-    // A new server starts from its seed.
+    // The new server starts from the same seed, so the first step is the same.
     assert_eq!(fly(&mut next, Paths::new(0).next(6)), step);
 }
 
@@ -134,7 +134,7 @@ fn a_clean_stop_leaves_nothing_behind() {
     assert_eq!(service_files(&instance), Vec::<PathBuf>::new());
 }
 
-/// The files in shared memory that processes have mapped.
+/// Returns the files in shared memory that these processes have mapped.
 fn shared_files(pids: &[u32]) -> BTreeSet<PathBuf> {
     let read = |pid| std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("its memory");
     let maps: String = pids.iter().map(read).collect();

@@ -1,6 +1,6 @@
-//! What another user can do to ours: nothing but get in the way, and be told of.
+//! What another user can do to our instances: only block their names, which is reported.
 //!
-//! A thread plays the other user, which only root may let it do; elsewhere those tests say so and pass.
+//! A thread acts as the other user, which requires root. Without root, these tests print that and pass.
 
 use emberwatch_protocol::channels::{
     Channel, ChannelError, Instance, Ipc, SHARED_MEMORY, Services, channel_directory, create_node,
@@ -17,10 +17,10 @@ use std::path::{Path, PathBuf};
 use tests::harness::{PATIENCE, SMALL, Server, eventually, frames_until};
 use tests::meter::all_under;
 
-/// Users whom nobody is.
+/// User ids that do not exist.
 const USERS: [u32; 3] = [64_001, 64_002, 64_003];
 
-/// Does something as another user, without groups; `None` if this process may not.
+/// Runs `act` as another user without groups. Returns `None` if this process may not change its user.
 fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
     let become_user = || {
         let (uid, gid) = (Uid::from_raw(user), Gid::from_raw(user));
@@ -33,20 +33,20 @@ fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
         thread.join().expect("what the other user expects")
     });
     if done.is_none() {
-        // Past the test harness, which keeps what passing tests print.
+        // Writes to standard error directly, because the test harness hides what passing tests print.
         let note = "skipped: this process may not act as another user; run the tests as root\n";
         let _ = std::io::stderr().write_all(note.as_bytes());
     }
     done
 }
 
-/// Everything of this user's channels: files in its directory and in shared memory.
+/// Returns all files of this user's channels: those in its directory and those in shared memory.
 fn places() -> (Vec<PathBuf>, Vec<PathBuf>) {
     let segments = segments_of(getuid().as_raw());
     (all_under(&channel_directory()), segments.collect())
 }
 
-/// A user's files in shared memory.
+/// Returns a user's files in shared memory.
 fn segments_of(user: u32) -> impl Iterator<Item = PathBuf> {
     let prefix = format!("emberwatch-{user}_");
     let entries = std::fs::read_dir(SHARED_MEMORY).expect("shared memory");
@@ -55,7 +55,7 @@ fn segments_of(user: u32) -> impl Iterator<Item = PathBuf> {
     own.map(|entry| entry.path())
 }
 
-/// A path's mode, if it has not gone meanwhile: other tests come and go.
+/// Returns the mode of a path, or `None` if it no longer exists, because other tests remove their files.
 fn mode(path: &Path) -> Option<u32> {
     std::fs::symlink_metadata(path)
         .ok()
@@ -99,7 +99,7 @@ fn another_user_cannot_connect_observe_read_or_remove() {
             denied(path, OpenOptions::new().write(true).open(path).map(drop));
         }
         denied(&ours, std::fs::read_dir(&ours).map(drop));
-        // Removing is up to the folder: ours, and one whose sticky bit is set.
+        // The folder decides whether a file may be removed: shared memory has the sticky bit set.
         let removed = remove_file(&segments[0]).expect_err("a segment that is ours");
         assert!(matches!(
             removed.kind(),
@@ -162,7 +162,7 @@ fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
     clean_up(user);
 }
 
-/// iceoryx2 changes it while it binds a listener, and two at once could change it for good.
+/// iceoryx2 changes the umask while it binds a listener. Two threads at once could leave it changed.
 #[test]
 fn threads_that_listen_leave_the_umask_as_it_was() {
     let umask = || {
@@ -181,12 +181,12 @@ fn threads_that_listen_leave_the_umask_as_it_was() {
         }
     };
     std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(listen))));
-    // While another test listens it is not.
+    // While another test binds a listener, the umask differs for a moment.
     let is_as_before = || !umask().ends_with("0177");
     assert!(eventually(PATIENCE, is_as_before), "{}", umask());
 }
 
-/// Removes what a user who is nobody left.
+/// Removes the files of a nonexistent user.
 fn clean_up(user: u32) {
     let _ = std::fs::remove_dir_all(format!("{SHARED_MEMORY}/emberwatch-{user}"));
     segments_of(user).for_each(|path| _ = remove_file(path));

@@ -1,4 +1,4 @@
-//! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
+//! Saved worlds that continue bit for bit: snapshots, forks and restarted servers.
 
 use crate::commands::check;
 use emberwatch_protocol::Client;
@@ -20,7 +20,7 @@ use tests::wire::{RawClient, Wire, control_header};
 
 const N_MOVES: usize = 6;
 
-/// The next few observations of a client's worlds, on random paths.
+/// Returns the next observations of a client's worlds on random paths.
 fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
     let (mut paths, robots) = (Paths::new(seed), client.robots());
     let mut step = || {
@@ -31,12 +31,12 @@ fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
     (0..5).map(|_| step()).collect()
 }
 
-/// Runs a command of the program that the server refuses.
+/// Runs a command and checks that the server refuses it.
 fn refused(server: &Server, command: &str, words: &str) {
     server.command(command).check(1).check_says(words);
 }
 
-/// The snapshots in a folder, by name.
+/// Returns the snapshots in a folder, sorted by name.
 fn snapshots_in(folder: &Folder) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder.path(""))
         .expect("the folder")
@@ -68,7 +68,7 @@ fn a_restored_world_and_its_memory_continue_bit_for_bit() {
         assert_eq!(client.observe(0..2).expect("observe"), before);
         assert_eq!(client.recall(0..2, 1).expect("recall"), past);
         assert_eq!(future(&mut client, 2), went_on);
-        // Another reset to the seed that it began with gives what that gave.
+        // A reset to the seed of the first episode repeats that episode.
         reset(&mut client, 70);
         client.observe(0..2).expect("observe")
     };
@@ -135,7 +135,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     }
 }
 
-/// What a client with one robot saw.
+/// Flattens the observations of a client with one robot.
 fn shown_of(seen: Vec<Vec<Observation>>) -> Vec<Observation> {
     seen.into_iter().flatten().collect()
 }
@@ -164,7 +164,7 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
     for (path, words) in [
         ("/no/such/file", "snapshot file /no/such/file"),
         ("/dev/zero", "expected a regular file"),
-        ("relative", "path: expected an absolute one"),
+        ("relative", "path: expected an absolute path"),
     ] {
         let request = Request::Snapshot {
             first_world: 0,
@@ -178,7 +178,7 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
             .check(1);
     }
     for (flags, words) in [
-        ("--width 8", "width: expected 8 as this server's, got 7"),
+        ("--width 8", "width: expected 8, as on this server, got 7"),
         ("--width 7 --worlds 2", "worlds: expected 2, got 1"),
     ] {
         let flags = format!("--height 5 {flags} --moves 6 --burn-in 20 --restore {file}");
@@ -212,19 +212,19 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
             let seen = client.step(0..2, &path(k)).expect("step");
             assert_eq!(seen, expected[k as usize], "step {k}");
         }
-        // At least two a round: after 10 steps, and when that was written or 10 steps later.
+        // At least two snapshots per round: after 10 steps, and another when that one is written or 10 steps later.
         let least = folder.path(&format!("{}-{:012}.snapshot", instance.name(), 2 * round));
         server
             .program
             .until(|| files().last().is_some_and(|newest| *newest >= least));
-        // The last two, and the first of the round, which outlives a loss of power.
+        // The latest two, and the first of the round, which survives a loss of power.
         server.program.until(|| matches!(files().len(), 2 | 3));
         server.kill();
     }
     let server = Server::start_on(&instance, &flags);
     let stands = server.step_of(0);
     server.program.finish();
-    // The newest file is damaged: the one before it serves.
+    // The newest file is damaged, so the one before it is restored.
     std::fs::write(files().last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
     let server = Server::start_on(&instance, &flags);
     assert_eq!(server.step_of(0), stands, "{}", server.program.stderr());
@@ -295,7 +295,7 @@ fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
             "expected",
         );
     }
-    // A link where the file is written at first leads nowhere else.
+    // A link at the path of the temporary file is replaced, not followed.
     link(&format!("lab.snapshot.{}.part", server.program.pid()));
     for _ in 0..2 {
         server
@@ -313,7 +313,7 @@ fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
     second
         .program
         .ends(1)
-        .check_says("or --restore, got 1 of another run");
+        .check_says("without --restore, got 1 of an earlier run");
 }
 
 #[test]
@@ -341,9 +341,9 @@ fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
     folder.write("snaps", "no folder");
     let mut client = server.acquire(0..1);
     fly_on(&mut client, 0, 300);
-    server.program.wait_for_words("not saved");
+    server.program.wait_for_words("no snapshot was written");
     let log = server.program.stderr();
-    assert!(log.matches("not saved").count() < 30, "{log}");
+    assert!(log.matches("no snapshot was written").count() < 30, "{log}");
 }
 
 #[test]
@@ -360,7 +360,7 @@ fn a_world_in_its_burn_in_begins_again_after_a_restart() {
     server.program.until(|| !snapshots_in(&folder).is_empty());
     server.kill();
     drop(pending);
-    // A copy as if it were of a server with short resets.
+    // A copy of the snapshot with the settings of a server with a short burn-in.
     let bytes = std::fs::read(&snapshots_in(&folder)[0]).expect("the snapshot");
     let restored = decode(&bytes).and_then(|file| file.restore(&small_spec(ENDLESS)));
     let restored = restored.expect("of that server");

@@ -1,4 +1,4 @@
-//! `emberwatch-agent suite` and `leaderboard`: results that go on, one score, a page of entries.
+//! `emberwatch-agent suite` and `leaderboard`: resumed results, the score, and the page of entries.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::PolicyRun;
@@ -18,7 +18,7 @@ test_seeds = { start = 0, end = 3 }
 
 const PAGE: &str = "# Leaderboard\n\n<!-- made by `emberwatch-agent leaderboard` -->\n";
 
-/// A folder with the task, results and entries.
+/// A folder with a task, results and entries.
 struct Place(Folder);
 
 impl Place {
@@ -63,7 +63,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
     let csv = || place.0.text("out/tiny.csv");
     let rows = csv();
     assert_eq!(rows.lines().count(), 1 + 3 * 3, "{rows}");
-    // What is there is not run again: its plans took as long as before.
+    // Existing rows are not run again: their planning times are unchanged.
     let more = place.suite("--policies coverage,beam_exploit,learned_beam");
     more.check_prints("| beam_exploit |");
     more.check_says("3 rows of coverage kept");
@@ -114,7 +114,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
         check(AGENT, &place.board(), &format!("{name} | {words}"));
         place.0.write(&file, entry);
     }
-    // A limit of file sizes stands for a full disk.
+    // A limit on file sizes simulates a full disk.
     let (program, board) = (program_path(AGENT), place.board());
     let script = format!(
         "trap '' XFSZ; ulimit -f 1; exec {} {board}",
@@ -129,7 +129,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
 fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     let place = Place::new();
     place.suite("--policies coverage");
-    // Rows that Python wrote on the same worlds.
+    // Rows as Python writes them for the same worlds.
     let rows = place.0.text("out/tiny.csv");
     let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
     let python: Vec<String> = of_coverage

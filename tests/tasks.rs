@@ -1,4 +1,4 @@
-//! Tasks: the worlds of a name are those of the same flags, and all that knows the server names it.
+//! Tasks: a task's worlds equal those of the same flags, and `hello`, `status` and snapshots name the task.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
@@ -6,11 +6,11 @@ use emberwatch_protocol::task::Task;
 use emberwatch_sim::snapshot::decode;
 use tests::harness::{AGENT, Folder, Program, SERVER, Server, fly_on, repository, reset};
 
-/// The task `small`, by hand.
+/// The settings of the task `small` as flags.
 const SMALL_BY_HAND: &str =
     "--model wildfire-small --height 16 --width 16 --moves 16 --burn-in 3000 --max-steps 300";
 
-/// A built-in task as text, with the name `mine`.
+/// Returns the text of a built-in task, renamed to `mine`.
 fn mine(task: &str) -> String {
     let text = std::fs::read_to_string(repository().join(format!("config/tasks/{task}.toml")));
     let text = text.expect("the task");
@@ -45,7 +45,7 @@ fn hello_status_and_snapshots_name_the_task() {
     let by_hand = Server::start(SMALL_BY_HAND);
     assert_eq!(by_hand.info().task, None);
     assert_eq!(json(&by_hand).get("task"), None);
-    // A snapshot fits the same worlds by flags.
+    // A snapshot fits a server whose equal settings come from flags.
     for (from, to, is_named) in [(&server, &by_hand, true), (&by_hand, &server, false)] {
         let file = folder.word("one.snapshot");
         from.command(&format!("snapshot {file}")).check(0);
@@ -66,7 +66,7 @@ fn an_agent_refuses_a_server_of_another_task() {
     let server = Server::start(&task);
     let flags = format!("--steps 1 --policy coverage {task}");
     Program::agent(&server.instance, &flags).ends(0);
-    // What counts is what the server runs, not what it is called.
+    // The server's actual settings count, not the name of its task.
     for (from, to, words) in [
         (
             "burn_in = 3000",
@@ -102,7 +102,7 @@ fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
         agent(&format!("compare --task {task} {policies} --csv {csv}"));
         let runs = read_runs(&folder.path("rows.csv")).expect("rows");
         assert!(runs.iter().map(|run| run.world_seed).eq(0..n_seeds));
-        // Also where these are more than a comparison has by default.
+        // Also if a task has more steps and robots than the default of a comparison.
         assert!(
             runs.iter()
                 .all(|run| (run.steps, run.robots) == (max_steps, 4)),
@@ -126,7 +126,7 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
         .replace("\"mine\"", "\"small\"")
         .replace("moves = 16", "moves = 15");
     let other = folder.write("other.toml", other);
-    // No reader waits for a writer that never comes.
+    // A pipe as a task file is refused; opening it would wait forever for a writer.
     let pipe = folder.word("pipe");
     let made = std::process::Command::new("mkfifo").arg(&pipe).status();
     assert!(made.expect("mkfifo").success());
@@ -137,7 +137,7 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
 --task jacksboro --states-offset 3 => states_offset: expected to be left out, as the task decides it
 --task= => task : expected a name or a file, got \"\"
 --task FILE => missing field `moves`
---task OTHER => name: expected one of its own, got small, which is built in
+--task OTHER => name: expected a name that no built-in task has, got small
 --task PIPE => expected a regular file, got a pipe";
     let table = table.replace("FILE", &file).replace("OTHER", &other);
     check_table(SERVER, &table.replace("PIPE", &pipe));
@@ -156,7 +156,8 @@ run --task ash => task ash: No such file";
         let file = folder.write("mine.toml", mine(task));
         Task::named(&file).expect("a task of a built-in name");
         folder.write(name, "");
-        let words = format!("{setting}: expected a file with a name of its own, got {name}");
+        let words =
+            format!("{setting}: expected a file whose name is not a built-in one, got {name}");
         check(SERVER, &format!("--task {file}"), &words);
     }
 }

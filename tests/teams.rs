@@ -1,5 +1,5 @@
-//! Several robots in one world, flown by several clients: the same paths give the same bytes, and no client that dies,
-//! hangs, is replaced or is not allowed changes what the others fly and see.
+//! Several robots in one world, flown by several clients. The same paths give the same bytes. A client that dies,
+//! hangs, is replaced or is refused does not change what the others fly and see.
 
 use crate::commands::check;
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
@@ -24,7 +24,7 @@ use tests::wire::{
     Pending, RawClient, Wire, answer, observe_header, recall_header, step_body, step_header,
 };
 
-/// Robots of the world.
+/// Number of robots in the world.
 const TEAM: u32 = 4;
 
 const N_MOVES: usize = 10;
@@ -33,7 +33,7 @@ const FLAGS: &str = "--height 9 --width 14 --moves 10 --burn-in 2000 --robots 4"
 
 const N_STEPS: u64 = 12;
 
-/// A client of some robots.
+/// A client with a lease on some robots.
 struct Flyer {
     wire: Wire,
     lease: u64,
@@ -61,7 +61,7 @@ impl Flyer {
         }
     }
 
-    /// Sends its robots' paths for a step.
+    /// Sends the robots' paths for a step.
     fn send(&self, k: u64) -> Sent {
         let robots = self.robots.clone();
         let paths: Vec<u8> = robots.flat_map(|robot| path(k, robot)).collect();
@@ -80,7 +80,7 @@ impl Flyer {
         shown.collect()
     }
 
-    /// Waits until so many robots of the world have a path for its next step.
+    /// Waits until `n_paths` robots of the world have a path for its next step.
     fn wait_for_paths(&self, n_paths: u32) {
         let has_come = || match self.wire.ask(&Request::Status {}) {
             Reply::Status(status) => status.worlds[0].n_paths == n_paths,
@@ -90,12 +90,13 @@ impl Flyer {
     }
 }
 
-/// The path of a robot in a step.
+/// Returns the path of a robot in a step.
 fn path(k: u64, robot: u32) -> Vec<u8> {
     path_to_bytes(&Paths::new(k * u64::from(TEAM) + u64::from(robot)).next(N_MOVES))
 }
 
-/// The steps of four robots, flown by clients that each hold some; the clients send in another order in each step.
+/// Flies four robots by clients that each hold a share, and returns the observations. The order in which the clients
+/// send changes in each step.
 fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
     let flyer = |robots: &Range<u32>| Flyer::new(server, robots.clone());
     let flyers: Vec<_> = shares.iter().map(flyer).collect();
@@ -128,7 +129,7 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
         own > step[0].0.n_visited
     };
     assert!(expected.iter().any(has_shared), "no cell was visited twice");
-    // A team frame holds what all saw, and is open to all.
+    // A team frame combines the observations of all robots, and any client may request it.
     let last = expected.last().expect("steps");
     let union = |cell: usize| last.iter().map(|(.., frame)| frame[cell]).min();
     let union: Vec<u8> = (0..9 * 14).filter_map(union).collect();
@@ -151,7 +152,7 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     let (_folder, file) = new_file();
     let recorder = start_recorder(&apart.instance, &file, "");
     assert!(fly(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
-    apart.info(); // told after the last step was published
+    apart.info(); // answered only after the last step was published
     stop(recorder);
     let in_parts = Server::start(FLAGS);
     assert!(fly(&in_parts, &[0..3, 3..4]) == expected);
@@ -178,7 +179,7 @@ fn a_path_that_is_given_up_is_never_flown() {
     second.wait_for_paths(2);
     drop(given_up);
     second.wait_for_paths(0);
-    // The connection of who waits is closed.
+    // Closes the connection of a client that waits.
     let waiting = second.send(0);
     first.wait_for_paths(2);
     drop((waiting, second));
@@ -186,7 +187,7 @@ fn a_path_that_is_given_up_is_never_flown() {
     assert_eq!(server.step_of(0), 0, "nothing was flown");
 }
 
-/// A world of agents, and of robot 0, which this process flies.
+/// A world in which this process flies robot 0 and agents fly the other robots.
 struct Lab {
     server: Server,
     world: PacedWorld,
@@ -204,14 +205,14 @@ impl Lab {
         Program::agent(&self.server.instance, &flags)
     }
 
-    /// Three agents, once all robots fly.
+    /// Starts three agents and waits until all robots fly.
     fn start_agents(&mut self) -> [Program; 3] {
         let agents = [1, 2, 3].map(|robot| self.start_agent(robot, ""));
         self.until(&agents.each_ref(), all_fly);
         agents
     }
 
-    /// Steps until a result is as wanted; every step on the way must be as its own paths make it.
+    /// Steps until a result is as wanted, and checks that every step agrees with its paths.
     fn until(&mut self, agents: &[&Program], mut wanted: impl FnMut(&WorldResult) -> bool) {
         let start = Instant::now();
         while !wanted(&self.step()) {
@@ -226,7 +227,7 @@ impl Lab {
     }
 }
 
-/// No robot stays.
+/// Returns whether all robots flew.
 fn all_fly(world: &WorldResult) -> bool {
     world.hovered | world.late == 0
 }
@@ -275,7 +276,7 @@ fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
     let holder = lab.server.status().worlds[0].holder_pids[3];
     assert_eq!(holder, None);
     three.signal(Signal::CONT);
-    // It has no world to wait for it: it asks by itself, and hears.
+    // The world does not wait for this robot, so no refusal reaches the agent until its own next request.
     three.ends(3).check_says("lease lost");
 }
 
@@ -290,7 +291,7 @@ fn a_stopped_agent_is_late_and_flies_again_when_it_wakes() {
     }
     three.signal(Signal::CONT);
     lab.until(&[&one, &two, &three], all_fly);
-    three.wait_for_words("late: the world went on");
+    three.wait_for_words("late: the world advanced");
     assert!(!three.has_ended(), "{}", three.stderr());
 }
 
@@ -330,13 +331,13 @@ fn agents_disturbed_at_random_change_nothing_for_the_others() {
     }
 }
 
-/// Flies a lively world of four robots by agents that hold some each; returns the paths by step, and the reward.
+/// Flies four robots by agents that each hold a share, in a world with many fires. Returns paths and reward.
 fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     const N_STEPS: usize = 40;
     let server = Server::start(
         "--model wildfire-small --height 16 --width 14 --moves 8 --burn-in 300 --robots 4",
     );
-    // Holds the world until each robot has its agent.
+    // Holds all robots, so that the world does not move until each robot has its agent.
     let _holder = server.acquire(0..4);
     let frames = Observer::frames(&server.instance).expect("the channel");
     let start = |robots: &Range<u32>| {
@@ -369,13 +370,13 @@ fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
     let together = flown_by(std::slice::from_ref(&all), "--team");
     assert_eq!(flown_by(&single, "--team"), together);
     assert_eq!(flown_by(&[0..1, 1..4], "--team"), together);
-    // One that plans for itself flies where others fly too.
+    // Agents that plan independently fly over the same cells.
     let (_, alone) = flown_by(&single, "");
     assert!(together.1 > 1.2 * alone, "{} and {alone}", together.1);
     flown_by(&single, "--share");
     let server = Server::start(&format!("{FLAGS} --publish-truth"));
     let check = |flags: &str, words: &str| check(AGENT, &format!("{flags} {}", on(&server)), words);
-    let robots = "expected some of the world's 0..4, got";
+    let robots = "expected a part of the world's robots 0..4, got";
     check("run --robot 4", &format!("{robots} 4..5"));
     check("run --robots 2..6 --team", &format!("{robots} 2..6"));
     check(

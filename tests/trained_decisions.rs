@@ -1,4 +1,4 @@
-//! `emberwatch-agent train --learner decisions`: a filter first, then which option to fly.
+//! `emberwatch-agent train --learner decisions`: learns first a filter, then the choice between options.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -28,7 +28,7 @@ fn place() -> Place {
     Place::new(SETTINGS, HEADER)
 }
 
-/// World steps at the end of a training; its losses must be finite.
+/// Returns the number of world steps at the end of a training, and checks that its losses are finite.
 fn steps(place: &Place, out: &str) -> String {
     let rows = place.rows(out);
     let row = rows.last().expect("rows");
@@ -37,7 +37,7 @@ fn steps(place: &Place, out: &str) -> String {
     row[1].clone()
 }
 
-/// The kernels and the estimator that a checkpoint has.
+/// Returns the kind of kernels and the estimator in a checkpoint.
 fn saved(place: &Place, out: &str) -> (KernelKind, String) {
     let contents = place.contents(out);
     let settings: AgentConfig = contents.settings().expect("its settings");
@@ -56,7 +56,7 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
         "100",
         "those that were left of the settings"
     );
-    place.refuse("out", &resume, "--steps: expected a number, as the 100");
+    place.refuse("out", &resume, "expected a number of steps, as all 100");
     let compared = place.compare("out", "--policies options");
     for words in [
         "random_walk",
@@ -76,7 +76,7 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
     let [decisions, filter, other] = ["out", "out/belief", "other"].map(|out| place.flag(out));
     let one = "--policies known/options/learned --baseline coverage";
     let words =
-        "known/options/learned | expected decisions on the belief known, got some on learned";
+        "known/options/learned | expected decisions on the belief known, got decisions on learned";
     check(
         AGENT,
         &format!("compare {COMPARED} {one} {decisions}"),
@@ -96,7 +96,7 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
 fn a_training_that_ended_in_its_filter_resumes_there() {
     let place = place();
     let first = format!("{WORLDS} --estimator learned_spatial_filter --kernels own");
-    let words = "the belief is not learned yet: continue with --resume";
+    let words = "the time ended before the belief was learned: continue with --resume";
     place.refuse("out", &format!("{first} --time-limit 0"), words);
     assert!(!place.checkpoint("out").exists());
     let resume = format!("{WORLDS} --resume --steps 20");
@@ -112,7 +112,7 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
     place.train("out", &format!("{resume} --time-limit 1e19"));
     let expected = (KernelKind::Own, "learned_spatial_filter".to_owned());
     assert_eq!(saved(&place, "out"), expected);
-    // From here on there are decisions to go on from.
+    // The checkpoint now holds decisions, from which a training can resume.
     let filter = place.flag("out/belief");
     let model = repository().join("config/models/wildfire-small.toml");
     let model = std::fs::read_to_string(model).expect("a model");
@@ -126,20 +126,20 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
         &resume,
         &format!(
             "--estimator learned_filter {other}
-{filter} => --checkpoint: expected none beside --resume
-{model} => checkpoint: expected 4 observations as the world's, got 3"
+{filter} => --checkpoint cannot be combined with --resume
+{model} => checkpoint: expected the world's 4 observations, got 3"
         ),
     );
     place.train("out", &resume);
     assert_eq!(steps(&place, "out"), "40");
-    // A filter that was given is the estimator's.
+    // A filter given by `--checkpoint` must be the estimator's filter.
     let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
     let given = format!("{} --worlds 2 --steps 4", on(&server));
     place.refuse_all(
         "given",
         &format!("{given} {filter}"),
         "--estimator known_model => --checkpoint | known_model
---learner filter => --checkpoint: expected none, or --learner decisions",
+--learner filter => --checkpoint applies only with --learner decisions",
     );
     let spatial = "--estimator learned_spatial_filter";
     place.train("given", &format!("{given} {filter} {spatial}"));
@@ -147,7 +147,7 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
     place.refuse_all(
         "hidden",
         &given,
-        "--learner filter --estimator known_model => --estimator: expected none, or
+        "--learner filter --estimator known_model => --estimator applies only with
 --estimator known_model => --reveal-model true
 --estimator filter => --estimator | got",
     );

@@ -1,4 +1,4 @@
-//! `emberwatch-agent train --learner neural`: a belief from what was seen, and what acts on it.
+//! `emberwatch-agent train --learner neural`: learns a belief from frames, on which policies act.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -32,7 +32,7 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
     let rows = place.learn("out", &resume);
     let last = rows.last().expect("rows");
     assert_eq!(last[1], "60", "those that were left of the settings");
-    place.refuse("out", &resume, "--steps: expected a number, as the 60 of");
+    place.refuse("out", &resume, "expected a number of steps, as all 60");
     let policies = "--policies neural_beam,neural/options/rule --baseline neural_beam";
     place
         .compare("out", policies)
@@ -40,7 +40,7 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
     let checkpoint = place.flag("out");
     let evaluated = agent(&format!("evaluate {COMPARED} {checkpoint}"));
     evaluated.check_prints("neural_belief - known_model");
-    // The same network on another grid.
+    // The same network also works on another grid.
     let server = Server::start(SMALL);
     let flags = format!("run {} --steps 5 --policy neural_beam", on(&server));
     agent(&format!("{flags} {checkpoint}"));
@@ -56,7 +56,11 @@ fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     let filter = place.flag("filter");
     place.learn("out", &format!("{WORLDS} {filter} --steps 40"));
     let again = format!("{WORLDS} {filter} --resume");
-    place.refuse("out", &again, "--checkpoint: expected none beside --resume");
+    place.refuse(
+        "out",
+        &again,
+        "--checkpoint cannot be combined with --resume",
+    );
     place.learn("out", &format!("{WORLDS} --resume"));
     let policies = "--policies neural_beam --baseline neural_beam";
     place.compare("out", policies).check_prints("neural_beam");

@@ -1,4 +1,4 @@
-//! `emberwatch-agent train` and what becomes of its checkpoints.
+//! `emberwatch-agent train` and the use of its checkpoints.
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -81,21 +81,21 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
             let resume = if done > 0 { "--resume" } else { "" };
             let flags = format!("--worlds 2 --steps {} {resume}", stop - done);
             let ended = place.train(out, &format!("{} {flags}", on(&server)));
-            assert!(!ended.stderr.contains("begin again"), "{}", ended.stderr);
-            // Two worlds step at once.
+            assert!(!ended.stderr.contains("start anew"), "{}", ended.stderr);
+            // Two worlds step together, so the number of steps is even.
             done = stop.next_multiple_of(2);
         }
         (place.rows(out), place.contents(out))
     };
     let (rows, whole) = train("whole", &[200]);
-    // In the walk, in mid-block and mid-window, and after the first updates.
+    // Stops during the random walk, within a block and a window, and after the first updates.
     let (rows_of_parts, parts) = train("parts", &[22, 61, 100, 200]);
     assert_eq!(rows, rows_of_parts);
     let losses: Vec<f64> = rows.iter().filter_map(|row| row[2].parse().ok()).collect();
     assert!(losses.len() > 80, "{losses:?}");
     assert!(losses.iter().all(|loss| loss.is_finite()), "{losses:?}");
     assert_eq!(rows.last().map(|row| &*row[1]), Some("200"));
-    // Parameters, moments, replay, streams and beliefs alike.
+    // Equal checkpoints have equal parameters, moments, replay buffers, streams and beliefs.
     assert!(whole == parts, "checkpoints differ");
 }
 
@@ -104,10 +104,10 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
     let place = place();
     place.train("path", &format!("{WORLDS} --steps 120"));
     place.train("full", &format!("{WORLDS} --steps 120 --coverage full"));
-    // The replay keeps 54 cells of a step, where a path of five moves shows at most six.
+    // The replay buffer stores 54 cells per step, while a path of five moves shows at most six.
     let size = |out: &str| place.bytes(out).len();
     assert!(2 * size("full") > 3 * size("path"));
-    // On a new server the replay begins empty, and fills with full frames again.
+    // On a new server the replay buffer starts empty, and fills with full frames again.
     place.train("full", &format!("{WORLDS} --steps 120 --resume"));
     assert!(2 * size("full") > 3 * size("path"));
     let server = Server::start(SMALL);
@@ -115,7 +115,7 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
         (
             "full",
             &*format!("{WORLDS} --resume --coverage path"),
-            "--coverage: expected the checkpoint's, full",
+            "--coverage: expected full as in the checkpoint, got path",
         ),
         (
             "new",
@@ -137,7 +137,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let place = place();
     let before = place.learn("out", &format!("{WORLDS} --steps 80"));
     let checkpoint = place.bytes("out");
-    place.refuse("out", WORLDS, "--out | expected --resume");
+    place.refuse("out", WORLDS, "--out | add --resume");
     let flags = format!("{WORLDS} --steps 80 --resume --freeze");
     assert_eq!(place.learn("out", &flags), before, "metrics of learning");
     assert!(
@@ -146,7 +146,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     );
     assert_eq!(place.folder.text("out/frozen.csv").lines().count(), 1 + 40);
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
-    ended.check_says("beliefs begin again robots=2");
+    ended.check_says("beliefs start anew robots=2");
     let files = std::fs::read_dir(place.folder.path("out")).expect("the folder");
     let names = files.map(|file| file.expect("a file").file_name());
     let runs = names.filter(|name| name.to_string_lossy().contains(".tfevents."));
@@ -169,7 +169,7 @@ fn a_moved_world_begins_a_new_track_and_keeps_the_replay() {
     assert_eq!([0, 1].map(|world| server.step_of(world)), [30 % 9; 2]);
     fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
     let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
-    ended.check_says("beliefs begin again robots=1");
+    ended.check_says("beliefs start anew robots=1");
     let rows = place.rows("out");
     assert!(updates(&rows[n_rows]) > updates(&rows[n_rows - 1]));
 }
@@ -178,7 +178,7 @@ fn a_moved_world_begins_a_new_track_and_keeps_the_replay() {
 fn a_number_that_is_not_finite_ends_training_by_name() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    // Finite, but a large step along it is not.
+    // The moment is finite, but a large step along it is not.
     place.set(&format!("{SETTINGS}rate = 1.0\nobservation_rate = 100.0\n"));
     let mut contents = place.contents("out");
     for (name, number) in [("first_moment", f32::MAX), ("second_moment", 0.0)] {
@@ -190,8 +190,8 @@ fn a_number_that_is_not_finite_ends_training_by_name() {
     let (n_rows, next) = (place.rows("out").len(), n_updates(&contents) + 1);
     let resume = format!("{WORLDS} --steps 80 --resume");
     let words = format!(
-        "update {next}: likelihood: expected finite numbers, got a step to a number that is not; \
-         what was learned before is in {}",
+        "update {next}: likelihood: expected finite numbers, got a NaN or infinite step; \
+         the training so far is saved in {}",
         checkpoint.display()
     );
     place.refuse("out", &resume, &words);
@@ -202,7 +202,7 @@ fn a_number_that_is_not_finite_ends_training_by_name() {
     }
     assert_eq!(n_updates(&saved), next - 1);
     assert!(place.rows("out").len() >= n_rows);
-    // It reads back whole: a later run gets as far, and no further.
+    // The checkpoint loads completely: a later run fails at the same point.
     place.refuse("out", &resume, "likelihood: expected finite numbers");
 }
 
@@ -281,7 +281,7 @@ fn a_checkpoint_is_compared_evaluated_and_checked() {
         place.refuse(
             "new",
             &flags,
-            "--kernels: expected a filter that is learned",
+            "--kernels applies only where a filter is trained",
         );
     }
     place.set(&SETTINGS.replace("[learning]", "[learning]\nkernel = [5, 5]"));
@@ -289,12 +289,12 @@ fn a_checkpoint_is_compared_evaluated_and_checked() {
     place.refuse("out", &resume, shape);
     let whole = place.bytes("out");
     std::fs::write(place.checkpoint("out"), &whole[..whole.len() / 2]).expect("cut");
-    let damaged = "checkpoint.safetensors | damaged or cut off";
+    let damaged = "checkpoint.safetensors | damaged or truncated";
     place.refuse("out", &resume, damaged);
     check(AGENT, &format!("evaluate {COMPARED} {out}"), damaged);
 }
 
-/// Flags of `train`, `evaluate` and `compare`, and the words of their refusal.
+/// Flags of `train`, `evaluate` and `compare`, and words of their refusal.
 const WRONG_FLAGS: &str = "
 train => --out
 train --out /proc/no => create /proc/no
@@ -302,7 +302,7 @@ train --out /tmp --freeze => --resume
 train --out OUT --worlds 0 => --worlds | 1..=1024
 train --out OUT --instance nobody --wait 0 => no server on instance \"nobody\"
 train --out OUT --instance x --height 9 => --instance | --height
-train --out OUT --time-limit=-1 => --time-limit | expected seconds
+train --out OUT --time-limit=-1 => --time-limit | expected a number of seconds
 train --out OUT --model no.toml => model file no.toml | No such file
 train --out OUT --world 3 => --world: expected 0
 train --out OUT --server no/such => start no/such | No such file

@@ -1,14 +1,14 @@
-//! Trainings, each in a folder of its own.
+//! Helpers for trainings, each in its own folder.
 
 use crate::commands::{agent, check};
 use emberwatch_learning::checkpoint::{self, Contents};
 use std::path::PathBuf;
 use tests::harness::{AGENT, Ended, Folder, Server};
 
-/// A private server with small worlds.
+/// Flags of a private server with small worlds.
 pub const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
 
-/// A folder with settings, in which trainings write into folders of theirs.
+/// A folder with a settings file and the output folders of trainings.
 pub struct Place {
     pub folder: Folder,
     /// Columns of the metrics.
@@ -23,7 +23,7 @@ impl Place {
         place
     }
 
-    /// Writes other settings.
+    /// Replaces the settings file.
     pub fn set(&self, settings: &str) {
         self.folder.write("agent.toml", settings);
     }
@@ -32,7 +32,7 @@ impl Place {
         self.folder.path(out).join("checkpoint.safetensors")
     }
 
-    /// The flag that names a checkpoint.
+    /// Returns the flag that names a checkpoint.
     pub fn flag(&self, out: &str) -> String {
         format!("--checkpoint {}", self.checkpoint(out).display())
     }
@@ -47,7 +47,7 @@ impl Place {
             .1
     }
 
-    /// The command's words for training into a folder.
+    /// Returns the arguments of a training into a folder.
     pub fn words(&self, out: &str, flags: &str) -> String {
         let [config, out] = ["agent.toml", out].map(|name| self.folder.word(name));
         format!("train --config {config} --out {out} {flags}")
@@ -61,7 +61,7 @@ impl Place {
         check(AGENT, &self.words(out, flags), words);
     }
 
-    /// Each line of the table has flags, ` => ` and words of the refusal.
+    /// Checks the refusal of each line of a table: flags, ` => ` and words of the error.
     pub fn refuse_all(&self, out: &str, flags: &str, table: &str) {
         for line in table.lines() {
             let (more, words) = line.split_once(" => ").expect("flags and words");
@@ -75,7 +75,7 @@ impl Place {
         self.rows(out)
     }
 
-    /// The rows of the metrics.
+    /// Returns the rows of the metrics.
     pub fn rows(&self, out: &str) -> Vec<Vec<String>> {
         let text = self.folder.text(&format!("{out}/metrics.csv"));
         let mut lines = text.lines();
@@ -84,17 +84,17 @@ impl Place {
         rows.collect()
     }
 
-    /// The policies that a comparison of small worlds prints, with a checkpoint.
+    /// Compares policies on small worlds with a checkpoint.
     pub fn compare(&self, out: &str, flags: &str) -> Ended {
         agent(&format!("compare {COMPARED} {} {flags}", self.flag(out)))
     }
 }
 
-/// Worlds of a comparison or an evaluation of a moment.
+/// Worlds of a very short comparison or evaluation.
 pub const COMPARED: &str = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
                             --beam-width 4 --shooting-samples 16";
 
-/// The flag that names a server.
+/// Returns the flag that names a server.
 pub fn on(server: &Server) -> String {
     format!("--instance {}", server.instance.name())
 }

@@ -1,11 +1,11 @@
-"""The protocol's second witness: a client written from PROTOCOL.md, on iceoryx2's Python binding.
+"""An independent client, written from PROTOCOL.md on iceoryx2's Python binding.
 
-It shares no code with the other clients, so that an error of theirs is not the protocol's.
-Sections are those of PROTOCOL.md. `wire_reference.py INSTANCE` connects, then sends what the
-compliance suite tells it: each line of its standard input is a request, `{"service": "step",
-"header": "<hex>", "payload": "<hex>"}`, whose last 16 bytes of the header, the listener, it fills
-in itself; each line of its standard output is the answer, `{"header": "<hex>", "payload":
-"<hex>"}`. It ends with an error if an answer is not as PROTOCOL.md has it.
+It shares no code with the other clients, so that their errors cannot pass as the protocol.
+"Section" refers to PROTOCOL.md. `wire_reference.py INSTANCE` connects and sends the requests of
+the compliance suite. Each line of its standard input is a request, `{"service": "step",
+"header": "<hex>", "payload": "<hex>"}`; the client itself fills in the last 16 bytes of the
+header, the listener's id. Each line of its standard output is an answer, `{"header": "<hex>",
+"payload": "<hex>"}`. It fails if an answer violates PROTOCOL.md.
 """
 
 import contextlib
@@ -26,10 +26,10 @@ import iceoryx2 as iox2
 
 VERSION = 2
 
-#: Most nodes, listeners and notifiers of a service.
+#: Maximum number of nodes, of listeners and of notifiers per service.
 MAX_NODES = 64
 
-#: Longest wait for a turn or an answer, seconds.
+#: Maximum wait for a turn or an answer, in seconds.
 TIMEOUT = 10.0
 
 SHARED_MEMORY = Path("/dev/shm")
@@ -38,7 +38,7 @@ ROOT = SHARED_MEMORY / f"emberwatch-{os.getuid()}"
 
 BYTES: Any = iox2.Slice[ctypes.c_uint8]
 
-#: Section 3: by struct its format, and its fields.
+#: Section 3: the format and the field names of each struct.
 LAYOUTS = {
     "StepRequest": (
         "=IIQQIIIIQQ",
@@ -65,7 +65,7 @@ LAYOUTS = {
 
 
 def header_type(name: str) -> Any:
-    """A header as iceoryx2 takes it: a structure with a type name."""
+    """Returns the type of a header for iceoryx2: a structure with a type name."""
     layout, names = LAYOUTS[name]
     kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
     fields = [(field, kinds[it]) for field, it in zip(names.split(), layout[1:], strict=True)]
@@ -74,19 +74,19 @@ def header_type(name: str) -> Any:
 
 
 def read(name: str, message: bytes, offset: int = 0) -> dict[str, Any]:
-    """The fields of a struct by name."""
+    """Unpacks a struct into a dictionary of its fields."""
     layout, names = LAYOUTS[name]
     return dict(zip(names.split(), struct.unpack_from(layout, message, offset), strict=True))
 
 
 def check(fits: bool, expected: str, got: object) -> None:
-    """Ends with an error where something is not as it must be."""
+    """Raises an error unless `fits` holds."""
     if not fits:
         raise ValueError(f"expected {expected}, got {got}")
 
 
 def check_places() -> None:
-    """Section 1: the directory and all shared memory of the prefix are this user's alone."""
+    """Section 1: checks that only this user can access the directory and the shared memory."""
     with contextlib.suppress(FileExistsError):
         ROOT.mkdir(mode=0o700)
     found = ROOT.lstat()
@@ -102,7 +102,7 @@ def check_places() -> None:
 
 @contextlib.contextmanager
 def turn() -> Iterator[None]:
-    """Section 1: what makes or removes nodes, services or ports takes turns."""
+    """Section 1: takes the lock under which nodes, services and ports are made or removed."""
     path, start = ROOT / "lock", time.monotonic()
     holder, since = None, start
     while True:
@@ -117,7 +117,7 @@ def turn() -> Iterator[None]:
         holder = next((it.split()[4] for it in locks if inode in it and "->" not in it), None)
         since = since if holder == before else now
         if holder is not None and now - since > 2.0:
-            yield  # A stopped or frozen process has it.
+            yield  # A stopped or frozen process holds the lock: continue without it.
             return
         check(now - start < TIMEOUT, "the lock in time", f"it held by {holder}")
         time.sleep(0.001)
@@ -128,7 +128,7 @@ def turn() -> Iterator[None]:
 
 
 def make_way() -> None:
-    """Section 1: room for ports, and nothing unfinished, for which iceoryx2 waits without end."""
+    """Section 1: checks for free space, and waits for unfinished files, which block iceoryx2."""
     free, start = os.statvfs(SHARED_MEMORY), time.monotonic()
     check(free.f_bavail * free.f_frsize >= 512 << 10, "512 KiB of shared memory", free)
     check(free.f_files == 0 or free.f_favail >= 48, "room for 48 files", free)
@@ -138,7 +138,7 @@ def make_way() -> None:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Section 9; but `.data` of others may grow at any time."""
+    """Section 1: returns whether a file is still being made. `.data` files may grow later."""
     with contextlib.suppress(FileNotFoundError):
         found = path.lstat()
         return path.suffix != ".data" and not (found.st_size and found.st_mode & stat.S_IRUSR)
@@ -146,7 +146,7 @@ def is_unfinished(path: Path) -> bool:
 
 
 def fill_segments() -> None:
-    """Section 1: gives this process's segments, whose names have its ids, all their memory."""
+    """Section 1: allocates the memory of this process's segments, whose names hold its ids."""
     for path in SHARED_MEMORY.glob(f"{PREFIX}*"):
         words = path.name.removeprefix(PREFIX).partition(".")[0].split("_")
         ids = [int(word) for word in words if word.isdecimal() and len(word) < 40]
@@ -156,7 +156,7 @@ def fill_segments() -> None:
 
 
 def create_node() -> Any:
-    """Section 1: of its own configuration, without signals and clean-ups of iceoryx2's own."""
+    """Section 1: creates a node with its own paths, without iceoryx2's signals and clean-ups."""
     config: Any = iox2.config.default()
     config.global_cfg.root_path = iox2.Path.new(f"{ROOT}/")
     config.global_cfg.prefix = iox2.FileName.new(PREFIX)
@@ -174,12 +174,12 @@ class Port:
     """A client of one request-response service."""
 
     def __init__(self, service: Any, request: str, reply: str) -> None:
-        """Opens it; `service` is iceoryx2's builder."""
+        """Opens the port; `service` is iceoryx2's builder."""
         self._size = ctypes.sizeof(header_type(reply))
         builder = service.request_response(BYTES, BYTES).request_header(header_type(request))
         opened = builder.response_header(header_type(reply)).open()
         check(opened.dynamic_config.number_of_servers == 1, "a server", "none")
-        # On `step` a client asks for its longest step, static; the suite sends longer ones.
+        # Other clients allocate statically for their longest step; the suite sends longer ones.
         port = opened.client_builder().initial_max_slice_len(4096)
         self._port = port.allocation_strategy(iox2.AllocationStrategy.PowerOfTwo).create()
 
@@ -192,7 +192,7 @@ class Port:
         return pending
 
     def take(self, pending: Any, response: Any) -> tuple[bytes, bytes]:
-        """Header and payload of an answer, copied; the next request needs its place."""
+        """Copies an answer's header and payload, and frees it for the next request."""
         header = ctypes.string_at(response.user_header_ptr, self._size)
         payload = ctypes.string_at(response.payload_ptr, response.payload().len())
         response.delete()
@@ -204,7 +204,7 @@ class Client:
     """A connection to a server."""
 
     def __init__(self, instance: str) -> None:
-        """Opens all services in one turn, then says hello."""
+        """Opens all services in one turn, then sends `hello`."""
         self._process: int | None = None
         check_places()
         with turn():
@@ -235,13 +235,13 @@ class Client:
         self._process = os.pidfd_open(self._info["pid"])
 
     def step(self, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Sends a step request, whatever it says."""
+        """Sends a step request, valid or not, and checks the answer."""
         answer = self._exchange(self._step, header, payload)
         self._check_step(read("StepRequest", header), read("StepReply", answer[0]), answer[1])
         return answer
 
     def control(self, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Sends bytes on `control`, whatever they say."""
+        """Sends bytes on `control`, valid or not, and checks the answer."""
         answer = self._exchange(self._control, header, payload)
         request, reply = read("ControlRequest", header), read("ControlReply", answer[0])
         told = (reply["version"], reply["sequence"])
@@ -251,25 +251,25 @@ class Client:
         return answer
 
     def _exchange(self, port: Port, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Section 8: wakes the server and waits for its answer, or for its end."""
+        """Section 8: wakes the server and waits for its answer or its end."""
         pending = port.send(header, payload)
         self._notifier.notify()
         start, is_gone = time.monotonic(), False
         while True:
-            # In this order: an answer may come just before the end.
+            # Receives before the check for the end, because the last answer may precede it.
             response = pending.receive()
             if response is not None:
                 return port.take(pending, response)
             waited = time.monotonic() - start
             check(not is_gone and waited < TIMEOUT, "an answer", f"none after {waited} s")
             if waited > 100e-6:
-                # Drains it, too.
+                # Also removes pending wake-ups.
                 self._listener.timed_wait(iox2.Duration.from_millis(50))
                 watched = [] if self._process is None else [self._process]
                 is_gone = bool(select.select(watched, [], [], 0)[0])
 
     def _check_step(self, request: dict[str, Any], reply: dict[str, Any], payload: bytes) -> None:
-        """Sections 3 and 4: what a client must refuse."""
+        """Sections 3 and 4: checks everything that a client must check in an answer."""
         for name in ("sequence", "first_robot", "flags"):
             check(reply[name] == request[name], f"{name} {request[name]}", reply)
         check(reply["version"] == VERSION, f"version {VERSION}", reply)
@@ -300,7 +300,7 @@ class Client:
 
 
 def main() -> None:
-    """Sends what standard input says, until it ends."""
+    """Sends the requests on standard input until its end."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     client = Client(sys.argv[1])
     for line in sys.stdin:

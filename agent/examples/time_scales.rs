@@ -1,5 +1,5 @@
-//! Draws the step sizes of autoencoder and DQN over a run of 25,000 iterations: those that vanish
-//! (`config/agent.toml`), and the authors' constants (`--preset paper`).
+//! Draws the step sizes of autoencoder and DQN over a run of 25,000 iterations: the vanishing defaults
+//! (`config/agent.toml`), and the constants of the authors (`--preset paper`).
 //!
 //! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.svg`
 

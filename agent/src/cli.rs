@@ -8,7 +8,7 @@ use emberwatch_protocol::limits::threads::NoThreads;
 use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;
 
-/// Estimates, plans and acts on an Emberwatch server.
+/// Estimates hidden states, plans paths and acts on an Emberwatch server.
 #[derive(Parser)]
 #[command(name = "emberwatch-agent", version)]
 struct Cli {
@@ -23,21 +23,21 @@ enum Command {
     Run(commands::RunCommand),
     /// Write a filter's first belief to a file
     Prior(commands::PriorCommand),
-    /// Compare policies on the same worlds: table, CSV and figures
+    /// Compare policies on the same worlds, with a table, CSV and figures
     #[command(after_long_help = policy::help())]
     Compare(commands::CompareCommand),
-    /// Run policies on the test worlds of tasks: one score for each
+    /// Run policies on the test worlds of tasks, with one score per policy
     #[command(after_long_help = policy::help())]
     Suite(commands::SuiteCommand),
-    /// Add an entry to the leaderboard, and make its page
+    /// Add an entry to the leaderboard and rebuild its page
     Leaderboard(commands::LeaderboardCommand),
-    /// Learn a model while acting: checkpoint and metrics
+    /// Learn a model while acting, with checkpoints and metrics
     Train(commands::TrainCommand),
-    /// Score a checkpoint beside the known model
+    /// Compare a checkpoint's predictions and policies with the known model's
     Evaluate(commands::EvaluateCommand),
 }
 
-/// Runs the command that the arguments say.
+/// Parses the arguments, runs the subcommand, and returns the exit code.
 pub fn main() -> ExitCode {
     set_up_process();
     emberwatch_protocol::program::start_logging();
@@ -64,7 +64,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Starts the threads that all commands share: they would start at their first work, where a failure is a panic.
+/// Starts rayon's global threads now, so that a failure is an error. Started at their first use, a failure would panic.
 fn start_threads() -> Result<(), NoThreads> {
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
     let started = ThreadPoolBuilder::new().build_global();

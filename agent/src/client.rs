@@ -1,4 +1,4 @@
-//! The agent's ends of the wire: connections, hidden states for scores, beliefs for observers.
+//! Communication with the server: connections, hidden states for scores, beliefs for observers.
 
 pub(crate) mod errors;
 pub(crate) mod info;

@@ -1,4 +1,4 @@
-//! The subcommands: flags in, library calls, files and tables out.
+//! The subcommands: they parse flags, call the library, and write files and tables.
 
 mod compare;
 mod evaluate;
@@ -26,7 +26,7 @@ use std::process::ExitCode;
 /// Exit code of a run whose lease was lost.
 const LEASE_LOST: u8 = 3;
 
-/// Where results go wrong for a reason that callers may want to tell apart, a code of its own.
+/// Returns the exit code for an error. A lost lease has a separate code, so that callers can recognise it.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     match refusal(error) {
         Some((Status::LeaseLost, ..)) => LEASE_LOST.into(),

@@ -1,4 +1,4 @@
-//! The agent's settings as flags; each overrides the preset or the file.
+//! Flags for the agent's settings. Each flag overrides the preset or the configuration file.
 
 use anyhow::{Context, Result, bail};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
@@ -11,13 +11,13 @@ use std::path::{Path, PathBuf};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// Whatever measures best
+    /// The settings that measured best
     Default,
-    /// What the paper's authors ran
+    /// The settings of the paper's authors
     Paper,
 }
 
-/// The settings as flags.
+/// Flags for the agent's settings.
 #[derive(Debug, Args)]
 pub struct AgentFlags {
     /// Start from these settings
@@ -26,21 +26,21 @@ pub struct AgentFlags {
     /// Read settings from this TOML file
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// States that beam search keeps
+    /// Number of states that beam search keeps after each move
     #[arg(long)]
     pub beam_width: Option<usize>,
-    /// Paths that shooting samples
+    /// Number of random paths that the shooting planner samples
     #[arg(long)]
     pub shooting_samples: Option<usize>,
-    /// The known-model filter's first belief
+    /// First belief of the known-model filter
     #[arg(long, value_parser = one_of(&PriorKind::ALL))]
     pub prior: Option<PriorKind>,
-    /// Seed of planners, of the prior's worlds and of learners [default: 0]
+    /// Seed of planners, of learners, and of the worlds that the first belief is simulated from [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
 }
 
-/// Parses a flag that is one of these values, by its name; the words after it explain it in `--help`.
+/// Returns a parser for a flag with these values: each has its name and its explanation in `--help`.
 pub fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [(T, &str, &str)],
 ) -> impl TypedValueParser<Value = T> {
@@ -53,7 +53,7 @@ pub fn one_of<T: Copy + Send + Sync + 'static>(
     })
 }
 
-/// As [`one_of`], of names alone.
+/// Like [`one_of`], for flags whose value is the name itself.
 pub fn one_of_names(
     all: impl Iterator<Item = (&'static str, &'static str)>,
 ) -> PossibleValuesParser {
@@ -66,7 +66,7 @@ impl AgentFlags {
         let mut config = match (&self.config, self.preset) {
             (Some(path), Preset::Default) => read(path)?,
             (Some(path), Preset::Paper) => bail!(
-                "config file {}: expected no file beside --preset paper",
+                "--config {} cannot be combined with --preset paper: remove one of them",
                 path.display()
             ),
             (None, Preset::Default) => AgentConfig::default(),

@@ -1,18 +1,18 @@
-//! Estimates, plans and acts on an Emberwatch server, and compares ways to do so.
+//! The agent of Emberwatch: estimates hidden states, plans paths, acts on a server, and compares policies.
 //!
-//! Rooms, each using only those below it:
+//! The modules from top to bottom; each uses only modules below it:
 //!
-//! - [`cli`] and `commands` -- flags in, words out
-//! - [`benchmark`] -- policies on the same worlds, scored
-//! - [`acting`] -- one world of a running server
-//! - `training` -- the loop that learns while acting, its metrics and events
-//! - [`client`] -- the ends of the wire
-//! - `flags` -- settings as flags
-//! - [`process`] -- the allocator and candle's threads
+//! - [`cli`] and `commands` -- the command line and its subcommands
+//! - [`benchmark`] -- runs and scores policies on the same worlds
+//! - [`acting`] -- acts on one world of a running server
+//! - `training` -- trains learners while they act, with metrics and events
+//! - [`client`] -- communication with the server
+//! - `flags` -- flags for the agent's settings
+//! - [`process`] -- the allocator and candle's thread counts
 //!
 //! Policies, estimators, learners and checkpoints are in the crate `emberwatch-learning`.
 
-#![allow(missing_docs, reason = "a program: what names say is not said again")]
+#![allow(missing_docs, reason = "a program: the names explain themselves")]
 
 pub mod acting;
 pub mod benchmark;

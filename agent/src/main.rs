@@ -1,4 +1,4 @@
-//! `emberwatch-agent`: acts on a server's world, or compares ways to act.
+//! `emberwatch-agent`: acts on a server's world, trains learners, and compares policies.
 
 use emberwatch_agent::process::Allocator;
 use std::process::ExitCode;

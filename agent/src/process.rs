@@ -1,24 +1,24 @@
-//! What programs that use networks set up first.
+//! Process setup for programs that run networks: the allocator's options and candle's thread counts.
 
 pub use mimalloc::MiMalloc as Allocator;
 use std::thread::available_parallelism;
 
 /// `mi_option_purge_delay` of mimalloc.h, which libmimalloc-sys does not name: milliseconds after which freed
-/// memory is given back; never if negative.
+/// memory is returned to the system; never if negative.
 const PURGE_DELAY: libmimalloc_sys::mi_option_t = 15;
 
-/// Variables that tell candle its threads. Without the first it reads `/proc/cpuinfo` for each product of matrices,
-/// which takes longer than a small product. The second is for threads that spin while they wait.
+/// Environment variables with candle's thread counts. Without the first, candle reads `/proc/cpuinfo` for each matrix
+/// product, which takes longer than a small product. The second counts threads that spin while they wait.
 const THREADS: [&str; 2] = ["RAYON_NUM_THREADS", "CANDLE_NUM_THREADS"];
 
-/// Keeps memory that is freed for the next tensor, and tells candle its threads. For programs whose
-/// global allocator is [`Allocator`]; they call it before they start a thread.
+/// Keeps freed memory for the next tensor, and sets candle's thread counts. Programs whose global allocator is
+/// [`Allocator`] call this before they start a thread.
 ///
-/// An update makes and drops hundreds of megabytes of tensors. Where these are given back to the system each
-/// time, page faults take as long as the arithmetic.
+/// An update allocates and frees hundreds of megabytes of tensors. If that memory were returned to the system each
+/// time, page faults would take as long as the arithmetic.
 #[expect(unsafe_code, reason = "a foreign function, and the environment")]
 pub fn set_up_process() {
-    // SAFETY: it stores a number in the allocator's table of options.
+    // SAFETY: the call only stores a number in the allocator's table of options.
     unsafe {
         libmimalloc_sys::mi_option_set(PURGE_DELAY, -1);
     }

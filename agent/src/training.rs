@@ -1,8 +1,8 @@
-//! Learns while acting: attach, then a step of all robots, updates, now and then a checkpoint.
+//! Trains a learner while it acts: a loop of steps of all robots, updates, and checkpoints at intervals.
 //!
-//! The learner is told the grid, the number of observations and each path's reward and frame; the model that a server
-//! may reveal is read only for decisions on the belief of a known model. One message steps all robots.
-//! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
+//! The learner receives the grid, the number of observation values, and each path's reward and frame. A model that the
+//! server reveals is read only for decisions on a known-model belief. One message steps all robots.
+//! The [`Learner`] determines what is learned, and how to act in the meantime.
 
 mod acting;
 mod events;
@@ -33,31 +33,32 @@ use emberwatch_protocol::feed::Feed;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// The folder of a run without learning, for TensorBoard.
+/// Subfolder for the TensorBoard events of a run without learning.
 const FROZEN_EVENTS: &str = "frozen";
 
-/// How often a checkpoint is written while training goes on.
+/// Minimum time between two checkpoints during training.
 const SAVE_INTERVAL: Duration = Duration::from_secs(30);
 
 const REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// The lease outlives a pause of this length, such as a slow disk's or that in which a prior is simulated.
+/// Time to live of the lease: longer than pauses for a slow disk or the simulation of a prior.
 const LEASE: Duration = Duration::from_secs(600);
 
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TrainSummary {
-    /// World steps acted, of all worlds together.
+    /// World steps, summed over all worlds.
     pub steps: u64,
-    /// Updates made, with those before a resume.
+    /// Number of updates, including earlier runs that this run resumes.
     pub updates: u64,
     pub reward: f64,
-    /// Time spent on planning paths and on updates.
+    /// Time spent on planning paths.
     pub planning: Duration,
+    /// Time spent on updates.
     pub learning: Duration,
 }
 
-/// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
-/// `contents`: what [`TrainingSpec::check`] gave.
+/// Trains on a server until the steps are done, the deadline has passed or `stop` is set. Saves in any case.
+/// `contents` is the result of [`TrainingSpec::check`].
 pub fn train(
     instance: &Instance,
     spec: &TrainingSpec,
@@ -71,7 +72,7 @@ pub fn train(
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
         (Err(problem), Err(also)) => {
-            bail!("{problem:#}; what was learned is lost: {also:#}");
+            bail!("{problem:#}; the training since the last checkpoint is lost: {also:#}");
         }
     }
     training_loop.warn_of_no_update(spec);
@@ -89,13 +90,13 @@ struct TrainingLoop {
     stopwatch: Stopwatch,
     feed: Feed,
     summary: TrainSummary,
-    /// Updates before this run, of the runs that it resumes.
+    /// Number of updates of the earlier runs that this run resumes.
     n_before: u64,
     saved: Instant,
     reported: Reported,
 }
 
-/// What was reported last, and what to report next.
+/// Totals at the last progress report, and the score since then.
 struct Reported {
     at: Instant,
     steps: u64,
@@ -113,7 +114,7 @@ impl TrainingLoop {
         if let Some(contents) = &contents
             && spec.has_other_settings(contents)
         {
-            tracing::warn!("settings: they differ from the checkpoint's, and replace them");
+            tracing::warn!("the settings differ from the checkpoint's, and replace them");
         }
         let connection = connect(instance)?;
         let claim = Claim {
@@ -130,13 +131,13 @@ impl TrainingLoop {
             learner.freeze();
         }
         let attached = learner.attach(running(&mut client)?);
-        let n_gone_on = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
-        let n_new = client.robots().len() - n_gone_on;
+        let n_resumed = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
+        let n_new = client.robots().len() - n_resumed;
         if spec.resume && n_new > 0 {
             let robots = n_new;
             tracing::info!(
                 robots,
-                "not where the checkpoint left them: beliefs begin again"
+                "the worlds of some robots have changed since the checkpoint: their beliefs start anew"
             );
         }
         let belief = learner.rollout(0).agent.belief();
@@ -187,7 +188,7 @@ impl TrainingLoop {
         Ok(())
     }
 
-    /// One step of each robot; worlds at the end of their episodes begin again.
+    /// Steps each robot once. Worlds whose episode has ended start the next one.
     fn step(&mut self) -> Result<Tick> {
         let shows_all = self.learner.wants_full_frames();
         let learner = &mut *self.learner;
@@ -207,7 +208,7 @@ impl TrainingLoop {
         Ok(tick)
     }
 
-    /// Writes the checkpoint, unless nothing is learned, and the metrics.
+    /// Writes the metrics and, unless learning is frozen, the checkpoint.
     fn save(&mut self, spec: &TrainingSpec) -> Result<()> {
         self.saved = Instant::now();
         if !spec.freeze {
@@ -222,7 +223,7 @@ impl TrainingLoop {
         self.events.flush()
     }
 
-    /// Warns of a run that was to learn and did not.
+    /// Warns if a run that is not frozen made no update.
     fn warn_of_no_update(&self, spec: &TrainingSpec) {
         let steps = self.summary.steps;
         if !spec.freeze && steps > 0 && self.learner.n_updates() == self.n_before {
@@ -263,7 +264,7 @@ impl Reported {
     }
 }
 
-/// A learner of the client's robots, going on from a checkpoint's contents if there are any.
+/// Creates the learner of the client's robots. With `contents`, resumes it from a checkpoint.
 fn begin(
     spec: &TrainingSpec,
     kind: &LearnerKind,
@@ -295,7 +296,7 @@ fn begin(
     }
 }
 
-/// What the client's robots show, in new episodes where the last ones have ended.
+/// Observes the client's robots. Worlds whose episode has ended start the next one first.
 fn running(client: &mut Client) -> Result<Vec<Observation>, ConnectionError> {
     let mut observations = client.observe(client.robots())?;
     let over = ended(client, observations.iter());
@@ -309,7 +310,7 @@ fn is_over(seen: &Observation) -> bool {
     seen.world.truncated != 0 || seen.world.terminated != 0
 }
 
-/// The worlds whose episodes have ended, by what the client's robots show.
+/// Returns the worlds whose episodes have ended, according to the observations of the client's robots.
 fn ended<'a>(client: &Client, observations: impl Iterator<Item = &'a Observation>) -> Vec<u32> {
     let robots = client.robots().zip(observations);
     let over = robots.filter(|(_, seen)| is_over(seen));
@@ -320,7 +321,7 @@ fn ended<'a>(client: &Client, observations: impl Iterator<Item = &'a Observation
     worlds
 }
 
-/// Starts the next episode of some worlds; returns what each of their robots shows.
+/// Starts the next episode of some worlds. Returns the number and first observation of each of their robots.
 fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>, ConnectionError> {
     if worlds.is_empty() {
         return Ok(Vec::new());
@@ -335,17 +336,17 @@ fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>,
     Ok(seen)
 }
 
-/// The file of metrics: a run without learning has one of its own.
+/// Opens the metrics file. A run without learning has a separate file.
 fn metrics(spec: &TrainingSpec, kind: &LearnerKind, learner: &dyn Learner) -> Result<Metrics> {
     let (columns, world_steps) = (kind.columns, learner.world_steps());
     match (spec.freeze, spec.resume) {
         (true, _) => Metrics::begin(&spec.out.join(FROZEN), columns),
-        (false, true) => Metrics::go_on(&spec.out.join(METRICS), columns, world_steps),
+        (false, true) => Metrics::reopen(&spec.out.join(METRICS), columns, world_steps),
         (false, false) => Metrics::begin(&spec.out.join(METRICS), columns),
     }
 }
 
-/// The file of TensorBoard's events: a run without learning has a folder of its own, and begins again.
+/// Opens the file of TensorBoard events. A run without learning has a separate folder, and starts from step 0.
 fn events(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Events> {
     match (spec.freeze, spec.resume) {
         (true, _) => Events::begin(&spec.out.join(FROZEN_EVENTS), 0),

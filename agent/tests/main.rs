@@ -1,4 +1,4 @@
-//! One program: each would link candle.
+//! All tests in one program, because each test program would link candle separately.
 
 mod prior;
 mod report;

@@ -1,4 +1,4 @@
-//! The subcommands: flags in, library calls, text out.
+//! The subcommands: each parses flags, calls the library and prints the result.
 
 mod print;
 mod record;

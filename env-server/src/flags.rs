@@ -24,32 +24,31 @@ pub struct ServerFlags {
     /// Number of independent worlds [default: 1]
     #[arg(long)]
     pub worlds: Option<u32>,
-    /// Robots of each world [default: 1]
+    /// Number of robots in each world [default: 1]
     #[arg(long)]
     pub robots: Option<u32>,
-    /// How long a world waits for the paths of its other held robots from the first path on, in milliseconds, 0 for
-    /// no deadline [default: 0]
+    /// Maximum wait of a world for its robots' paths, in milliseconds after the first path, 0 for no limit [default: 0]
     #[arg(long, value_name = "MILLIS")]
     #[serde(rename = "deadline_millis")]
     pub deadline_ms: Option<u64>,
     #[arg(long, value_name = "NAME|FILE", help = format!(
-        "Worlds of this task, which decides model or states, sensor, grid, moves, robots, burn-in, start and episodes: \
-         {} or the path of a task file", listed(Task::built_in_names())))]
+        "Use the worlds of a task, which sets model or states, sensor, grid, moves, robots, burn-in, start and episode \
+         length: {} or the path of a task file", listed(Task::built_in_names())))]
     pub task: Option<String>,
     #[arg(long, value_name = "NAME|FILE", help = format!(
-        "The model of the worlds: {} or the path of a model file [default: wildfire]", listed(Model::built_in_names())))]
+        "Model of the worlds: {} or the path of a model file [default: wildfire]", listed(Model::built_in_names())))]
     pub model: Option<String>,
     #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64), help = format!(
-        "Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS} [default: as the model says]"))]
+        "Rows and columns that robots see around each cell of their path, 0 to {MAX_RADIUS} [default: the model's]"))]
     pub sensor_radius: Option<u8>,
     #[arg(long, value_name = "NAME|FILE|FOLDER", help = format!(
-        "Worlds show recorded states, which decide model, grid and burn-in: {} or a .npz or .npy file or folder",
+        "Show recorded states, which set model, grid and burn-in: {} or the path of a .npz or .npy file or of a folder",
         listed(state_names())))]
     pub states: Option<String>,
-    /// Seeds choose among the symmetries of the grid, too
+    /// Let seeds also choose among the symmetries of the grid
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub states_symmetries: Option<bool>,
-    /// Episodes begin at a recorded step of 0 to this, drawn from the seed [default: 0]
+    /// Maximum recorded step at which an episode begins; the seed draws one from 0 to this [default: 0]
     #[arg(long, value_name = "STEPS")]
     pub states_offset: Option<u64>,
     /// Grid height in cells [default: 64]
@@ -58,49 +57,49 @@ pub struct ServerFlags {
     /// Grid width in cells [default: 64]
     #[arg(long)]
     pub width: Option<usize>,
-    /// Moves in a path [default: 64]
+    /// Number of moves in a path [default: 64]
     #[arg(long)]
     pub moves: Option<usize>,
     /// Seed of world 0; world i starts from this plus i [default: 0]
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Steps simulated before k = 0 [default: 10000]
+    /// Number of steps simulated before k = 0 [default: 10000]
     #[arg(long)]
     pub burn_in: Option<u64>,
-    /// Episode length in steps, 0 for no end [default: 0]
+    /// Maximum episode length in steps, 0 for no limit [default: 0]
     #[arg(long)]
     pub max_steps: Option<u64>,
-    /// What a step observes [default: path]
+    /// Cells that a robot observes in a step [default: path]
     #[arg(long)]
     pub coverage: Option<CoverageFlag>,
-    /// The robots' first cells: corner (each in another), centre, random or ROW,COL [default: corner]
+    /// Start cells of robots: corner (a different one for each), centre, random or ROW,COL [default: corner]
     #[arg(long, value_parser = start_of)]
     pub start: Option<Start>,
     /// Publish the hidden states, for evaluation and pictures
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub publish_truth: Option<bool>,
-    /// Tell clients the model [default: true]
+    /// Send clients the model [default: true]
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub reveal_model: Option<bool>,
-    /// A lease ends this long after its last use, in milliseconds [default: 30000]
+    /// Time after its last use when a lease ends, in milliseconds [default: 30000]
     #[arg(long)]
     pub lease_millis: Option<u64>,
-    /// Threads that simulate, 0 for one per core [default: 0]
+    /// Number of threads that simulate, 0 for one per core [default: 0]
     #[arg(long)]
     pub threads: Option<usize>,
-    /// Steps of each world whose frames are kept for later agents [default: 256]
+    /// Number of latest steps per world whose frames are kept for agents that take over [default: 256]
     #[arg(long)]
     pub history: Option<u32>,
-    /// Start with the worlds of this snapshot file, or of the last in this folder, if there is one
+    /// Start with the worlds of this snapshot file, or of the latest one in this folder, if there is one
     #[arg(long, value_name = "FILE|FOLDER")]
     pub restore: Option<String>,
-    /// Write a snapshot each so many steps of all worlds, and one at the end [default: 0, never]
+    /// Average steps of the worlds between two snapshots; one more is written at the end [default: 0, never]
     #[arg(long, value_name = "STEPS")]
     pub snapshot_every: Option<u64>,
-    /// The folder for these snapshots
+    /// Folder for these snapshots
     #[arg(long, value_name = "FOLDER")]
     pub snapshot_dir: Option<String>,
-    /// How many of these snapshots to keep, and the last that the disk has for sure [default: 3]
+    /// Number of these snapshots to keep, in addition to the latest that is safely on disk [default: 3]
     #[arg(long)]
     pub snapshot_keep: Option<u32>,
 }
@@ -118,7 +117,7 @@ pub enum CoverageFlag {
 }
 
 impl ServerFlags {
-    /// The effective settings.
+    /// Returns the effective settings: defaults, overridden by the file, overridden by flags.
     pub fn effective(&self) -> Result<ServerConfig, ConfigError> {
         let config = match &self.config {
             None => ServerConfig::default(),

@@ -1,4 +1,4 @@
-//! `emberwatch-server`: reads settings, starts logging, serves.
+//! The program `emberwatch-server`.
 
 mod commands;
 
@@ -21,10 +21,10 @@ struct Cli {
     command: Option<Command>,
     #[command(flatten)]
     flags: ServerFlags,
-    /// Check the settings, print the effective ones as TOML, and end
+    /// Check the settings, print the effective ones as TOML, and exit
     #[arg(long)]
     check: bool,
-    /// End when this process ends
+    /// Exit when the process with this id ends
     #[arg(long, value_name = "PID")]
     exit_with: Option<i32>,
 }
@@ -37,13 +37,13 @@ enum Command {
     Stop(commands::StopCommand),
     /// Write worlds of a running server to a file
     Snapshot(commands::SnapshotCommand),
-    /// Replace worlds of a running server by those of a file
+    /// Replace worlds of a running server by worlds from a file
     Restore(commands::RestoreCommand),
-    /// Replace a world of a running server by a copy of another
+    /// Replace a world of a running server by a copy of another world
     Fork(commands::ForkCommand),
-    /// Observe an instance and write what is published to a file
+    /// Record the frames that an instance publishes to a file
     Record(commands::RecordCommand),
-    /// Publish a recording as its server did
+    /// Publish a recording in the same way as the recorded server
     Replay(commands::ReplayCommand),
 }
 

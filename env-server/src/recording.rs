@@ -1,4 +1,4 @@
-//! `record` and `replay`: what a server publishes, into a file and out of it.
+//! `record` and `replay`: write what a server publishes to a file, and publish it again.
 
 mod pace;
 mod recorder;

@@ -1,4 +1,4 @@
-//! The server on its channels: the loop, its ports, and the threads that keep slow work off it.
+//! The server: its main loop, its ports on the channels, and the threads that do slow work.
 
 mod autosave;
 mod completions;

@@ -1,4 +1,4 @@
-//! A whole client: flies random paths in the first world of a running server.
+//! A complete client, which flies random paths in the first world of a running server.
 //!
 //! `emberwatch-server --instance lab &`, then
 //! `cargo run -p emberwatch-protocol --example random_robot -- lab`

@@ -1,5 +1,5 @@
-//! Lists the models, tasks and recorded states that ship, for `src/built_in.rs`: what is in the folders of `config/` is
-//! built in.
+//! Generates the tables of built-in models, tasks and recorded states that `src/built_in.rs` includes, from the folders
+//! of `config/`.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -17,7 +17,8 @@ fn main() {
     write("states", states);
 }
 
-/// The files of a folder with this extension, or its folders if that is empty, in the order of their names, each as the tuple of its name and `contents`.
+/// Lists the entries of a folder by name, each as a Rust tuple of its name and `contents`. The entries are the files
+/// with this extension, or the subfolders if `extension` is empty.
 fn entries(folder: &str, extension: &str, contents: impl Fn(PathBuf) -> String) -> Vec<String> {
     println!("cargo:rerun-if-changed={folder}");
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
@@ -32,7 +33,7 @@ fn entries(folder: &str, extension: &str, contents: impl Fn(PathBuf) -> String) 
                 .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
         })
         .collect();
-    // The names alone: `wildfire` comes before `wildfire-small`.
+    // Compares names without extension, so that `wildfire` comes before `wildfire-small`.
     files.sort_by(|a, b| a.file_stem().cmp(&b.file_stem()));
     let entry = |path: PathBuf| {
         let name = path.file_stem().and_then(OsStr::to_str);

@@ -1,13 +1,14 @@
-//! The wire between the server and its clients: channels of shared memory by iceoryx2, connections, observers.
+//! The wire between a server and its clients: channels over shared memory (iceoryx2), connections and observers.
 //!
-//! A [`Client`] flies robots; `examples/random_robot.rs` is a whole program. Below it, a [`Connection`] takes the
-//! requests in [`control`] and [`message`]. An [`observer`] reads what a server publishes, a [`recording`] what a file
-//! holds of that. A [`responder`], [`channels`] and [`failed_connections`] are for those who serve worlds.
+//! A [`Client`] flies robots; `examples/random_robot.rs` is a complete program. It sends the requests of [`control`]
+//! and [`message`] over a [`Connection`]. An [`observer`] reads the samples that a server publishes, and a
+//! [`recording`] stores them in a file. [`responder`], [`channels`] and [`failed_connections`] are for servers.
 //!
-//! The messages are in the crate `emberwatch-messages`, the mathematics of the worlds in `emberwatch-model`; a client
-//! finds what it needs of both here. PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden
-//! state of one grid; a *step* `k` flies one path with each robot and moves the world once; a *frame* holds the
-//! observations of a step; a *lease* is the right to fly robots.
+//! The crate `emberwatch-messages` has the messages, and `emberwatch-model` the mathematics of the worlds. The parts of
+//! both that a client needs are re-exported here. PROTOCOL.md describes the wire for other languages.
+//!
+//! Terms: a *world* is the hidden state of one grid. A *step* `k` flies one path with each robot and moves the world
+//! once. A *frame* holds the observations of a step. A *lease* is the right to fly robots.
 
 #[cfg(feature = "program")]
 pub mod program;

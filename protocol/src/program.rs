@@ -1,4 +1,4 @@
-//! What every program does when it starts: log to standard error, stop on signals or when another process ends.
+//! The start of every program: logs to standard error, and stops on signals or when another process ends.
 
 use emberwatch_messages::limits::threads::spawn;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -17,8 +17,8 @@ pub use emberwatch_model::text::{MAX_TEXT_BYTES, read_text};
 
 const SAME_SIGNAL: Duration = Duration::from_millis(500);
 
-/// Logs to standard error. `RUST_LOG` sets the level, also by target (`warn`, `warn,emberwatch_agent=debug`); the
-/// default is `info`.
+/// Starts logging to standard error. `RUST_LOG` sets the level, also by target (`warn`, `warn,emberwatch_agent=debug`);
+/// the default is `info`.
 pub fn start_logging() {
     let wanted = std::env::var("RUST_LOG");
     let filter = wanted.ok().and_then(|text| text.parse::<Targets>().ok());
@@ -32,8 +32,8 @@ pub fn start_logging() {
         .init();
 }
 
-/// A flag that SIGINT, SIGTERM or SIGHUP sets; another one ends the process at once. `timeout` and shells send a
-/// signal to a process and to its group: what follows within half a second is taken as the same one.
+/// Returns a flag that SIGINT, SIGTERM or SIGHUP sets. A second signal ends the process at once. `timeout` and shells
+/// send one signal to a process and to its group, so signals within half a second of the first count as the same one.
 ///
 /// # Errors
 /// If the system refuses a handler or a thread.

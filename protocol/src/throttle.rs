@@ -1,8 +1,9 @@
-//! Logs one of many like warnings, and then how many there were. Pure: time is an argument.
+//! Limits repeated warnings: logs one, and later the number that were suppressed. It reads no clock; time is an
+//! argument.
 
 use std::time::{Duration, Instant};
 
-/// Least time between two warnings of one kind.
+/// Minimum time between two warnings of one kind.
 const INTERVAL: Duration = Duration::from_secs(10);
 
 /// Decides which warnings of one kind are logged.
@@ -13,7 +14,7 @@ pub struct Throttle {
 }
 
 impl Throttle {
-    /// Counts a warning; if it is to be logged, returns how many before it were not.
+    /// Counts a warning. If it should be logged, returns the number of warnings suppressed since the last logged one.
     pub fn pass(&mut self, now: Instant) -> Option<u64> {
         if self.last.is_some_and(|last| now < last + INTERVAL) {
             self.n_unsaid += 1;

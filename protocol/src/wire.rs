@@ -1,9 +1,9 @@
-//! The wire: how messages travel between processes.
+//! The wire: transports messages between processes.
 //!
-//! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`; [`connection`] is a client's
-//! side, [`responder`] the answering side, [`observer`] a reader's side.
-//! [`node`], [`turn`] and [`cleanup`] create and remove channels, [`shared_memory`] gives them memory; [`wait`] is the
-//! bounded wait.
+//! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`. [`connection`] is a
+//! client's side, [`responder`] the answering side, and [`observer`] a reader's side. [`node`], [`turn`] and
+//! [`cleanup`] create and remove channels, and [`shared_memory`] allocates their memory. [`wait`] is the wait with a
+//! deadline.
 
 pub mod agent_belief;
 mod channel_files;

@@ -1,12 +1,13 @@
-//! ARCHITECTURE.md names every room and file rightly; rooms use only those below them; no file depends on itself by
-//! way of others. The index of documents is complete, and so are programs of several test files.
+//! Checks that ARCHITECTURE.md names every room (folder of sources) and only existing files, that rooms use only rooms
+//! below them, and that no files depend on each other in a circle. The index of documents must be complete, and each
+//! test file must be a module of its test program.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
-/// Folders of sources: each folder in them that has any is a room.
+/// Folders of sources. Each folder in them that has source files is a room.
 const SOURCES: [&str; 15] = [
     "protocol/src",
     "protocol/messages/src",
@@ -25,26 +26,26 @@ const SOURCES: [&str; 15] = [
     "clients/python/src/emberwatch",
 ];
 
-/// Folders of crates.
+/// Lists the folders of crates.
 fn crates() -> impl Iterator<Item = &'static str> {
     SOURCES.iter().filter_map(|name| name.strip_suffix("/src"))
 }
 
-/// Each file of a crate, by the path of its module from the root, with the files it depends on.
+/// The files of a crate by the path of their module from the root, each with the files that it depends on.
 type Graph = BTreeMap<Vec<String>, BTreeSet<Vec<String>>>;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The rooms of the table, in its order.
+/// Returns the rooms of the table, in its order.
 fn rooms() -> Vec<&'static str> {
     let rows = ARCHITECTURE.lines().filter(|line| line.starts_with("| `"));
     let room = |row: &'static str| row.split('`').nth(1).expect("a room");
     rows.map(room).collect()
 }
 
-/// The source files below a folder, relative to the root.
+/// Returns the source files below a folder, relative to the root.
 fn source_files(folder: &str) -> Vec<String> {
     let entries = std::fs::read_dir(root().join(folder)).expect("a source folder");
     let below = |entry: std::io::Result<std::fs::DirEntry>| {
@@ -64,7 +65,7 @@ fn is_source(name: &str) -> bool {
     [".rs", ".py", ".js"].iter().any(|end| name.ends_with(end))
 }
 
-/// The room of a source file: the topmost folder below the sources, or these themselves.
+/// Returns the room of a source file: the topmost folder below the sources, or the sources themselves.
 fn room_of(path: &str) -> String {
     let of = |source: &&&str| path.starts_with(&format!("{source}/"));
     let source = SOURCES.iter().filter(of).max_by_key(|source| source.len());
@@ -80,7 +81,7 @@ fn every_room_is_listed_and_every_room_and_file_named_exists() {
     let rooms = rooms();
     let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
     let found: BTreeSet<String> = files.iter().map(|path| room_of(path)).collect();
-    // What only has thin roots beside folders, and folders of a room's own, need no line.
+    // Folders that contain rooms, and folders inside a room, need no line in the table.
     let inner = [
         "agent/network/src/ops",
         "agent/network/src/dqn",
@@ -219,7 +220,7 @@ fn module_of(name: &str) -> Vec<String> {
     names.map(str::to_owned).collect()
 }
 
-/// The graph of a crate's library, without files of unit tests.
+/// Returns the graph of a crate's library, without files of unit tests.
 fn graph_of(name: &str) -> Graph {
     let source = format!("{name}/src");
     let mut texts = BTreeMap::new();
@@ -239,7 +240,8 @@ fn graph_of(name: &str) -> Graph {
     graph(texts)
 }
 
-/// What files depend on: child modules, and every module that a path from `crate`, `super` or `self` names.
+/// Returns the files that each file depends on: its child modules, and every module that a path from `crate`, `super`
+/// or `self` names.
 fn graph(texts: BTreeMap<Vec<String>, String>) -> Graph {
     let file_of = |path: &[String]| {
         let mut ends = (0..=path.len()).rev().map(|end| path[..end].to_vec());
@@ -260,7 +262,7 @@ fn graph(texts: BTreeMap<Vec<String>, String>) -> Graph {
     graph
 }
 
-/// Every path in the code that begins with `crate`, `super` or `self`, from the crate's root, up to a brace.
+/// Returns every path in the code that begins with `crate`, `super` or `self`, from the crate's root, up to a brace.
 fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
     let code = text.split("#[cfg(test)]\nmod tests").next();
     let lines = code.unwrap_or_default().lines();
@@ -286,7 +288,7 @@ fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
     found
 }
 
-/// The files that a file depends on, also by way of others.
+/// Returns the files that a file depends on, directly or indirectly.
 fn reached<'a>(graph: &'a Graph, from: &'a Vec<String>) -> BTreeSet<&'a Vec<String>> {
     let mut reached = BTreeSet::new();
     let mut next = vec![from];
@@ -296,7 +298,7 @@ fn reached<'a>(graph: &'a Graph, from: &'a Vec<String>) -> BTreeSet<&'a Vec<Stri
     reached
 }
 
-/// The files of one circle, if there is one.
+/// Returns the files of one circle, if there is one.
 fn circle(graph: &Graph) -> Vec<Vec<String>> {
     let all: BTreeMap<_, _> = graph
         .keys()

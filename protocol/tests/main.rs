@@ -1,4 +1,4 @@
-//! One program: each would link the crate.
+//! One test program: each separate one would have to link the crate.
 
 mod architecture;
 mod wire;

@@ -1,4 +1,4 @@
-//! PROTOCOL.md against the code: byte tables, codes, limits, JSON examples, and the worked example.
+//! Compares PROTOCOL.md with the code: byte tables, codes, limits, JSON examples, and the worked example.
 
 mod document;
 
@@ -25,7 +25,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use serde_json::Value;
 use std::collections::BTreeSet;
 
-/// The fields of a struct; one that is not listed does not compile.
+/// Returns the fields of a struct. If a field is not listed, this does not compile.
 macro_rules! fields {
     ($name:ident: $($field:ident)*) => {{
         let $name { $($field),* } = $name::default();
@@ -38,7 +38,7 @@ macro_rules! fields {
     }};
 }
 
-/// The layouts of structs.
+/// Returns the layouts of structs.
 macro_rules! layouts {
     ($($name:ident: $($field:ident)*;)*) => {
         vec![$(Layout {
@@ -57,7 +57,7 @@ fn type_name<T: Header>() -> &'static str {
     unsafe { <WireHeader<T> as ZeroCopySend>::type_name() }
 }
 
-/// The type of a field as PROTOCOL.md writes it.
+/// Returns the type of a field as in PROTOCOL.md.
 fn type_of<T>(_: &T) -> String {
     match std::any::type_name::<T>() {
         "[u8; 8]" => "u8[8]".into(),
@@ -95,7 +95,7 @@ fn every_header_is_laid_out_as_documented() {
     }
 }
 
-/// The rows of a table of names and numbers.
+/// Returns the rows of a table of names and numbers.
 fn numbers_under(header: &str) -> Vec<(String, usize)> {
     let row = |row: Vec<String>| (row[0].replace('`', ""), row[1].parse().expect("a number"));
     rows_under(header).into_iter().map(row).collect()
@@ -130,7 +130,7 @@ fn every_code_is_documented() {
     assert!(PROTOCOL.contains(&format!("**{UNOBSERVED} where nothing was")));
 }
 
-/// Constants by their names.
+/// Returns constants with their names.
 macro_rules! limits {
     ($($name:ident)*) => {
         [$((stringify!($name).to_owned(), $name)),*]
@@ -245,7 +245,7 @@ fn the_worked_example_is_as_long_as_its_headers_say() {
     }
 }
 
-/// The lines of the JSON examples with this behind `json`.
+/// Returns the lines of the JSON examples whose fence has this title after `json`.
 fn lines_of_fences(title: &str) -> Vec<&'static str> {
     let fences = fences("json").into_iter();
     let titled = fences.filter(|(found, _)| *found == title);
@@ -257,7 +257,7 @@ fn snake_case<T: serde::Serialize>(value: &T) -> String {
     text.replace('"', "")
 }
 
-/// Every variant of a tagged enum, as serde lists them when it meets an unknown one.
+/// Returns every variant of a tagged enum, as serde lists them in the error for an unknown one.
 fn variants_of<T: serde::de::DeserializeOwned>(tag: &str) -> BTreeSet<String> {
     let unknown = serde_json::from_str::<T>(&format!(r#"{{"{tag}":"?"}}"#));
     let error = unknown.err().expect("no such variant").to_string();

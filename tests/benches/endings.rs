@@ -1,6 +1,6 @@
-//! How soon the death of a process is noticed: `cargo bench -p tests --bench endings`.
+//! Measures how soon the death of a process is noticed: `cargo bench -p tests --bench endings`.
 //!
-//! Peer: this process's own notice of the same death, by a pidfd.
+//! The reference is the time until this process notices the same death through a pidfd.
 
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::wait::sleep_until_readable;
@@ -18,7 +18,7 @@ fn main() {
     report("a client waits on a killed server", killed_server);
 }
 
-/// Prints the median and the longest time, and their ratio to the peer's median.
+/// Prints the median and the maximum time, and their ratio to the reference's median.
 fn report(what: &str, mut measure: impl FnMut() -> (Duration, Duration)) {
     let times: Vec<_> = (0..N_ROUNDS).map(|_| measure()).collect();
     let millis = |time: fn(&(Duration, Duration)) -> Duration| {
@@ -32,7 +32,7 @@ fn report(what: &str, mut measure: impl FnMut() -> (Duration, Duration)) {
     ));
 }
 
-/// Kills a program; how long until `notice` returns, and until a pidfd says so.
+/// Kills a program. Returns the time until `notice` returns, and the time until a pidfd reports the death.
 fn kill(program: &Program, notice: impl FnOnce()) -> (Duration, Duration) {
     let pid = Pid::from_raw(program.pid() as i32).expect("a process id");
     let process = pidfd_open(pid, PidfdFlags::empty()).expect("a process");

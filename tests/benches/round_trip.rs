@@ -1,9 +1,9 @@
 //! Round trip of a step from a Rust client to a server process and back:
 //! `cargo bench -p tests --bench round_trip`; arguments after `--` go to the server.
 //!
-//! Prints median and tail in microseconds with the simulation's own time subtracted, on a machine
-//! as it is and with three busy processes on top; then the processor time of an idle server. The peer
-//! to hold this against, Gymnasium's AsyncVectorEnv, is measured by `scripts/bench` in the same run.
+//! Prints median and tail in microseconds without the simulation's own time, first on the machine as it is, then with
+//! three additional busy processes. Then prints the processor time of an idle server. `scripts/bench` measures
+//! Gymnasium's AsyncVectorEnv in the same run for comparison.
 
 use std::ops::Range;
 use std::sync::Barrier;
@@ -15,7 +15,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 50_000;
 
-/// Robots that fly the same paths again and again.
+/// Robots that repeat the same paths.
 struct Flight {
     stepper: Stepper,
     paths: Vec<u8>,
@@ -29,7 +29,7 @@ impl Flight {
         Self { stepper, paths }
     }
 
-    /// Nanoseconds of one round trip: all of it, and the simulation's share.
+    /// Returns the nanoseconds of one round trip, and the part that the simulation took.
     fn step(&mut self) -> (u64, u64) {
         let start = Instant::now();
         let answer = self.stepper.step(&self.paths);
@@ -59,7 +59,7 @@ fn spread(nanos: impl Iterator<Item = u64>) -> String {
 }
 
 fn main() {
-    // cargo adds `--bench` on its own.
+    // Cargo itself adds `--bench`.
     let more = std::env::args()
         .skip(1)
         .filter(|argument| argument != "--bench")
@@ -90,7 +90,7 @@ fn main() {
     }
 }
 
-/// Steps of one world whose robots have a client each.
+/// Measures steps of one world in which each robot has its own client.
 fn report_barrier(server: &Server, team: u32, n_steps: usize) {
     let all_hold_one = Barrier::new(team as usize);
     std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! Writes the generated files of `fuzz/corpus` again, as needed after a change of a format.
+//! Regenerates the generated files of `fuzz/corpus`. Needed after a change of a format.
 
 fn main() -> std::io::Result<()> {
     let mut targets = tests::fuzz::TARGETS.iter();

@@ -1,7 +1,7 @@
-//! A belief of one's own acts in worlds in this process, beside policies of the benchmark.
+//! A custom estimator acts on worlds in this process, next to policies of the benchmark.
 //!
-//! A cell is believed to be what it showed last, and less surely each step. Run it with
-//! `cargo run --release -p tests --example own_belief`.
+//! It believes that each cell is in the state it last observed there, with a confidence that decreases each step. Run
+//! it with `cargo run --release -p tests --example own_belief`.
 
 use anyhow::Result;
 use emberwatch_belief::Belief;
@@ -19,20 +19,20 @@ use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::embedded::Embedded;
 use ndarray::Array2;
 
-/// Share of what a cell showed that is still believed a step later.
+/// Factor by which the confidence in an observation decreases per step.
 const KEPT: f32 = 0.95;
 
 const WORLDS: u32 = 4;
 const STEPS: u64 = 100;
 
-/// What each cell showed last, fading to what is believed of any cell.
+/// An estimator that believes the last observation of each cell, decaying to the initial belief.
 struct LastSeen {
     belief: Belief,
     first: Belief,
     likelihood: Array2<f64>,
 }
 
-/// Its constructor and its facts: what a policy asks for.
+/// The description and the constructor of this estimator, for a policy.
 const LAST_SEEN: BeliefKind = BeliefKind {
     name: "last_seen",
     label: "last_seen",
@@ -80,7 +80,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Mean reward of a step, on the same worlds for every policy.
+/// Returns the mean reward per step of a policy. Every policy gets the same worlds.
 fn mean_reward(policy: &Policy, model: &Model) -> Result<f64> {
     let settings = ServerConfig {
         worlds: WORLDS,

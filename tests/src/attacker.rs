@@ -1,4 +1,4 @@
-//! A client that sends what no client should: random numbers, random bytes, mutated requests.
+//! A hostile client that sends random numbers, random bytes and mutated requests.
 
 use crate::harness::PATIENCE;
 use crate::wire::{RawClient, Wire, answer, step_body};
@@ -13,7 +13,7 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// A control request of each kind but shutdown, takeover and files, which every client may do.
+/// One control request of each kind, except shutdown, takeovers and file requests, which any client may use.
 const TEMPLATES: [&str; 8] = [
     r#"{"op":"hello","protocol":2,"client":"x"}"#,
     r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
@@ -25,20 +25,20 @@ const TEMPLATES: [&str; 8] = [
     r#"{"op":"status"}"#,
 ];
 
-/// A client that sends what no client should.
+/// A client that sends invalid requests.
 pub struct Attacker {
     wire: Wire,
     rng: ChaCha8Rng,
-    /// Leases to try: none, its own, the victim's.
+    /// Leases to try: none, its own and the victim's.
     leases: Vec<u64>,
-    /// The step that it last saw in an answer.
+    /// The latest step that an answer showed.
     k: u64,
     pub n_refused: u64,
     pub n_accepted: u64,
 }
 
 impl Attacker {
-    /// An attacker that holds robot 1 and knows somebody else's lease.
+    /// Creates an attacker that holds robot 1 and knows another client's lease.
     pub fn new(instance: &Instance, stolen: u64, seed: u64) -> Self {
         let wire = Wire::open(instance);
         let own = wire.acquire(1..2).lease;
@@ -52,7 +52,7 @@ impl Attacker {
         }
     }
 
-    /// Sends one message, and mostly waits for its answer.
+    /// Sends one message, and usually waits for its answer.
     pub fn strike(&mut self) {
         let status = if self.rng.random() {
             self.strike_step()
@@ -69,7 +69,7 @@ impl Attacker {
         }
     }
 
-    /// Returns the status, if it waits for the answer.
+    /// Sends a step request. Returns the answer's status if it waits for one.
     fn strike_step(&mut self) -> Option<u32> {
         let header = StepRequest {
             version: self.number(VERSION),
@@ -137,7 +137,7 @@ impl Attacker {
         Some(reply.status)
     }
 
-    /// Mostly the right number; else one that is near, huge or random.
+    /// Returns the right number in most cases, and otherwise one that is close, huge or random.
     fn number(&mut self, right: u32) -> u32 {
         match self.rng.random_range(0..50) {
             0 => right.wrapping_add(1),

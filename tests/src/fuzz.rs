@@ -1,7 +1,7 @@
-//! Hostile bytes for every decoder: one function per format, which checks what must hold of any bytes.
+//! Hostile bytes for every decoder: one function per format, which checks properties that must hold for any bytes.
 //!
-//! A [`Target`] is a line of [`TARGETS`]. `tests/decoders.rs` runs it on damaged copies of its corpus,
-//! `fuzz/corpus/<name>/`; `fuzz/` runs the same functions under libFuzzer.
+//! [`TARGETS`] lists them. `tests/decoders.rs` runs each target on damaged copies of its corpus, `fuzz/corpus/<name>/`.
+//! `fuzz/` runs the same functions under libFuzzer.
 
 mod besieged;
 mod files;
@@ -15,15 +15,15 @@ use std::path::{Path, PathBuf};
 /// A decoder under attack.
 #[derive(Debug, Clone, Copy)]
 pub struct Target {
-    /// Also its folder in the corpus, and its program in `fuzz/`.
+    /// Name of the target, of its folder in the corpus, and of its program in `fuzz/`.
     pub name: &'static str,
-    /// Decodes bytes and panics if something is wrong with the decoder; returns whether they were accepted.
+    /// Decodes bytes and returns whether they were accepted. Panics if it finds an error in the decoder.
     pub body: fn(&[u8]) -> bool,
-    /// What the code makes of the corpus. Texts lie there as they were written.
+    /// Generates the binary files of the corpus. Text files in the corpus are written by hand.
     pub seeds: fn() -> Vec<Seed>,
 }
 
-/// All of them.
+/// All targets.
 pub const TARGETS: [Target; 11] = [
     target("step_request", requests::step, requests::step_seeds),
     target("control_request", requests::control, Vec::new),
@@ -46,23 +46,23 @@ const fn target(name: &'static str, body: fn(&[u8]) -> bool, seeds: fn() -> Vec<
     Target { name, body, seeds }
 }
 
-/// Decodes bytes as a target of a name does.
+/// Runs the target of this name on bytes.
 ///
 /// # Panics
-/// If something is wrong with its decoder, or there is no such target.
+/// If the target finds an error in its decoder, or there is no such target.
 pub fn decode(name: &str, bytes: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name);
     (target.expect("a target of this name").body)(bytes)
 }
 
 impl Target {
-    /// Its folder in the corpus.
+    /// Returns the target's folder in the corpus.
     pub fn folder(&self) -> PathBuf {
         let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus");
         corpus.join(self.name)
     }
 
-    /// The files of its corpus, in the order of their names.
+    /// Reads the files of the target's corpus, sorted by name.
     pub fn corpus(&self) -> std::io::Result<Vec<Vec<u8>>> {
         let entries = std::fs::read_dir(self.folder())?;
         let paths = entries.map(|entry| Ok(entry?.path()));
@@ -71,7 +71,7 @@ impl Target {
         paths.iter().map(std::fs::read).collect()
     }
 
-    /// Writes its seeds into its corpus.
+    /// Writes the generated files of the target's corpus.
     pub fn write_seeds(&self) -> std::io::Result<()> {
         std::fs::create_dir_all(self.folder())?;
         let mut seeds = (self.seeds)().into_iter();
@@ -109,7 +109,7 @@ mod tests {
     fn the_texts_of_the_corpus_are_of_this_release() {
         let reply: fn(&str) -> bool = |text| parse::<Reply>(text.as_bytes()).is_ok();
         let model: fn(&str) -> bool = |text| Model::from_toml(text).is_ok();
-        // Behind the byte that says what happened before.
+        // Skips the first byte, which selects the events before the request.
         let request: fn(&str) -> bool =
             |text| parse::<Request>(text[1..].replace("LEASE", "1").as_bytes()).is_ok();
         for (folder, names, is_read) in [

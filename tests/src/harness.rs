@@ -1,4 +1,4 @@
-//! Servers as children, on names of their own, and what tests do with them.
+//! Servers as child processes, each on its own instance, and helpers for tests with them.
 
 use crate::wire::observe_header;
 use emberwatch_protocol::backend::Backend;
@@ -28,16 +28,16 @@ pub use crate::programs::{
     repository, run,
 };
 
-/// How long a server that has just begun may take to answer, before it is asked again.
+/// How long a starting server may take to answer before the request is repeated.
 const START: Duration = Duration::from_secs(3);
 
 /// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
 
-/// A burn-in that never ends, steps.
+/// A number of burn-in steps that takes forever.
 pub const ENDLESS: u64 = 1 << 40;
 
-/// A world's last result, that of one of its robots, and what this robot saw.
+/// The latest result of a world, and the result and frame of one of its robots.
 pub type Seen = (WorldResult, RobotResult, Vec<u8>);
 
 pub struct Server {
@@ -46,7 +46,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts a server on an instance of its own; `flags` are separated by spaces.
+    /// Starts a server on a new instance; `flags` are separated by spaces.
     pub fn start(flags: &str) -> Self {
         Self::start_on(&new_instance(), flags)
     }
@@ -66,7 +66,7 @@ impl Server {
         server
     }
 
-    /// Starts a server on an instance; it may not answer yet.
+    /// Starts a server on an instance, which may not answer yet.
     pub fn start_without_waiting(instance: &Instance, flags: &str) -> Self {
         let arguments = format!("--instance {} {flags}", instance.name());
         Self {
@@ -75,7 +75,7 @@ impl Server {
         }
     }
 
-    /// Starts a server and waits until it answers; its worlds are in burn-in then.
+    /// Starts a server and waits until it answers, while its worlds are still in their burn-in.
     pub fn start_in_burn_in(flags: &str) -> Self {
         let server = Self::start_without_waiting(&new_instance(), flags);
         let answers = || status_within(&server.instance, START).is_ok();
@@ -83,7 +83,7 @@ impl Server {
         server
     }
 
-    /// Starts a server of two worlds as [`SMALL`] ones at k = 0, whose every reset goes on for ever.
+    /// Starts a server of two worlds like those of [`SMALL`], at k = 0, in which resets never end.
     pub fn start_with_endless_resets(flags: &str) -> Self {
         let WorldSpec {
             settings,
@@ -106,12 +106,12 @@ impl Server {
         Connection::open(&self.instance, "tests", PATIENCE).expect("connect")
     }
 
-    /// A client that holds robots of it.
+    /// Creates a client that holds robots of this server.
     pub fn acquire(&self, robots: Range<u32>) -> Client {
         Client::acquire(self.connect(), &Claim::new(robots)).expect("acquire")
     }
 
-    /// A client that takes robots of it from their holders.
+    /// Creates a client that takes over robots of this server.
     pub fn take_over(&self, robots: Range<u32>) -> Client {
         Client::acquire(self.connect(), &takeover(robots)).expect("take over")
     }
@@ -124,7 +124,7 @@ impl Server {
         status(&self.instance).expect("status")
     }
 
-    /// What a robot shows, and its world's last result, over a connection that holds nothing.
+    /// Observes a robot and its world over a connection without a lease.
     pub fn observe(&self, robot: u32) -> Seen {
         let request = observe_header(robot..robot + 1);
         let answer = self.connect().step(request, &[], PATIENCE);
@@ -133,7 +133,7 @@ impl Server {
         (parts.worlds[0], parts.robots[0], parts.frames.to_vec())
     }
 
-    /// The step k that the world of a robot is at.
+    /// Returns the current step k of a robot's world.
     pub fn step_of(&self, robot: u32) -> u64 {
         self.observe(robot).0.step
     }
@@ -142,7 +142,7 @@ impl Server {
         self.status().worlds[0].holder_pids[0]
     }
 
-    /// Runs one of the program's commands for it.
+    /// Runs a subcommand of the server program on this instance.
     pub fn command(&self, words: &str) -> Ended {
         run(
             SERVER,
@@ -150,13 +150,13 @@ impl Server {
         )
     }
 
-    /// Kills it as no handler can prevent; returns when it is gone.
+    /// Kills the server with SIGKILL and waits for its end.
     pub fn kill(self) {
         self.program.kill();
     }
 }
 
-/// A claim on robots that are taken from their holders.
+/// Returns a claim that takes robots over from their holders.
 pub fn takeover(robots: Range<u32>) -> Claim {
     Claim {
         takeover: true,
@@ -164,7 +164,7 @@ pub fn takeover(robots: Range<u32>) -> Claim {
     }
 }
 
-/// What a world shall be reset to; `None`: what the server chooses.
+/// Returns the seed for a reset of a world; with `None`, the server chooses it.
 pub fn seed(world: u32, seed: impl Into<Option<u64>>) -> WorldSeed {
     WorldSeed {
         world,
@@ -172,7 +172,7 @@ pub fn seed(world: u32, seed: impl Into<Option<u64>>) -> WorldSeed {
     }
 }
 
-/// A name that no other test has.
+/// Returns an instance name that no other test uses.
 pub fn new_instance() -> Instance {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let count = COUNTER.fetch_add(1, Ordering::Relaxed);
@@ -180,7 +180,7 @@ pub fn new_instance() -> Instance {
     Instance::new(&name).expect("a plain name")
 }
 
-/// What a server of one world of 2 x 3 cells says of itself in a recording.
+/// Returns the description of a server with one world of 2 x 3 cells, for a recording.
 pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
     let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
         "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
@@ -193,7 +193,7 @@ pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
     }
 }
 
-/// The files of an instance's services.
+/// Returns the files of an instance's services.
 pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     let files = std::fs::read_dir(channel_directory().join("services"));
     let files = files.expect("services").flatten().map(|entry| entry.path());
@@ -202,7 +202,7 @@ pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     files.filter(|path| text(path).contains(&name)).collect()
 }
 
-/// What snapshots of a server as a [`SMALL`] one say of it, and the rules of its worlds.
+/// Returns the settings and rules of the worlds of a [`SMALL`] server.
 pub fn small_spec(burn_in: u64) -> WorldSpec {
     let config = ServerConfig {
         height: 5,
@@ -215,7 +215,7 @@ pub fn small_spec(burn_in: u64) -> WorldSpec {
     WorldSpec::of(&checked).expect("a valid model")
 }
 
-/// The server's status, over a connection of its own.
+/// Asks for the server's status over a new connection.
 pub fn status(instance: &Instance) -> Result<ServerStatus, ConnectionError> {
     status_within(instance, PATIENCE)
 }
@@ -228,7 +228,7 @@ fn status_within(instance: &Instance, limit: Duration) -> Result<ServerStatus, C
     }
 }
 
-/// Reproducible paths.
+/// A generator of reproducible random paths.
 pub struct Paths(ChaCha8Rng);
 
 impl Paths {
@@ -246,7 +246,7 @@ impl Paths {
     }
 }
 
-/// Starts a client's worlds again with consecutive seeds.
+/// Resets a client's worlds to consecutive seeds.
 pub fn reset(client: &mut Client, first_seed: u64) {
     let worlds = client.worlds_of(&client.robots());
     let seeds = worlds.zip(first_seed..);
@@ -260,7 +260,7 @@ pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
     client.step(robots, &[path]).expect("step").remove(0)
 }
 
-/// Flies random paths, one a step, with a client's only robot.
+/// Flies a random path in each step with a client's only robot.
 pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation> {
     let paths = Paths::new(seed)
         .take(client.info().n_moves, n_steps)
@@ -268,29 +268,29 @@ pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation
     paths.map(|path| fly(client, path)).collect()
 }
 
-/// The robots of a published step.
+/// Returns the robots of a published step.
 pub fn robots_of(sample: &Sample<FrameHeader>) -> Vec<RobotSample<'_>> {
     split_frame_payload(&sample.header, &sample.payload).expect("a whole sample")
 }
 
-/// The path of the only robot of a published step; empty after a reset.
+/// Returns the path of the only robot of a published step. Empty after a reset.
 pub fn path_of(sample: &Sample<FrameHeader>) -> Vec<Move> {
     path_from_bytes(robots_of(sample)[0].path).expect("a path")
 }
 
-/// What the only robot of a published step shows, as [`Server::observe`] does.
+/// Returns the content of a published step with one robot in the form of [`Server::observe`].
 pub fn seen_in(sample: &Sample<FrameHeader>) -> Seen {
     let robot = &robots_of(sample)[0];
     (sample.header.result, robot.result, robot.frame.to_vec())
 }
 
-/// What an answer of a client shows, as [`Server::observe`] does.
+/// Returns a client's observation in the form of [`Server::observe`].
 pub fn seen_by(observation: &Observation) -> Seen {
     let frame = observation.frame.as_bytes().to_vec();
     (observation.world, observation.robot, frame)
 }
 
-/// Reads frames until one of a world and step has come; returns all, that one last.
+/// Reads frames until the one of this world and step arrives. Returns all of them.
 pub fn frames_until(
     observer: &Observer<FrameHeader>,
     world: u32,

@@ -1,4 +1,4 @@
-//! What tests, benchmarks and examples share: programs as children, the wire byte by byte, hostile input.
+//! Shared code of tests, benchmarks and examples: child processes, raw protocol messages, hostile input.
 
 #![allow(missing_docs, reason = "tests, which share it")]
 

@@ -1,23 +1,23 @@
-//! What a process uses.
+//! Measurements of the resources that a process uses.
 
 use emberwatch_protocol::channels::SHARED_MEMORY;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// Memory, descriptors and shared memory at one moment.
+/// The memory, descriptors and shared memory in use at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Use {
-    /// Resident memory of the process, KiB.
+    /// Resident memory of the process, in KiB.
     pub resident: u64,
     pub descriptors: usize,
-    /// Files of this user's channels, of all instances.
+    /// Number of files of this user's channels, for all instances.
     pub files: usize,
-    /// KiB of those that are in use.
+    /// Disk blocks that these files occupy, in KiB.
     pub shared: u64,
 }
 
 impl Use {
-    /// That of a process.
+    /// Measures a process.
     pub fn of(pid: u32) -> Self {
         let user = rustix::process::getuid().as_raw();
         let own = format!("{SHARED_MEMORY}/emberwatch-{user}");
@@ -28,7 +28,7 @@ impl Use {
         };
         let mut files = all_under(Path::new(SHARED_MEMORY));
         files.retain(|path| is_own(path) && !path.is_dir());
-        // What a file really takes, in blocks of half a KiB.
+        // The allocated blocks of a file, of 512 bytes each.
         let blocks = |path: &PathBuf| path.metadata().map_or(0, |file| file.blocks());
         Self {
             resident: memory("VmRSS:", pid),
@@ -54,7 +54,7 @@ impl std::fmt::Display for Use {
     }
 }
 
-/// A line of a process's `/proc/<pid>/status` that is in KiB; 0 if there is none.
+/// Reads a line in KiB from a process's `/proc/<pid>/status`. Returns 0 if it does not exist.
 pub fn memory(line: &str, pid: u32) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let found = status.lines().find_map(|text| text.strip_prefix(line));
@@ -68,7 +68,7 @@ pub fn n_descriptors(pid: u32) -> usize {
     descriptors.expect("its descriptors").count()
 }
 
-/// User and system time of a process in seconds, which the kernel counts in hundredths.
+/// Returns the user and system time of a process, in seconds. The kernel counts hundredths of a second.
 pub fn processor_seconds(pid: u32) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("a running process");
     let (_, after_name) = stat.rsplit_once(')').expect("its name in brackets");
@@ -77,7 +77,7 @@ pub fn processor_seconds(pid: u32) -> f64 {
     (ticks(11) + ticks(12)) / 100.0
 }
 
-/// A folder and everything below it.
+/// Returns a folder and everything below it.
 pub fn all_under(folder: &Path) -> Vec<PathBuf> {
     let mut all = vec![folder.to_path_buf()];
     let mut next = 0;

@@ -1,5 +1,5 @@
-//! A world as its published steps must make it, stepped in this process: no server, no clients, no time. And a world of
-//! a server that goes as fast as it is checked so.
+//! A copy of a server's world that repeats its published steps in this process, to check them. Also a world on a server
+//! that steps only as fast as it is checked.
 
 use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
 use emberwatch_protocol::client::Claim;
@@ -15,17 +15,17 @@ use emberwatch_sim::snapshot::WorldSpec;
 use emberwatch_sim::world::{Episode, Flown, Robot, Rules};
 use std::time::{Duration, Instant};
 
-/// A lease that ends by nothing but what a test does.
+/// Duration of a lease that does not expire during a test.
 const LONG: Duration = Duration::from_secs(3600);
 
-/// World 0 of a server, undisturbed.
+/// The expected state of world 0 of a server.
 pub struct Mirror {
     rules: Rules,
     episode: Episode,
 }
 
 impl Mirror {
-    /// At k = 0 of the first episode; but for what it says of itself, the server has the default settings.
+    /// Creates the world at k = 0 of the first episode. Settings that are not in `info` must have their defaults.
     pub fn of(info: &ServerInfo) -> Self {
         let config = ServerConfig {
             height: info.height,
@@ -42,11 +42,11 @@ impl Mirror {
         Self { rules, episode }
     }
 
-    /// Takes a published step, with the paths and masks that the sample tells; returns whether it is a new one, not the
-    /// last one again.
+    /// Repeats a published step with the paths and masks of its sample. Returns whether the sample is new, not the
+    /// previous one published again.
     ///
     /// # Panics
-    /// If a step is missing, or the sample shows anything else than these paths give.
+    /// If a step is missing, or the sample differs from the result of its paths.
     pub fn follow(&mut self, sample: &Sample<FrameHeader>) -> bool {
         let (world, k) = (sample.header.result, self.episode.outcome().step);
         let robots = robots_of(sample);
@@ -71,7 +71,7 @@ impl Mirror {
     }
 }
 
-/// Takes the step that a result and the robots' paths tell of; these are empty for who hovered or was late.
+/// Repeats a step from its result and the robots' paths, which are empty for robots that hovered or were late.
 pub fn step_again(
     episode: &mut Episode,
     rules: &Rules,
@@ -87,7 +87,7 @@ pub fn step_again(
         full |= u64::from(result.coverage == Coverage::Full as u32) << index;
     }
     let (hovered, late) = (told.hovered, told.late);
-    // Each robot flew, hovered or was late, and only one of these.
+    // Each robot either flew, hovered or was late.
     assert_eq!(ready ^ hovered ^ late, all);
     assert_eq!(hovered & late, 0);
     let flown = Flown {
@@ -104,8 +104,7 @@ fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
     (robot.frame().as_bytes(), path_to_bytes(robot.path()))
 }
 
-/// World 0 of a server, one of whose robots is flown by this process: it checks each step before it flies the next, so
-/// that no step is missed.
+/// World 0 of a server. This process flies one robot, and checks each step before the next to miss none.
 pub struct PacedWorld {
     pub client: Client,
     pub last: WorldResult,
@@ -115,7 +114,7 @@ pub struct PacedWorld {
 }
 
 impl PacedWorld {
-    /// The world at k = 0, and a robot that nobody holds.
+    /// Acquires a free robot in a world at k = 0.
     pub fn new(server: &Server, robot: u32) -> Self {
         let observer = Observer::frames(&server.instance).expect("observe");
         frames_until(&observer, 0, 0);
@@ -132,7 +131,7 @@ impl PacedWorld {
         }
     }
 
-    /// Flies a path, checks all steps until then, and tells of each.
+    /// Flies a path, checks all steps published until then, and passes each to `tell`.
     pub fn step(&mut self, mut tell: impl FnMut(&Sample<FrameHeader>)) {
         let path = self.paths.next(self.client.info().n_moves);
         let (start, robots) = (Instant::now(), self.client.robots());
@@ -140,7 +139,7 @@ impl PacedWorld {
         let flown = self.client.step_until(robots.clone(), &[path], &is_over);
         match flown {
             Ok(Some(_)) => {}
-            // This process was not given the time: it goes on with the next step.
+            // This process was scheduled too late. It continues with the next step.
             Err(ConnectionError::Refused {
                 status: Status::Late,
                 ..

@@ -1,4 +1,4 @@
-//! Programs as children: started, waited for with deadlines, killed on drop.
+//! Programs as child processes. Waits for them have deadlines, and dropping one kills it.
 
 use emberwatch_protocol::channels::Instance;
 use rustix::process::{Pid, Signal, kill_process};
@@ -8,7 +8,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 use tempfile::TempDir;
 
-/// How long anything may take that should take milliseconds: less than a lease lasts, 30 s.
+/// Time limit for operations that should take milliseconds. It is shorter than a lease of 30 s.
 pub const PATIENCE: Duration = Duration::from_secs(25);
 
 pub const LIMIT: Duration = Duration::from_secs(60);
@@ -17,13 +17,13 @@ pub const SERVER: &str = "emberwatch-server";
 
 pub const AGENT: &str = "emberwatch-agent";
 
-/// A child process and what it wrote to its standard error so far.
+/// A child process whose output is captured.
 pub struct Program {
     child: Child,
     folder: TempDir,
 }
 
-/// A folder of a test's own, which is removed with it.
+/// A temporary folder, removed on drop.
 pub struct Folder(TempDir);
 
 impl Default for Folder {
@@ -37,12 +37,12 @@ impl Folder {
         self.0.path().join(name)
     }
 
-    /// A file's path as a word of a command.
+    /// Returns a file's path as an argument of a command.
     pub fn word(&self, name: &str) -> String {
         self.path(name).display().to_string()
     }
 
-    /// Writes a file; returns its path as a word of a command.
+    /// Writes a file and returns its path as an argument of a command.
     pub fn write(&self, name: &str, contents: impl AsRef<[u8]>) -> String {
         std::fs::write(self.path(name), contents).expect("write a file");
         self.word(name)
@@ -59,14 +59,14 @@ impl Folder {
 
 #[derive(Debug)]
 pub struct Ended {
-    /// Its exit code; `None` if a signal ended it.
+    /// The exit code, or `None` if a signal ended the program.
     pub code: Option<i32>,
     pub stdout: String,
     pub stderr: String,
 }
 
 impl Program {
-    /// Starts a program of this workspace; its arguments are separated by spaces.
+    /// Starts a program of this workspace; `arguments` are separated by spaces.
     pub fn start(name: &str, arguments: &str) -> Self {
         let arguments: Vec<&str> = arguments.split_whitespace().collect();
         Self::start_at(&program_path(name), &arguments)
@@ -80,7 +80,7 @@ impl Program {
         )
     }
 
-    /// Starts Python with the package, for the lines of a script.
+    /// Starts Python, with the package installed, on a script.
     pub fn start_python(script: &str) -> Self {
         Self::start_at(&python(), &["-c", script])
     }
@@ -94,7 +94,7 @@ impl Program {
             .stdout(file("stdout"))
             .stderr(file("stderr"))
             .env("RUST_LOG", "info")
-            // Not the user's; here nothing can be kept.
+            // Keeps the program away from the user's cache: nothing can be stored here.
             .env("XDG_CACHE_HOME", "/dev/null")
             .spawn();
         Self {
@@ -107,12 +107,12 @@ impl Program {
         self.child.id()
     }
 
-    /// What it has written to its standard output so far.
+    /// Returns the standard output so far.
     pub fn stdout(&self) -> String {
         self.read("stdout")
     }
 
-    /// What it has written to its standard error so far.
+    /// Returns the standard error so far.
     pub fn stderr(&self) -> String {
         self.read("stderr")
     }
@@ -122,7 +122,7 @@ impl Program {
         kill_process(pid, signal).expect("signal the program");
     }
 
-    /// Pauses it; returns when it no longer runs.
+    /// Pauses the program with SIGSTOP and waits until it is stopped.
     pub fn stop(&self) {
         self.signal(Signal::STOP);
         let stat = format!("/proc/{}/stat", self.pid());
@@ -162,13 +162,13 @@ impl Program {
         self.wait(PATIENCE).check(code)
     }
 
-    /// Tells it to stop, which it does gently.
+    /// Sends SIGTERM and checks that the program ends with exit code 0.
     pub fn finish(self) -> Ended {
         self.signal(Signal::TERM);
         self.ends(0)
     }
 
-    /// Kills it as no handler can prevent, unless it has ended; returns when it is gone.
+    /// Kills the program with SIGKILL and waits for its end.
     pub fn kill(mut self) {
         self.child.kill().expect("kill the program");
         self.child.wait().expect("wait for the program");
@@ -210,12 +210,12 @@ impl Ended {
     }
 }
 
-/// Runs a program to its end; its arguments are separated by spaces.
+/// Runs a program to its end; `arguments` are separated by spaces.
 pub fn run(name: &str, arguments: &str) -> Ended {
     Program::start(name, arguments).wait(LIMIT)
 }
 
-/// Looks every millisecond until something holds; returns whether it did before the deadline.
+/// Checks a condition every millisecond. Returns whether it held before the time limit.
 pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
     let deadline = Instant::now() + limit;
     while !holds() {
@@ -232,14 +232,14 @@ pub fn repository() -> PathBuf {
     tests.parent().expect("tests lies in the repository").into()
 }
 
-/// The Python of the tests, which `scripts/test` makes.
+/// Returns the Python interpreter of the tests, which `scripts/test` installs.
 pub fn python() -> PathBuf {
     let python = repository().join("target/venv/bin/python");
     assert!(python.exists(), "no {}; run scripts/test", python.display());
     python
 }
 
-/// The program of a name, as built from the present sources.
+/// Returns the path of a program, after checking that it is built from the current sources.
 pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
     let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");

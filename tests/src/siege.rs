@@ -1,5 +1,5 @@
-//! A server under attack: beside the attacker a victim steps its world, which must go as if nobody else
-//! were there, and afterwards the server must hold no more than before.
+//! A server under attack. Meanwhile a victim steps its world, which must evolve as if it were alone. Afterwards the
+//! server must not hold more resources than before.
 
 use crate::harness::{PATIENCE, Paths, Server, eventually};
 use crate::meter::{memory, n_descriptors};
@@ -11,29 +11,29 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
-/// Three worlds: the first is the victim's, the second the attacker's, the third anybody's.
+/// Three worlds: the victim's, the attacker's, and a free one.
 pub const FLAGS: &str =
     "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --lease-millis 86400000";
 
-/// How much more memory of its own a server may have in the end than in the beginning: its allocator
-/// keeps some of what the longest request took (5 MiB were seen), and tables of clients have bounds.
+/// Maximum growth of a server's private memory. Its allocator keeps some of the memory of the longest request (up to
+/// 5 MiB were measured), and the tables of clients are bounded.
 const MOST_GROWTH_KIB: u64 = 8 << 10;
 
-/// How often the victim steps: beside the attacker, not instead of it.
+/// Pause between the victim's steps, which leaves processor time for the attacker.
 const PACE: Duration = Duration::from_micros(500);
 
-/// What a server holds.
+/// The resources that a server holds.
 #[derive(Debug)]
 struct Holdings {
     n_descriptors: usize,
-    /// Shared memory that it has mapped, bytes.
+    /// Mapped shared memory, in bytes.
     shared: u64,
-    /// Memory of its own, KiB.
+    /// Private memory, in KiB.
     own: u64,
 }
 
-/// Starts a server and a victim, and runs an attack, which is told the victim's lease; then checks
-/// that neither noticed.
+/// Starts a server and a victim, and runs an attack, which gets the victim's lease. Then checks that the victim was
+/// undisturbed and that the server holds no more resources.
 pub fn besiege(attack: impl FnOnce(&Server, u64)) {
     let server = Server::start(FLAGS);
     let (tell_lease, stolen) = channel();
@@ -42,7 +42,7 @@ pub fn besiege(attack: impl FnOnce(&Server, u64)) {
         let victim = scope.spawn(|| live(&server.instance, &tell_lease, &stop));
         let stolen = stolen.recv_timeout(PATIENCE).expect("a lease");
         let before = Holdings::of(server.program.pid());
-        // Also when the attack fails: the victim waits for it.
+        // Stops the victim also if the attack panics; otherwise it would never end.
         let stopped = Stop(&stop);
         attack(&server, stolen);
         check_holdings(server.program.pid(), &before);
@@ -62,7 +62,7 @@ impl Drop for Stop<'_> {
     }
 }
 
-/// The victim: steps world 0 until told to stop; returns every answer's payload.
+/// Runs the victim: steps world 0 until `stop` is set. Returns every answer's payload.
 fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec<Vec<u8>> {
     let wire = Wire::open(instance);
     let lease = wire.acquire(0..1).lease;
@@ -73,7 +73,7 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
         assert_eq!(reply.status, Status::Ok as u32);
         seen.push(payload);
         if seen.len() == 1 {
-            // From here on nothing of the victim's is new to the server.
+            // The server has now allocated everything for the victim, so that later growth is due to the attack.
             tell_lease.send(lease).expect("somebody steals the lease");
         }
         std::thread::sleep(PACE);
@@ -81,7 +81,7 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
     seen
 }
 
-/// Asserts that a server where nothing happened shows the same.
+/// Asserts that a server without an attacker gives the same answers.
 fn assert_undisturbed(seen: &[Vec<u8>]) {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
@@ -113,7 +113,7 @@ impl Holdings {
     }
 }
 
-/// Waits until a server holds no more than it did.
+/// Waits until a server holds no more resources than before.
 fn check_holdings(pid: u32, before: &Holdings) {
     let mut now = Holdings::of(pid);
     let is_as_before = eventually(PATIENCE, || {

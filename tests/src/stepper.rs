@@ -1,4 +1,4 @@
-//! Steps as fast as the wire allows: a lease on a connection, and answers as bytes.
+//! A minimal client that steps as fast as the channel allows and leaves answers as bytes.
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::Connection;
@@ -8,7 +8,7 @@ use emberwatch_protocol::lease::{Call, Lease};
 use emberwatch_protocol::message::Operation;
 use std::ops::Range;
 
-/// A connection that holds robots.
+/// A connection and its lease on robots.
 pub struct Stepper {
     pub connection: Connection,
     pub lease: Lease,
@@ -16,7 +16,7 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// Takes robots from their holders.
+    /// Takes robots over from their holders.
     pub fn new(mut connection: Connection, robots: Range<u32>) -> Self {
         let acquire = Request::Acquire {
             first_robot: robots.start,
@@ -37,7 +37,7 @@ impl Stepper {
         }
     }
 
-    /// Flies paths, one robot's after the other's.
+    /// Flies the concatenated paths of all robots.
     pub fn step(&mut self, paths: &[u8]) -> StepAnswer {
         let request = self.lease.request(Operation::Step, &self.robots, 0);
         let mut call = Call::new(request, paths, PATIENCE);

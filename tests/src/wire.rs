@@ -1,5 +1,5 @@
-//! The protocol byte by byte: headers and payloads as a client of another language, or a hostile
-//! one, sends them. Nothing is filled in and nothing is checked.
+//! The protocol byte by byte: headers and payloads as a client in another language or a hostile client sends them.
+//! Nothing is filled in or checked.
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::channels::{
@@ -27,10 +27,10 @@ pub type ControlAnswer = (ControlReply, Vec<u8>);
 
 pub type Requests<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// A request that waits for its answer.
+/// A sent request that waits for its answer.
 pub type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// Sends raw messages and waits for their answers: what the compliance suite asks of a client.
+/// A client of the compliance suite, which sends raw messages and waits for their answers.
 pub trait RawClient {
     /// Sends a step request and waits for its answer.
     fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer;
@@ -38,10 +38,10 @@ pub trait RawClient {
     /// Sends bytes on `control` and waits for the answer.
     fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer;
 
-    /// The process that the server sees.
+    /// Returns the id of the process that the server sees as the client.
     fn pid(&self) -> u32;
 
-    /// Sends a well-formed control request; the status in the header must be the reply's.
+    /// Sends a well-formed control request, and checks that the status in the header equals the reply's.
     fn ask(&self, request: &Request) -> Reply {
         let text = serde_json::to_vec(request).expect("requests serialise");
         let (header, payload) = self.control(control_header(7), &text);
@@ -51,7 +51,7 @@ pub trait RawClient {
         reply
     }
 
-    /// Sends a step request: the status of its answer, and the detail.
+    /// Sends a step request, and returns the status and detail of its answer.
     fn status_of(&self, header: StepRequest, payload: &[u8]) -> (Status, u64) {
         let (reply, _) = self.step(header, payload);
         let status = Status::try_from(reply.status);
@@ -66,7 +66,7 @@ pub trait RawClient {
     }
 }
 
-/// A client without manners.
+/// A client that skips the handshake and all checks.
 pub struct Wire {
     step: Requests<StepRequest, StepReply>,
     control: Requests<ControlRequest, ControlReply>,
@@ -80,7 +80,7 @@ impl Wire {
         Self::try_open(instance).expect("open the channels")
     }
 
-    /// As [`Self::open`], where it may fail.
+    /// Like [`Self::open`], but returns the error.
     pub fn try_open(instance: &Instance) -> Result<Self, ChannelError> {
         let node = create_node()?;
         let services = Services {
@@ -136,7 +136,7 @@ impl RawClient for Wire {
     }
 }
 
-/// The header of a correct step of robot 0.
+/// Returns the header of a correct step of robot 0.
 pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
     StepRequest {
         version: VERSION,
@@ -149,7 +149,7 @@ pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
     }
 }
 
-/// The header of a correct request for what robots show now.
+/// Returns the header of a correct request to observe robots.
 pub fn observe_header(robots: Range<u32>) -> StepRequest {
     StepRequest {
         operation: Operation::Observe as u32,
@@ -159,7 +159,7 @@ pub fn observe_header(robots: Range<u32>) -> StepRequest {
     }
 }
 
-/// The header of a correct request for what robots showed at a step.
+/// Returns the header of a correct request to recall robots at past steps.
 pub fn recall_header(robots: Range<u32>) -> StepRequest {
     StepRequest {
         operation: Operation::Recall as u32,
@@ -167,14 +167,14 @@ pub fn recall_header(robots: Range<u32>) -> StepRequest {
     }
 }
 
-/// The payload of a step of worlds that are at these steps.
+/// Returns the payload of a step of worlds at these steps.
 pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
     let mut body = Vec::new();
     write_step_body(steps, paths, &mut body);
     body
 }
 
-/// A request for robots that nobody holds.
+/// Returns a request for a lease on free robots.
 pub fn acquire_request(robots: Range<u32>) -> Request {
     Request::Acquire {
         first_robot: robots.start,
@@ -184,7 +184,7 @@ pub fn acquire_request(robots: Range<u32>) -> Request {
     }
 }
 
-/// The header of a correct control request.
+/// Returns the header of a correct control request.
 pub fn control_header(sequence: u64) -> ControlRequest {
     ControlRequest {
         version: VERSION,
@@ -193,7 +193,7 @@ pub fn control_header(sequence: u64) -> ControlRequest {
     }
 }
 
-/// Waits for an answer; `None` if none comes in time.
+/// Waits for an answer. Returns `None` if none arrives in time.
 pub fn answer<Q: Header, R: Header>(
     pending: &Pending<Q, R>,
     limit: Duration,
@@ -209,7 +209,7 @@ pub fn answer<Q: Header, R: Header>(
     Waiter::default().wait(limit, poll, block).expect("wait")
 }
 
-/// A port of a service; nobody is greeted.
+/// Opens a client port of a service without a handshake.
 pub fn client<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
 ) -> Result<Requests<Q, R>, ChannelError> {
@@ -218,7 +218,7 @@ pub fn client<Q: Header, R: Header>(
     builder.create().map_err(ipc_error("create a client"))
 }
 
-/// Sends a request and wakes nobody.
+/// Sends a request without waking the server.
 pub fn send<Q: Header, R: Header>(
     client: &Requests<Q, R>,
     header: Q,

@@ -5,7 +5,7 @@ use emberwatch_model::Grid;
 
 /// Computes the Brier score of one state: the mean over all cells of `(p - 1[x = target])^2`.
 ///
-/// `p` is the belief in the state. It has the number `target` in the model and `own` in the belief. A perfect belief
+/// `p` is the belief in the state, which is number `target` in `truth` and number `own` in the belief. A perfect belief
 /// scores 0. If a share `q` of the cells is in the state, the belief `p = q` in every cell scores `q (1 - q)`.
 pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
     let squared = |(&p, &state): (&f32, &u8)| {
@@ -63,7 +63,7 @@ mod tests {
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
         assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
         assert!((log_loss(&uniform, &truth) - 3.0_f64.ln()).abs() < 1e-6);
-        // The first state of each cell.
+        // All states tie, so state 0 counts: the true state of half the cells.
         assert_eq!(accuracy(&uniform, &truth), 0.5);
     }
 }

@@ -1,5 +1,5 @@
-//! From frames to a belief about every cell (paper sections III.A to III.C). A new estimator is one file with an
-//! [`Estimator`].
+//! Estimators, which turn frames into a belief about every cell (paper sections III.A to III.C). To add one, implement
+//! [`Estimator`] in a file of this module.
 
 pub mod bayes;
 pub mod belief;

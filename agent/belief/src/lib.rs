@@ -1,14 +1,13 @@
-//! Beliefs about a grid of hidden states that robots see in part, and plans on them. Pure: frames, seeds and
-//! steps come as arguments; no clock, no logging, and no files but for [`estimation::kept_belief`].
+//! Beliefs about a partly observed grid of hidden states, and plans based on these beliefs.
+//!
+//! The code is pure: frames, seeds and steps are arguments. It reads no clock and writes no log, and only
+//! [`estimation::kept_belief`] accesses files.
 //!
 //! - [`estimation`]: from frames to a belief about every cell (paper sections III.A to III.C)
 //! - [`planning`]: from a belief to a path (paper section III.D)
-//! - [`merit`], [`brier`]: how good a run and a belief were
+//! - [`merit`], [`brier`]: scores of a run and of a belief
 
-#![allow(
-    missing_docs,
-    reason = "items that their names explain have no words of their own"
-)]
+#![allow(missing_docs, reason = "self-explanatory names need no docs")]
 
 pub mod brier;
 pub mod estimation;

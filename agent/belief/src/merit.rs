@@ -1,47 +1,50 @@
-//! The field's figures of merit of one run, as `docs/figures-of-merit.md` defines them. Pure.
+//! The figures of merit of one run that are common in the field, as defined in `docs/figures-of-merit.md`.
 //!
-//! They need no model: only which state is the target, and for two of them the hidden states.
+//! They need no model, only the number of the target state. Two of them also need the hidden states.
 
 use emberwatch_model::path::Flight;
 use emberwatch_model::{Cell, Grid, Shape};
 
-/// Steps for which a cell counts as seen after a visit, unless told otherwise.
+/// Default number of steps for which a cell counts as seen after a visit.
 pub const RECENT_STEPS: u32 = 10;
 
-/// The figures of one run; `None` where there was nothing to measure.
+/// The figures of one run. A figure is `None` if there was nothing to measure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Merit {
-    /// Steps until a robot first visited a burning cell.
+    /// Number of steps until a robot first visited a burning cell.
     pub steps_to_detection: Option<u64>,
-    /// Burning cells of the world in that step.
+    /// Number of burning cells of the world at that step.
     pub burning_cells_at_detection: Option<u32>,
-    /// Share of the burning cells that a robot visited in the last steps: mean over steps with fire.
+    /// Share of the burning cells that a robot visited in the last [`MeritTally::recent_steps()`], as the mean over
+    /// steps with fire.
     pub burning_seen_share: Option<f64>,
-    /// Moves from the nearest robot to the nearest burning cell that is not among these: mean over
-    /// steps that have one.
+    /// Number of moves from the nearest robot to the nearest burning cell that no robot visited recently, as the mean
+    /// over steps with such a cell.
     pub front_distance: Option<f64>,
-    /// Share of all cells that a robot ever visited.
+    /// Share of all cells that any robot visited during the run.
     pub grid_seen_share: f64,
 }
 
-/// What a step paid, as the server counts it.
+/// The reward counts of one step, as the server reports them.
 #[derive(Debug, Clone, Copy)]
 pub struct Found {
-    /// Distinct burning cells that the robots visited.
+    /// Number of distinct burning cells that the robots visited.
     pub n_hits: u32,
+    /// Number of burning cells of the world.
     pub n_burning: u32,
 }
 
-/// The figures of a run while it goes on.
+/// The running computation of the figures.
 #[derive(Debug, Clone)]
 pub struct MeritTally {
     shape: Shape,
     target: u8,
     recent_steps: u32,
     step: u32,
-    /// The step of the last visit to each cell, row-major; 0: never.
+    /// The step of the last visit to each cell, row-major. 0 if the cell was never visited.
     last_visits: Vec<u32>,
     n_seen: usize,
+    /// The step of the first detection, and the number of burning cells at that step.
     detection: Option<(u32, u32)>,
     burning_seen: Mean,
     distance: Mean,
@@ -54,7 +57,7 @@ struct Mean {
 }
 
 impl MeritTally {
-    /// Before the first step. `target`: the state that burns; `recent_steps`: at least 1.
+    /// Creates the tally before the first step. `target` is the burning state, and `recent_steps` is at least 1.
     pub fn new(shape: Shape, target: u8, recent_steps: u32) -> Self {
         Self {
             shape,
@@ -69,8 +72,8 @@ impl MeritTally {
         }
     }
 
-    /// One step: a flight of each robot, at least one, and the hidden states that it met, shape `[H, W]`, where
-    /// they are known.
+    /// Adds a step: one flight for each of at least one robot, the reward counts, and the hidden states that the robots
+    /// met, shape `[H, W]`, if they are known.
     pub fn update(&mut self, flights: &[Flight], found: Found, states: Option<&Grid<u8>>) {
         self.step += 1;
         for &cell in flights.iter().flat_map(|flight| &flight.visited) {
@@ -89,6 +92,7 @@ impl MeritTally {
         self.recent_steps
     }
 
+    /// Returns the figures so far.
     pub fn merit(&self) -> Merit {
         Merit {
             steps_to_detection: self.detection.map(|(step, _)| step.into()),
@@ -99,10 +103,11 @@ impl MeritTally {
         }
     }
 
+    /// Updates the figures that need the hidden states.
     fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
         let states = states.as_slice().expect("invariant: grids are row-major");
         let forgotten = self.step.saturating_sub(self.recent_steps);
-        // Without a branch: the compiler makes vector code of it.
+        // Without branches, so that the compiler vectorises the loop.
         let (mut n_burning, mut n_seen) = (0_u32, 0_u32);
         for (&state, &visit) in states.iter().zip(&self.last_visits) {
             let burns = u32::from(state == self.target);
@@ -136,7 +141,8 @@ impl Mean {
     }
 }
 
-/// Moves from a cell to the nearest of some, or `best` if none is nearer: row by row, the near ones first.
+/// Returns the number of moves from a cell to the nearest cell that satisfies `is_one`, or `best` if none is nearer.
+/// Scans row by row, from the nearest rows outwards.
 fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> bool) -> usize {
     let (height, width) = shape.dim();
     for row_moves in 0..height {
@@ -164,7 +170,7 @@ mod tests {
 
     const FIRE: u8 = 2;
 
-    /// A row of cells: `#` burns.
+    /// Creates a world of one row, in which `#` burns.
     fn world(row: &str) -> Grid<u8> {
         let states = row.bytes().map(|cell| u8::from(cell == b'#') * FIRE);
         Grid::from_shape_vec((1, row.len()), states.collect()).expect("test world")
@@ -178,7 +184,7 @@ mod tests {
         }
     }
 
-    /// The figures of steps: the world, and the cells that each robot visits.
+    /// Computes the figures of a run. Each step has the world, and the cells that each robot visits.
     fn merit(recent_steps: u32, steps: &[(&str, &[&[usize]])]) -> Merit {
         let shape = Shape::new(1, steps[0].0.len()).expect("test shape");
         let mut tally = MeritTally::new(shape, FIRE, recent_steps);
@@ -201,11 +207,11 @@ mod tests {
     #[test]
     fn fire_is_detected_by_the_first_visit_to_a_cell_that_burns_then() {
         let of = |it: Merit| (it.steps_to_detection, it.burning_cells_at_detection);
-        // Visited before it burns, missed, found when two cells burn.
+        // Cell 1 is visited before it burns, then missed. Cell 2 is found when two cells burn.
         let steps: [(&str, &[&[usize]]); 3] =
             [("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])];
         assert_eq!(of(merit(9, &steps)), (Some(3), Some(2)));
-        // Later finds change nothing.
+        // Later detections do not count.
         let got = merit(9, &[("#...", &[&[0]]), ("####", &[&[1]])]);
         assert_eq!(of(got), (Some(1), Some(1)));
         let got = merit(9, &[("...#", &[&[0]]), ("...#", &[&[1]])]);
@@ -225,10 +231,10 @@ mod tests {
             grid_seen_share: 0.75,
         };
         assert_eq!(got, expected);
-        // Steps without fire do not count: those with it are half seen.
+        // Steps without fire do not count. In the other step, half of the fire is seen.
         let got = merit(9, &[("....", &[&[0]]), ("#..#", &[&[1]])]);
         assert_eq!(got.burning_seen_share, Some(0.5));
-        // Fire that is all seen has no front.
+        // If all fire is seen, there is no front.
         let got = merit(9, &[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
         assert_eq!(got.burning_seen_share, Some(1.0));
         assert_eq!((got.front_distance, got.grid_seen_share), (None, 1.0));
@@ -238,8 +244,8 @@ mod tests {
     fn cells_are_seen_for_the_last_steps_alone() {
         let steps: [(&str, &[&[usize]]); 3] =
             [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
-        // Of two burning cells one is seen: in all of 3 steps, in the first two, in the first. To the nearest other are
-        // 3, 2 and 1 moves, or 3, 1 and 1 where cell 0 is forgotten at once.
+        // One of two burning cells is seen: in all 3 steps, in the first two, or in the first. The nearest unseen fire
+        // is 3, 2 and 1 moves away, or 3, 1 and 1 moves if cell 0 is forgotten after one step.
         for (recent_steps, seen, moves) in [(3, 1.5, 6.0), (2, 1.0, 6.0), (1, 0.5, 5.0)] {
             let got = merit(recent_steps, &steps);
             assert_eq!(got.burning_seen_share, Some(seen / 3.0), "{recent_steps}");

@@ -1,7 +1,7 @@
-//! Planners: from a value per cell to a path (paper section III.D).
+//! Planners, which turn a value per cell into a path (paper section III.D).
 //!
-//! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
-//! with the best score, which is eq. 15 with the sign turned and without its constant factor.
+//! An [`Objective`] converts a belief into [`CellValues`]. A [`Planner`] then searches for the path with the highest
+//! score: the cost of eq. 15 with the opposite sign and without its constant factor.
 
 pub mod ahead;
 pub mod beam;

@@ -1,7 +1,7 @@
-//! Numbers from the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
+//! Comparison with results of the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
 //!
-//! Beliefs there are `[H, W, S]`, and so are the arrays in `data/`. Files are stored uncompressed, as
-//! `ndarray-npy` reads them without a codec; otherwise as they were made:
+//! The authors' beliefs have shape `[H, W, S]`, and so have the arrays in `data/`. The files are uncompressed copies of
+//! the originals, because `ndarray-npy` then needs no codec:
 //!
 //! ```python
 //! for name in "a3_bayes", "a4_masked_small", "a5_planner":
@@ -31,7 +31,7 @@ fn shape_of(dim: (usize, usize)) -> Shape {
     Shape::new(dim.0, dim.1).expect("test shape")
 }
 
-/// `[H, W, S]` to a belief.
+/// Converts an array `[H, W, S]` to a belief.
 fn belief_from(channels_last: ArrayView3<'_, f32>) -> Belief {
     let planes = channels_last.permuted_axes([2, 0, 1]);
     Belief::from_probabilities(planes.to_owned()).expect("on the simplex")
@@ -43,7 +43,8 @@ fn assert_close(belief: &Belief, channels_last: ArrayView3<'_, f32>, what: &str)
     assert!(worst < 1e-6, "{what}: off by {worst}");
 }
 
-/// A3: every cell observed, from `u_0 = 1/3`. The reference calls the predictor `u_{k+1}` its estimate.
+/// Case A3: every cell is observed, starting from `u_0 = 1/3`. The reference calls the predictor `u_{k+1}` its
+/// estimate.
 #[test]
 fn the_filter_reproduces_posterior_and_predictor() {
     let mut golden = Golden::open("a3_bayes");
@@ -73,8 +74,8 @@ fn the_filter_reproduces_posterior_and_predictor() {
     }
 }
 
-/// A4 without the network: Bayes' rule on visited cells only, with the likelihood that the reference's network learned:
-/// `W` is `[O, S]` and the softmax runs over observations.
+/// Case A4 without the network: Bayes' rule on visited cells only, with the likelihood that the reference's network
+/// learned. Its weights `W` have shape `[O, S]`, and the softmax is over observations.
 #[test]
 fn the_masked_posterior_agrees() {
     let mut golden = Golden::open("a4_masked_small");
@@ -98,7 +99,7 @@ fn the_masked_posterior_agrees() {
     }
 }
 
-/// What the reference's planner types maximise for each action, the last of which is entropy.
+/// Returns the objective of a planner type of the reference for an action. The last action is entropy.
 fn objective(planner_type: usize, action: usize) -> Objective {
     const DEFAULT: usize = 0;
     const RANDOM: usize = 1; // number of distinct cells, whatever the action
@@ -110,19 +111,19 @@ fn objective(planner_type: usize, action: usize) -> Objective {
     })
 }
 
-/// A5: scores of every sample under three planner types and four actions, and the winners. The sampled moves, clamped
-/// after they are summed up, become moves that our robot flies over the same cells.
+/// Case A5: scores of every sample for three planner types and four actions, and the winners. The reference clamps the
+/// sums of the sampled moves. The test converts them to moves by which our robot visits the same cells.
 ///
-/// The reference writes the visit mask at `[position[1], position[0]]`, so its second coordinate is the
-/// row, and its basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. The environment gets
-/// that same mask, so nothing but the names of the axes is turned.
+/// The reference writes the visit mask at `[position[1], position[0]]`. So its second coordinate is the row, and its
+/// basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. Its environment receives the same mask, so only the
+/// names of the axes are swapped.
 ///
-/// A zero probability makes the reference's entropy `0 * log 0 = NaN`; it multiplies the whole grid
-/// by the visit mask, so the score of every path is NaN, and `torch.argmax` takes the first NaN. Our
-/// entropy is 0 there: case p3 checks that the reference has NaN exactly where this happens.
+/// With a zero probability, the reference's entropy is `0 * log 0 = NaN`. The reference multiplies the whole grid by
+/// the visit mask, so the score of every path is NaN, and `torch.argmax` returns the first NaN. Our entropy is 0 there.
+/// Case p3 checks that the reference has NaN exactly in this situation.
 ///
-/// Sums of up to 64 numbers of 1 to 2 in another order differ by up to 64 roundings of 128, that is
-/// 5e-4 at worst and below 5e-5 in fact. Where the reference's best two are that close, either may win.
+/// Sums of up to 64 numbers between 1 and 2 in another order differ by up to 64 roundings of 128. This is 5e-4 in the
+/// worst case, and below 5e-5 in these data. If the reference's best two scores are that close, either may win.
 #[test]
 fn path_scores_and_winners_agree() {
     const TOLERANCE: f32 = 5e-5;
@@ -172,7 +173,7 @@ fn path_scores_and_winners_agree() {
     }
 }
 
-/// The reference's random walk clamps each move, and here the first coordinate is the row.
+/// The reference's random walk clamps each move. Its first coordinate is the row, unlike in its planner.
 #[test]
 fn random_walks_fly_the_same_cells() {
     let mut golden = Golden::open("a5_planner");

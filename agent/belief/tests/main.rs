@@ -1,4 +1,4 @@
-//! One program: each would link the crate.
+//! All integration tests in one program, so that the crate is linked only once.
 
 mod golden;
 mod planning;

@@ -1,4 +1,4 @@
-//! What holds for planners and teams on random problems, and for filters and summaries.
+//! Property tests of planners and teams on random problems.
 
 mod airspace;
 mod fields;

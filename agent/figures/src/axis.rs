@@ -1,12 +1,12 @@
-//! Linear axes with round ticks, and labels that keep their distance.
+//! Linear axes with round ticks, and the placement of labels without overlaps.
 
-/// Sizes of numbers between which axes are exact enough.
-const LEAST: f64 = 1e-200;
-const MOST: f64 = 1e200;
+/// Minimum range of an axis, and maximum absolute value. Outside of these limits, axes are not exact enough.
+const MIN_RANGE: f64 = 1e-200;
+const MAX_VALUE: f64 = 1e200;
 
-/// Whether a number has a place on an axis.
+/// Whether a number can be drawn on an axis.
 pub fn is_drawable(value: f64) -> bool {
-    value.abs() <= MOST
+    value.abs() <= MAX_VALUE
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -17,14 +17,14 @@ pub struct Axis {
 }
 
 impl Axis {
-    /// An axis over zero and all the given values that can be drawn, with about `n_ticks` ticks, the first
-    /// and last of them at its ends.
+    /// Creates an axis that covers zero and all drawable values. It has about `n_ticks` ticks, with the first and the
+    /// last tick at its ends.
     pub fn covering(values: impl Iterator<Item = f64>, n_ticks: usize) -> Self {
         let values = values.filter(|&value| is_drawable(value));
         let (least, most) = values.fold((0.0_f64, 0.0_f64), |(least, most), value| {
             (least.min(value), most.max(value))
         });
-        let most = if most - least > LEAST {
+        let most = if most - least > MIN_RANGE {
             most
         } else {
             least + 1.0
@@ -32,7 +32,7 @@ impl Axis {
         let step = round_step((most - least) / n_ticks as f64);
         let (first, last) = ((least / step).floor() as i64, (most / step).ceil() as i64);
         let ticks = (first..=last).map(|tick| tick as f64 * step).collect();
-        // Enough decimals for 2.5 of the step's power of ten.
+        // Enough decimals to show the step exactly, which is 1, 2, 2.5 or 5 times a power of ten.
         let exact = |decimals: &usize| {
             let shifted = step * 10_f64.powi(*decimals as i32);
             (shifted - shifted.round()).abs() < 1e-6 * shifted
@@ -45,7 +45,7 @@ impl Axis {
         }
     }
 
-    /// An axis from zero to exactly `n` (positive) with ticks at whole numbers, not always at `n`.
+    /// Creates an axis from zero to exactly `n` > 0, with ticks at whole numbers, but not always at `n`.
     pub fn counting_to(n: usize, n_ticks: usize) -> Self {
         let most = n as f64;
         let mut axis = Self::covering(std::iter::once(most), n_ticks.min(n));
@@ -56,7 +56,7 @@ impl Axis {
         axis
     }
 
-    /// An axis of decimal logarithms over all the given (finite) ones, with ticks at whole powers of ten.
+    /// Creates an axis over decimal logarithms (which must be finite), with ticks at whole powers of ten.
     pub fn of_powers(logarithms: impl Iterator<Item = f64>) -> Self {
         let (least, most) = logarithms.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), value| {
             (a.min(value), b.max(value))
@@ -76,7 +76,7 @@ impl Axis {
         }
     }
 
-    /// Where a value lies in the range: 0 at its start, 1 at its end.
+    /// Returns the position of a value in the range: 0 at its start, 1 at its end.
     pub fn fraction(&self, value: f64) -> f64 {
         let (first, last) = self.range;
         (value - first) / (last - first)
@@ -94,7 +94,7 @@ impl Axis {
     }
 }
 
-/// The least of 1, 2, 2.5, 5 and 10 times a power of ten that is not below `step`.
+/// Rounds `step` up to 1, 2, 2.5, 5 or 10 times a power of ten.
 fn round_step(step: f64) -> f64 {
     let power = 10_f64.powf(step.log10().floor());
     let factor = [1.0, 2.0, 2.5, 5.0]
@@ -103,12 +103,12 @@ fn round_step(step: f64) -> f64 {
     factor.unwrap_or(10.0) * power
 }
 
-/// Moves positions as little as possible (in squares) so that neighbours are `gap` apart and, where
-/// there is room, all lie in `least..=most`; the order of ties is that given.
+/// Moves positions so that neighbours are at least `gap` apart, and all positions are in `least..=most` if they fit.
+/// The sum of squared movements is minimal. Equal positions keep their order.
 pub fn spread(positions: &[f64], gap: f64, (least, most): (f64, f64)) -> Vec<f64> {
     let mut order: Vec<usize> = (0..positions.len()).collect();
     order.sort_by(|&a, &b| positions[a].total_cmp(&positions[b]));
-    // Without the gaps it is a monotone regression: pool neighbours that are out of order.
+    // After subtracting the gaps, this is an isotonic regression: merge neighbours that are out of order.
     let mut pools: Vec<(f64, usize)> = Vec::new();
     for (rank, &index) in order.iter().enumerate() {
         let mut pool = (positions[index] - gap * rank as f64, 1);

@@ -1,12 +1,12 @@
-//! A grid of probabilities as a PNG file.
+//! Heat maps: grids of probabilities as PNG files.
 
 use crate::palette::sequential;
 use ndarray::ArrayView2;
 use png::{BitDepth, ColorType, Encoder, EncodingError};
 
-/// Shorter side that a small grid's picture has at least, pixels, where cells of up to sixteen give it.
-const LEAST_SIDE: usize = 256;
-const MOST_PIXELS_PER_CELL: usize = 16;
+/// Minimum length of a picture's shorter side in pixels, unless cells would exceed [`MAX_PIXELS_PER_CELL`].
+const MIN_SIDE: usize = 256;
+const MAX_PIXELS_PER_CELL: usize = 16;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Heat {
@@ -15,15 +15,15 @@ pub struct Heat {
     pub png: Vec<u8>,
 }
 
-/// Draws probabilities of shape `[H, W]`, light for 0 and NaN, dark for 1. The picture's height and width are in pixels.
+/// Draws probabilities `[H, W]`, light for 0 and NaN, dark for 1. The height and width of the result are in pixels.
 ///
 /// # Errors
 ///
-/// The grid has no cells, or more than a PNG file can have.
+/// If the grid has no cells, or more cells than a PNG file permits.
 pub fn heat(probabilities: ArrayView2<'_, f32>) -> Result<Heat, EncodingError> {
     let (height, width) = probabilities.dim();
-    let side = LEAST_SIDE.div_ceil(height.min(width).max(1));
-    let side = side.clamp(1, MOST_PIXELS_PER_CELL);
+    let side = MIN_SIDE.div_ceil(height.min(width).max(1));
+    let side = side.clamp(1, MAX_PIXELS_PER_CELL);
     let (height, width) = (height * side, width * side);
     let cells = (0..height * width)
         .map(|at| probabilities[[at / width / side, at % width / side]])

@@ -1,4 +1,4 @@
-//! The ladder: one value per row as a bar, with an interval around it and every single world.
+//! The ladder chart: one bar per row, with an interval and a dot for every world.
 
 use crate::axis::{Axis, is_drawable};
 use crate::palette::{Color, GRID, INK, PAPER, blend};
@@ -10,38 +10,39 @@ const ROW: f64 = 44.0;
 const BAR: f64 = 26.0;
 /// Upper edge of the bars, below title, note and legend.
 const TOP: f64 = 132.0;
-/// Room for tick labels and the axis label.
+/// Height of the tick labels and the axis label.
 const BOTTOM: f64 = 72.0;
-/// Widest label of a row, and of a value; longer ones are shortened.
-const LABEL_ROOM: f64 = 360.0;
-const VALUE_ROOM: f64 = 200.0;
+/// Maximum widths of a row's label and of its value. Longer texts are shortened.
+const MAX_LABEL: f64 = 360.0;
+const MAX_VALUE: f64 = 200.0;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ladder {
     pub title: String,
-    /// A line of small print under it.
+    /// A line of small print below the title.
     pub note: String,
     pub axis: String,
-    /// What colours mean; all of them fit on a line.
+    /// Names of the colours. They must fit on one line.
     pub legend: Vec<(&'static str, Color)>,
     pub bars: Vec<Bar>,
 }
 
-/// A row. What is not finite is not drawn: a value of NaN has no bar, only its worlds.
+/// A row of the chart. Values that are not finite are not drawn: if `value` is NaN, only the worlds are drawn.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bar {
     pub name: String,
-    /// What is said behind it, smaller; may be empty.
+    /// Small text after the name. It may be empty.
     pub remark: String,
     pub label: String,
     pub color: Color,
     pub value: f64,
-    /// The ends of its whisker.
+    /// The ends of the error bar.
     pub ends: Option<[f64; 2]>,
+    /// Seed and value of each world.
     pub worlds: Vec<(u64, f64)>,
 }
 
-/// Where rows and values lie on the page.
+/// The area of the bars on the page.
 struct Plot {
     left: f64,
     right: f64,
@@ -94,10 +95,10 @@ impl Plot {
         let widest = |width: &dyn Fn(&Bar) -> f64| bars.iter().map(width).fold(0.0, f64::max);
         let label =
             |bar: &Bar| TextStyle::LABEL.width(&bar.name) + TextStyle::NOTE.width(&bar.remark);
-        let values = widest(&|bar| TextStyle::LABEL.width(&bar.label)).min(VALUE_ROOM);
+        let values = widest(&|bar| TextStyle::LABEL.width(&bar.label)).min(MAX_VALUE);
         let seeds = bars.iter().flat_map(|bar| &bar.worlds).map(|world| world.0);
         Self {
-            left: MARGIN + widest(&label).min(LABEL_ROOM) + 14.0,
+            left: MARGIN + widest(&label).min(MAX_LABEL) + 14.0,
             right: WIDTH - MARGIN - values - 24.0,
             bottom: TOP + ROW * bars.len() as f64,
             axis: Axis::covering(bars.iter().flat_map(Bar::extent), 8),
@@ -119,7 +120,7 @@ impl Bar {
 
     fn draw(&self, page: &mut Svg, plot: &Plot, middle: f64) {
         self.draw_label(page, plot, middle);
-        let label = TextStyle::LABEL.fit(&self.label, VALUE_ROOM);
+        let label = TextStyle::LABEL.fit(&self.label, MAX_VALUE);
         page.text(
             (WIDTH - MARGIN, middle),
             Align::Right,
@@ -144,14 +145,14 @@ impl Bar {
 
     fn draw_worlds(&self, page: &mut Svg, plot: &Plot, upper: f64) {
         let dot = blend(self.color, INK, 0.55);
-        // The only world of a bar is its end.
+        // With a single world, its dot would coincide with the end of the bar.
         let worlds = if self.worlds.len() > 1 || !is_drawable(self.value) {
             &self.worlds[..]
         } else {
             &[]
         };
         for &(seed, value) in worlds.iter().filter(|world| is_drawable(world.1)) {
-            // One height per world, so that a world can be followed from bar to bar.
+            // A world has the same height in all bars, so that it can be compared.
             let rank = plot.seeds.binary_search(&seed).unwrap_or(0) as f64 + 0.5;
             let at = (plot.x(value), upper + BAR * rank / plot.seeds.len() as f64);
             page.disc(at, 3.5, PAPER);
@@ -161,7 +162,7 @@ impl Bar {
 
     fn draw_label(&self, page: &mut Svg, plot: &Plot, middle: f64) {
         let right = plot.left - 14.0;
-        let remark = TextStyle::NOTE.fit(&self.remark, LABEL_ROOM / 2.0);
+        let remark = TextStyle::NOTE.fit(&self.remark, MAX_LABEL / 2.0);
         let width = TextStyle::NOTE.width(&remark);
         page.text((right, middle), Align::Right, TextStyle::NOTE, &remark);
         let name = TextStyle::LABEL.fit(&self.name, right - MARGIN - width + 1.0);

@@ -1,10 +1,10 @@
-//! What the colours and marks of a snapshot mean, and how the marks look.
+//! The legend of a snapshot, and its marks.
 
 use crate::palette::{Color, INK, MUTED, PAPER};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
 
-/// A state or an observation.
+/// The name and colour of a state or of an observation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Named {
     pub name: String,
@@ -16,7 +16,7 @@ const SWATCH: f64 = 14.0;
 
 #[derive(Debug, Clone, Copy)]
 enum Mark {
-    /// No mark: the heading of a group.
+    /// No mark, only the heading of a group.
     Heading,
     Color(Color),
     Path,
@@ -24,8 +24,8 @@ enum Mark {
     Robot,
 }
 
-/// Draws the legend from `corner` on, each group of marks on lines of its own; what states and observations share is
-/// said once. Returns the height of its lines.
+/// Draws the legend at `corner`. Each group of marks begins a new line. If states and observations are equal, they form
+/// one group. Returns the height of the legend.
 pub fn draw_legend(
     page: &mut Svg,
     states: &[Named],
@@ -53,7 +53,7 @@ pub fn draw_legend(
     middle - top
 }
 
-/// Marks with their names, by line.
+/// Returns the marks with their names, by group.
 fn groups(states: &[Named], observations: &[Named], unobserved: Color) -> Vec<Vec<(Mark, String)>> {
     let group = |heading: &str, named: &[Named]| {
         let heading = (Mark::Heading, heading.to_owned());
@@ -79,7 +79,7 @@ fn groups(states: &[Named], observations: &[Named], unobserved: Color) -> Vec<Ve
 }
 
 impl Mark {
-    /// Width of the mark and the space behind it.
+    /// Returns the width of the mark and the space after it.
     fn width(self) -> f64 {
         match self {
             Self::Heading => 0.0,
@@ -111,12 +111,12 @@ impl Mark {
     }
 }
 
-/// Draws a path of straight legs, with a white rim where cells are wide enough to show beside it.
+/// Draws a path of horizontal and vertical legs. `rim` is the width of its white rim, in points.
 pub fn draw_path(page: &mut Svg, points: &[Point], width: f64, rim: f64) {
     for (half, color) in [(width / 2.0 + rim, PAPER), (width / 2.0, INK)] {
         for ends in points.windows(2) {
             let ((x0, y0), (x1, y1)) = (ends[0], ends[1]);
-            // A leg runs along a row or a column, so it is a rectangle, without blurred edges.
+            // Legs run along rows or columns, so that rectangles avoid blurred edges.
             let from = (x0.min(x1) - half, y0.min(y1) - half);
             page.rectangle(from, (x0.max(x1) + half, y0.max(y1) + half), color);
         }

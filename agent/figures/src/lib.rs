@@ -1,11 +1,11 @@
-//! Charts: data in, SVG out, the same on every machine.
+//! Charts: data in, SVG out, identical on every machine.
 //!
-//! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step; `svg` draws, `axis` scales.
-//! [`heat`] is a picture of pixels, for TensorBoard, which shows no SVG.
+//! [`Ladder`] draws bars, [`Lines`] curves over a common axis, and [`Snapshot`] the cells of one step. `svg` has the
+//! drawing functions, and `axis` the scales. [`heat`] creates PNG files for TensorBoard, which does not show SVG.
 
 #![allow(
     missing_docs,
-    reason = "for one program: what names say is not said again"
+    reason = "serves one program: only names that need an explanation have one"
 )]
 
 mod axis;
@@ -22,6 +22,6 @@ mod text;
 pub use heat::{Heat, heat};
 pub use ladder::{Bar, Ladder};
 pub use legend::Named;
-pub use lines::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
+pub use lines::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
 pub use palette::Color;
 pub use snapshot::Snapshot;

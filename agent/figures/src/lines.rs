@@ -1,73 +1,73 @@
-//! Curves over one axis, panel under panel, with bands around them and names at their ends.
+//! Panels of curves over a common axis, with error bands, and names at the ends of the curves.
 
 use crate::axis::{Axis, is_drawable, spread};
 use crate::palette::{Color, GRID, INK, LINES, MUTED, SHADE, blend};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
 
-/// Most curves of a panel: there are no more colours.
-pub const MOST_CURVES: usize = LINES.len();
+/// Maximum number of curves per panel, which is the number of colours.
+pub const MAX_CURVES: usize = LINES.len();
 
-/// Height of a panel with its title, of several on a page and of one alone.
+/// Height of a panel with its title, if there are several panels and if there is only one.
 const PANEL: f64 = 190.0;
 const ONLY_PANEL: f64 = 556.0;
-/// Height of the page's title, and of the axis under the last panel.
+/// Height of the page's title, and of the axis below the last panel.
 const HEAD: f64 = 84.0;
 const FOOT: f64 = 64.0;
-/// Empty room under a plot.
+/// Height of the gap below a plot.
 const GAP: f64 = 22.0;
-/// Room for the name of a panel, above its plot.
+/// Height of a panel's title above its plot.
 const TITLE: f64 = 30.0;
-/// Distance between names, and between the end of a curve and its name.
+/// Minimum distance between names, and length of the line from a curve's end to its name.
 const LABEL_GAP: f64 = 20.0;
 const LEADER: f64 = 28.0;
-/// Widest name; longer ones are shortened.
-const LABEL_ROOM: f64 = 230.0;
-/// How much a band hides of what is under it.
+/// Maximum width of a name. Longer names are shortened.
+const MAX_LABEL: f64 = 230.0;
+/// Opacity of an error band.
 const BAND: f64 = 0.18;
-/// Part of the height that a shaded background may fill.
+/// Maximum share of the plot's height for the shaded background.
 const SHADE_HEIGHT: f64 = 0.4;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lines {
     pub title: String,
-    /// A line of small print under it.
+    /// A line of small print below the title.
     pub note: String,
-    /// What the common axis counts, from zero on.
+    /// Label of the common axis, which starts at zero.
     pub axis: String,
-    /// From top to bottom; those without a point are left out.
+    /// Panels from top to bottom. Panels without points are omitted.
     pub panels: Vec<Panel>,
 }
 
-/// Curves of one unit.
+/// Curves with a common unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Panel {
-    /// What is drawn, with its unit.
+    /// The quantity, with its unit.
     pub title: String,
     pub scale: Scale,
-    /// At most [`MOST_CURVES`]; further ones are left out.
+    /// At most [`MAX_CURVES`] curves. Further curves are omitted.
     pub curves: Vec<Curve>,
     pub shade: Option<Shade>,
 }
 
-/// How a panel's values are placed.
+/// The scale of a panel's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scale {
     Linear,
-    /// By their decimal logarithm; values that have none are left out.
+    /// Decimal logarithms. Values without a logarithm are omitted.
     Logarithmic,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
     pub name: String,
-    /// Its points, from the least x to the greatest; those that are not finite are left out.
+    /// Points in the order of x. Points that are not finite are omitted.
     pub points: Vec<(f64, f64)>,
-    /// Half the height of a band around it, a number a point; empty for none.
+    /// Half the height of the error band at each point. Empty if there is no band.
     pub errors: Vec<f64>,
 }
 
-/// An area over the axis, on a scale of its own.
+/// A shaded area above the axis, with a separate scale.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shade {
     pub name: String,
@@ -85,7 +85,7 @@ impl Curve {
 }
 
 impl Lines {
-    /// The page as SVG; `None` without any point.
+    /// Returns the page as SVG. `None` if there are no points.
     pub fn svg(&self) -> Option<String> {
         let panels: Vec<Drawn<'_>> = self.panels.iter().filter_map(Drawn::of).collect();
         let last = panels
@@ -121,7 +121,7 @@ impl Lines {
     }
 }
 
-/// What all panels of a page share.
+/// The common axis of all panels, and their size.
 struct Frame {
     left: f64,
     right: f64,
@@ -151,7 +151,7 @@ impl Frame {
     }
 }
 
-/// A curve whose every number can be drawn, logarithms taken.
+/// The drawable part of a curve, on the panel's scale.
 struct DrawnCurve {
     name: String,
     color: Color,
@@ -161,7 +161,7 @@ struct DrawnCurve {
 }
 
 impl DrawnCurve {
-    /// What can be drawn of a curve; a band ends where its scale does.
+    /// Extracts the drawable points and band edges of a curve. `None` if there are no drawable points.
     fn of(curve: &Curve, scale: Scale, color: Color) -> Option<Self> {
         let errors = curve
             .errors
@@ -180,7 +180,7 @@ impl DrawnCurve {
             let edges = edges.filter(|edges| edges.iter().all(|&edge| is_drawable(edge)));
             band.extend(edges.map(|edges| (x, edges)));
         }
-        let name = TextStyle::LABEL.fit(&curve.name, LABEL_ROOM);
+        let name = TextStyle::LABEL.fit(&curve.name, MAX_LABEL);
         (!points.is_empty()).then_some(Self {
             name,
             color,
@@ -199,7 +199,7 @@ impl Scale {
     }
 }
 
-/// A panel of curves that can be drawn.
+/// A panel with its drawable curves.
 struct Drawn<'a> {
     panel: &'a Panel,
     curves: Vec<DrawnCurve>,
@@ -300,7 +300,7 @@ impl<'a> Drawn<'a> {
         }
     }
 
-    /// Names at the curves' ends, moved apart where ends are close, with a leader to each.
+    /// Draws names at the curves' ends, with connecting lines. Names of close ends are moved apart.
     fn draw_names(&self, page: &mut Svg, frame: &Frame, ends: &[Point], (upper, lower): Point) {
         let heights: Vec<f64> = ends.iter().map(|end| end.1).collect();
         let gap = LABEL_GAP.min((lower - upper) / ends.len() as f64);

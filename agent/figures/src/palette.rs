@@ -1,4 +1,4 @@
-//! Colours of the figures: few, apart under every common colour blindness, on white.
+//! Colours of the figures on white. They are distinguishable with all common kinds of colour blindness.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -20,11 +20,11 @@ pub const GRID: Color = Color(0xe4, 0xe4, 0xe4);
 
 pub const PAPER: Color = Color(0xff, 0xff, 0xff);
 
-/// Light area behind a line plot.
+/// Shaded area behind curves.
 pub const SHADE: Color = Color(0xf7, 0xe6, 0xd8);
 
-/// Lines in the order of use: Okabe and Ito (2008), with brown for their yellow, which is too
-/// light for a line on white.
+/// Colours of lines in the order of use: Okabe and Ito (2008), but with brown instead of yellow, which is too light for
+/// a line on white.
 pub const LINES: [Color; 8] = [
     Color(0x00, 0x72, 0xb2),
     Color(0xd5, 0x5e, 0x00),
@@ -36,8 +36,8 @@ pub const LINES: [Color; 8] = [
     Color(0x8c, 0x51, 0x0a),
 ];
 
-/// ColorBrewer's YlGnBu (Apache-2.0), light to dark: its lightness falls evenly, so that it also
-/// reads in grey.
+/// ColorBrewer's YlGnBu (Apache-2.0), from light to dark. Its lightness falls evenly, so that it is readable in
+/// greyscale.
 const SEQUENTIAL: [Color; 9] = [
     Color(0xff, 0xff, 0xd9),
     Color(0xed, 0xf8, 0xb1),
@@ -50,13 +50,13 @@ const SEQUENTIAL: [Color; 9] = [
     Color(0x08, 0x1d, 0x58),
 ];
 
-/// Greys that may stand for "not observed", the preferred one first.
+/// Candidate greys for "not observed", in order of preference.
 const NEUTRALS: [u8; 4] = [0xe2, 0xb8, 0x80, 0x48];
 
-/// Squared distance at which two colours are told apart at a glance: 60 of 255 in each channel.
+/// Squared distance at which two colours are clearly distinguishable: 60 of 255 in each channel.
 const APART: i32 = 3 * 60 * 60;
 
-/// Colour of a probability, light for 0 and for none; values outside `0..=1` are clamped.
+/// Returns the colour of a probability, light for 0 and NaN. Values outside of `0..=1` are clamped.
 pub fn sequential(probability: f32) -> Color {
     let last = SEQUENTIAL.len() - 1;
     let known = if probability.is_nan() {
@@ -69,7 +69,7 @@ pub fn sequential(probability: f32) -> Color {
     blend(SEQUENTIAL[below], SEQUENTIAL[below + 1], at - below as f64)
 }
 
-/// A grey unlike all the given colours: the first that is well apart from them, else the furthest.
+/// Returns the first grey that is clearly distinguishable from all given colours, otherwise the most distant grey.
 pub fn unlike(colors: &[Color]) -> Color {
     let grey = |level: u8| Color(level, level, level);
     let nearest = |level: u8| {
@@ -81,7 +81,7 @@ pub fn unlike(colors: &[Color]) -> Color {
     grey(level.expect("invariant: there are neutrals"))
 }
 
-/// `from` at `fraction` 0, `to` at 1.
+/// Mixes two colours: `from` at `fraction` 0, `to` at 1.
 pub fn blend(from: Color, to: Color, fraction: f64) -> Color {
     let channel = |from: u8, to: u8| {
         let (from, to) = (f64::from(from), f64::from(to));

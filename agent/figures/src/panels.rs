@@ -1,27 +1,27 @@
-//! How panels of one grid each share a page, and how a grid's cells become crisp pixels.
+//! The layout of equally large panels on a page, each with the cells of one grid, aligned to pixels.
 
 use crate::palette::Color;
 use crate::svg::{Run, Svg};
 use std::collections::BTreeMap;
 
-/// Pixels per point of a PNG.
+/// Pixels per point.
 const SCALE: f64 = 2.0;
 
 /// Distance between panels in points.
 const GAP: f64 = 26.0;
-/// Room for a panel's title above it.
-pub const TITLE_ROOM: f64 = 30.0;
-/// Narrowest room for a panel in points, for the sake of its title.
-const LEAST_ROOM: f64 = 190.0;
-/// Height in points that all panels together should keep to, where rows stay legible.
+/// Height of the title above a panel.
+pub const TITLE_HEIGHT: f64 = 30.0;
+/// Minimum width of a panel's column in points, so that its title fits.
+const MIN_WIDTH: f64 = 190.0;
+/// Target height of all panels together in points, as long as rows are not below [`MIN_HEIGHT`].
 const PAGE_HEIGHT: f64 = 860.0;
-/// Least height of a panel that the page's height may press it to.
-const LEAST_HEIGHT: f64 = 130.0;
+/// Minimum height of a panel in points, which takes precedence over [`PAGE_HEIGHT`].
+const MIN_HEIGHT: f64 = 130.0;
 
-/// Longest side of a panel in points: more would not show more.
-const MOST_SIDE: f64 = 540.0;
+/// Maximum length of a panel's longer side in points. Larger panels would not show more detail.
+const MAX_SIDE: f64 = 540.0;
 
-/// How many pixels a cell takes, or how many cells a pixel stands for.
+/// The number of pixels per cell side, or the number of cells per pixel side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Zoom {
     pixels: usize,
@@ -40,10 +40,10 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// The layout with the largest cells within `width` points; of equals, the one with three
-    /// columns, then with fewer rows.
+    /// Returns the layout with the largest cells within `width` points. With equal cells, it prefers three columns, and
+    /// then fewer rows.
     pub fn new(shape: (usize, usize), n_panels: usize, (left, width): (f64, f64)) -> Self {
-        let most = ((width + GAP) / (LEAST_ROOM + GAP)) as usize;
+        let most = ((width + GAP) / (MIN_WIDTH + GAP)) as usize;
         let candidates = (1..=most.clamp(1, n_panels)).map(|columns| {
             let zoom = Zoom::fitting(shape, n_panels, columns, width);
             Self {
@@ -68,50 +68,50 @@ impl Layout {
         }
     }
 
-    /// Height of all rows in points, titles included.
+    /// Returns the height of all rows in points, including titles.
     pub fn height(&self) -> f64 {
         let rows = self.n_panels.div_ceil(self.columns) as f64;
-        rows * (TITLE_ROOM + self.panel_size().1 + GAP) - GAP
+        rows * (TITLE_HEIGHT + self.panel_size().1 + GAP) - GAP
     }
 
-    /// Width in points that a panel and its title may use.
+    /// Returns the width of a column in points, for a panel and its title.
     pub fn room(&self) -> f64 {
-        self.panel_size().0.max(LEAST_ROOM)
+        self.panel_size().0.max(MIN_WIDTH)
     }
 
-    /// Left edge of the first panel in points.
+    /// Returns the left edge of the first panel in points.
     pub fn left(&self) -> f64 {
         self.left
     }
 
-    /// Upper left corner of panel `index`, below its title, for rows that begin at `top`.
+    /// Returns the upper left corner of panel `index`, below its title. Rows begin at `top`.
     pub fn corner(&self, index: usize, top: f64) -> (f64, f64) {
         let (row, column) = (index / self.columns, index % self.columns);
         let x = self.left + column as f64 * (self.room() + GAP);
-        let y = top + row as f64 * (TITLE_ROOM + self.panel_size().1 + GAP) + TITLE_ROOM;
-        // On whole pixels, or cells would differ by one.
+        let y = top + row as f64 * (TITLE_HEIGHT + self.panel_size().1 + GAP) + TITLE_HEIGHT;
+        // Aligned to whole pixels, so that all cells have the same size.
         ((x * SCALE).round() / SCALE, (y * SCALE).round() / SCALE)
     }
 
-    /// Width and height of a panel in points.
+    /// Returns the width and height of a panel in points.
     pub fn panel_size(&self) -> (f64, f64) {
         let points = |cells: usize| (self.zoom.n_pixels(cells)) as f64 / SCALE;
         (points(self.shape.1), points(self.shape.0))
     }
 
-    /// Side of a cell in points.
+    /// Returns the side of a cell in points.
     pub fn cell_size(&self) -> f64 {
         self.zoom.pixels as f64 / self.zoom.stride as f64 / SCALE
     }
 
-    /// Middle of a cell in a panel at `corner`.
+    /// Returns the centre of a cell (row, column) in a panel at `corner`.
     pub fn center(&self, corner: (f64, f64), (row, col): (usize, usize)) -> (f64, f64) {
         let middle = |at: usize| (at as f64 + 0.5) * self.cell_size();
         (corner.0 + middle(col), corner.1 + middle(row))
     }
 
-    /// Fills each cell (row, column) of a panel at `corner` with its colour; nearest neighbour, so that no
-    /// colour appears that is not in the legend.
+    /// Fills each cell (row, column) of a panel at `corner` with its colour. Large grids are reduced by nearest
+    /// neighbour, so that all colours are in the legend.
     pub fn fill(&self, page: &mut Svg, corner: (f64, f64), color: impl Fn(usize, usize) -> Color) {
         let Zoom { pixels, stride } = self.zoom;
         let side = pixels as f64 / SCALE;
@@ -143,11 +143,11 @@ impl Zoom {
         let rows = n_panels.div_ceil(columns) as f64;
         let columns = columns as f64;
         let room = (width - GAP * (columns - 1.0)) / columns * SCALE;
-        let height = (PAGE_HEIGHT / rows - TITLE_ROOM - GAP).max(LEAST_HEIGHT) * SCALE;
+        let height = (PAGE_HEIGHT / rows - TITLE_HEIGHT - GAP).max(MIN_HEIGHT) * SCALE;
         let longer = shape.1.max(shape.0) as f64;
         let cell = (room / shape.1 as f64)
             .min(height / shape.0 as f64)
-            .min(MOST_SIDE * SCALE / longer);
+            .min(MAX_SIDE * SCALE / longer);
         if cell >= 1.0 {
             Self {
                 pixels: cell as usize,

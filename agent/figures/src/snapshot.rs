@@ -1,46 +1,46 @@
-//! One step as the paper draws it: the hidden truth, what could be seen, what was seen along the
-//! path, and the belief in each state, if there is one.
+//! A snapshot of one step, as in the paper: the hidden states, the observations of all cells, the observations along
+//! the path, and the belief in each state, if there is a belief.
 
 use crate::legend::{Named, draw_legend, draw_path, draw_robot, draw_start};
 use crate::palette::{Color, MUTED, sequential, unlike};
-use crate::panels::{Layout, TITLE_ROOM};
+use crate::panels::{Layout, TITLE_HEIGHT};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
 use ndarray::ArrayView2;
 
 /// Upper edge of the legend, below the title.
 const LEGEND_TOP: f64 = 76.0;
-/// Room for the colour bar below the panels.
+/// Height of the colour bar below the panels.
 const FOOT: f64 = 84.0;
 const COLOR_BAR: f64 = 260.0;
-/// Side in points of a cell that shows its colour beside a path with a white rim.
+/// Minimum side of cells in points for a path with a white rim. Smaller cells would be hidden by it.
 const WIDE_CELL: f64 = 12.0;
 
-/// One step of one world, with hindsight.
+/// One step of one world, including its hidden states.
 #[derive(Debug, Clone)]
 pub struct Snapshot<'a> {
     pub title: String,
-    /// What else is said of it.
+    /// Small text after the title.
     pub note: String,
     pub states: Vec<Named>,
     pub observations: Vec<Named>,
     /// The hidden state of each cell, shape `[H, W]`.
     pub truth: ArrayView2<'a, u8>,
-    /// What the sensor would have shown of each cell, shape `[H, W]`.
+    /// The observation that the sensor would have made in each cell, shape `[H, W]`.
     pub observation: ArrayView2<'a, u8>,
-    /// What the robot saw, 255 or any other value without a name where that is nothing, shape `[H, W]`.
+    /// The robot's frame, shape `[H, W]`. Cells with 255, or another value without a name, were not observed.
     pub frame: ArrayView2<'a, u8>,
     /// The robot's cells (row, column), the start first.
     pub path: Vec<(usize, usize)>,
-    /// What the belief calls each of its states, and its probabilities after the frame, shape `[H, W]`.
+    /// The name of each state in the belief, and its probabilities after the frame, shape `[H, W]`.
     pub beliefs: Vec<(String, ArrayView2<'a, f32>)>,
 }
 
 impl Snapshot<'_> {
-    /// The page as SVG; it grows in height with the number of beliefs.
+    /// Returns the page as SVG. Its height depends on the number of beliefs.
     ///
     /// # Panics
-    /// If its parts are of different grids.
+    /// If the grids differ in size.
     pub fn svg(&self) -> String {
         let n_panels = 3 + self.beliefs.len();
         let layout = Layout::new(self.truth.dim(), n_panels, (MARGIN, WIDTH - 2.0 * MARGIN));
@@ -63,7 +63,7 @@ impl Snapshot<'_> {
         page.finish(WIDTH, (top + layout.height() + FOOT).ceil())
     }
 
-    /// A grey for what was not observed.
+    /// Returns the grey for cells that were not observed.
     fn unobserved(&self) -> Color {
         let named = self.states.iter().chain(&self.observations);
         unlike(&named.map(|it| it.color).collect::<Vec<_>>())
@@ -101,7 +101,7 @@ impl Snapshot<'_> {
         let corner = layout.corner(2, top);
         let centers = self.path.iter().map(|&cell| layout.center(corner, cell));
         let points: Vec<Point> = centers.collect();
-        // Thin against the cells, whose colours it must not hide, and never too thin to see.
+        // Thin enough not to hide the colours of the cells, and thick enough to be visible.
         let width = (layout.cell_size() * 0.2).clamp(1.0, 3.0);
         let rim = if layout.cell_size() < WIDE_CELL {
             0.0
@@ -126,7 +126,7 @@ fn draw_panel(
 ) {
     let corner = layout.corner(index, top);
     let title = TextStyle::STRONG.fit(title, layout.room());
-    let at = (corner.0, corner.1 - TITLE_ROOM / 2.0);
+    let at = (corner.0, corner.1 - TITLE_HEIGHT / 2.0);
     page.text(at, Align::Left, TextStyle::STRONG, &title);
     layout.fill(page, corner, color);
     let (width, height) = layout.panel_size();

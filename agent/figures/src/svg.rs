@@ -1,4 +1,4 @@
-//! A white page to draw on, in points from its upper left corner; it becomes the text of an SVG file.
+//! A white page for drawing, which becomes the text of an SVG file. Coordinates are points from the upper left corner.
 
 use crate::palette::{Color, PAPER};
 use crate::text::{CAP_HEIGHT, FAMILY, TextStyle};
@@ -7,16 +7,16 @@ use std::fmt::Write;
 /// Width of every page in points.
 pub const WIDTH: f64 = 1200.0;
 
-/// Empty rim of every page in points.
+/// Empty margin of every page in points.
 pub const MARGIN: f64 = 32.0;
 
-/// A position in points: right of the left edge, below the upper edge.
+/// A position in points: distance from the left edge, and from the upper edge.
 pub type Point = (f64, f64);
 
-/// Neighbouring squares of one colour: the left upper corner of the first, and how many there are.
+/// A row of adjacent squares: the upper left corner of the first square, and the number of squares.
 pub type Run = (Point, usize);
 
-/// Where a text's horizontal position lies.
+/// The part of a text at its horizontal position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
     Left,
@@ -24,7 +24,7 @@ pub enum Align {
     Right,
 }
 
-/// The page. What is drawn later lies over what was drawn before.
+/// A page. Later elements cover earlier ones.
 #[derive(Debug, Default)]
 pub struct Svg {
     body: String,
@@ -35,7 +35,7 @@ impl Svg {
         Self::default()
     }
 
-    /// A page with a title and a line of small print.
+    /// Creates a page with a title and a line of small print.
     pub fn titled(title: &str, note: &str) -> Self {
         let mut page = Self::new();
         for (y, style, text) in [
@@ -48,10 +48,10 @@ impl Svg {
         page
     }
 
-    /// The text of a page of this size in points.
+    /// Returns the SVG text of the page, with the given size in points.
     pub fn finish(self, width: f64, height: f64) -> String {
-        // Round joints, as mitred ones grow spikes at sharp angles. A space at the beginning of a text counts
-        // in its width.
+        // Round joins, because mitred joins have spikes at sharp angles. Spaces are preserved, because the computed
+        // text widths include them.
         format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
              viewBox=\"0 0 {width} {height}\" font-family=\"{FAMILY}\" \
@@ -61,7 +61,7 @@ impl Svg {
         )
     }
 
-    /// Fills a rectangle, its edges on half points: whole pixels of a screen with two a point.
+    /// Fills a rectangle. Its edges are aligned to half points, which are whole pixels on a screen with two per point.
     pub fn rectangle(&mut self, from: Point, to: Point, color: Color) {
         let [left, top, right, bottom] = [from.0, from.1, to.0, to.1].map(on_pixel);
         if right > left && bottom > top {
@@ -73,7 +73,7 @@ impl Svg {
         }
     }
 
-    /// Outlines a rectangle, inside its bounds.
+    /// Draws the outline of a rectangle, inside its bounds.
     pub fn outline(&mut self, from: Point, to: Point, width: f64, color: Color) {
         self.rectangle(from, (to.0, from.1 + width), color);
         self.rectangle((from.0, to.1 - width), to, color);
@@ -81,7 +81,7 @@ impl Svg {
         self.rectangle((to.0 - width, from.1), to, color);
     }
 
-    /// A line along a row or a column of the page.
+    /// Draws a horizontal or vertical line.
     pub fn rule(&mut self, from: Point, to: Point, width: f64, color: Color) {
         let half = width / 2.0;
         let along = |a: f64, b: f64| if a == b { (a - half, a + half) } else { (a, b) };
@@ -98,7 +98,7 @@ impl Svg {
         }
     }
 
-    /// Fills a polygon through which what is under it is seen, unless `opacity` is 1.
+    /// Fills a polygon. It is transparent if `opacity` is below 1.
     pub fn polygon(&mut self, points: &[Point], color: Color, opacity: f64) {
         let points = list(points);
         self.add(format_args!(
@@ -125,7 +125,7 @@ impl Svg {
         ));
     }
 
-    /// Writes a text whose capitals are centred on the height of `at`.
+    /// Draws a text whose capitals are vertically centred at `at`.
     pub fn text(&mut self, at: Point, align: Align, style: TextStyle, text: &str) {
         if text.is_empty() {
             return;
@@ -136,7 +136,7 @@ impl Svg {
             Align::Center => at.0 - width / 2.0,
             Align::Right => at.0 - width,
         };
-        // As wide as the layout counts on in whatever font the viewer has.
+        // The viewer stretches the text to the width of the layout, whatever its font.
         let length = format!(
             " textLength=\"{}\" lengthAdjust=\"spacingAndGlyphs\"",
             short(width)
@@ -160,7 +160,7 @@ fn list(points: &[Point]) -> String {
     list
 }
 
-/// Two decimals are enough; a number that is none must not reach a file.
+/// Rounds to two decimals. Numbers that are not finite become 0, so that the file remains valid.
 fn short(number: f64) -> f64 {
     if number.is_finite() {
         (number * 100.0).round() / 100.0

@@ -1,15 +1,15 @@
-//! How wide texts are. Layout counts with the widths of Noto Sans; an SVG tells each text's width, so that viewers with
-//! another font stretch it to fit.
+//! Widths of texts. The layout uses the widths of Noto Sans. The SVG specifies each text's width, so that viewers with
+//! another font stretch the text to fit.
 
 use crate::palette::{Color, INK, MUTED};
 
 /// Height of a capital letter as a fraction of the text size (Noto Sans, OS/2 table: 714 / 1000).
 pub const CAP_HEIGHT: f64 = 0.714;
 
-/// The font, and what is near it for viewers that lack it.
+/// The font, and similar fonts for viewers that lack it.
 pub const FAMILY: &str = "Noto Sans, Open Sans, DejaVu Sans, Arial, sans-serif";
 
-/// What is put in place of the end of a text that is too long.
+/// Replaces the end of a text that is too long.
 const ELLIPSIS: char = '…';
 
 /// Widths of the characters from space to tilde in thousandths of the text size (Noto Sans Regular, hmtx table).
@@ -22,7 +22,7 @@ const REGULAR: [u16; 95] = [
     258, 935, 618, 605, 615, 615, 413, 479, 361, 618, 508, 786, 529, 510, 470, 380, 551, 380, 572,
 ];
 
-/// The same of Noto Sans Bold.
+/// The same widths for Noto Sans Bold.
 #[rustfmt::skip]
 const BOLD: [u16; 95] = [
     260, 286, 472, 646, 572, 901, 750, 266, 339, 339, 545, 572, 285, 322, 285, 413, 572, 572, 572,
@@ -32,10 +32,10 @@ const BOLD: [u16; 95] = [
     305, 982, 657, 619, 633, 633, 454, 497, 434, 657, 569, 856, 578, 569, 488, 394, 551, 394, 572,
 ];
 
-/// Width of other characters, thousandths: most letters with accents are narrower.
+/// Width of other characters in thousandths. Most letters with accents are narrower.
 const OTHER: u16 = 640;
 
-/// Width of characters of East Asian scripts, and of pictures.
+/// Width of East Asian characters and emoji in thousandths.
 const WIDE: u16 = 1000;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,7 +63,7 @@ impl TextStyle {
         Self { color, ..self }
     }
 
-    /// The text as an SVG element at a place.
+    /// Returns the text as an SVG element. `at` and `more` are its position and further attributes.
     pub fn element(self, at: &str, more: &str, text: &str) -> String {
         let (size, color) = (self.size, self.color);
         let weight = if self.is_bold {
@@ -75,7 +75,7 @@ impl TextStyle {
         format!("<text {at} font-size=\"{size}\"{weight}{more} fill=\"{color}\">{text}</text>")
     }
 
-    /// How wide a text is, in points.
+    /// Returns the width of a text in points.
     pub fn width(self, text: &str) -> f64 {
         let table = if self.is_bold { &BOLD } else { &REGULAR };
         let of = |letter: char| match letter {
@@ -89,21 +89,21 @@ impl TextStyle {
         f64::from(thousandths) / 1000.0 * self.size
     }
 
-    /// The text, or as much of its start as fits into `room` points with an ellipsis.
+    /// Shortens a text to `room` points. A shortened text ends with an ellipsis.
     pub fn fit(self, text: &str, room: f64) -> String {
         if self.width(text) <= room {
             return text.into();
         }
         let ends: Vec<usize> = text.char_indices().map(|(at, _)| at).collect();
         let short = |end: usize| format!("{}{ELLIPSIS}", text[..end].trim_end());
-        // Widths grow with the text.
+        // Widths increase with the length of the text, so that binary search works.
         let n = ends.partition_point(|&end| self.width(&short(end)) <= room);
         n.checked_sub(1)
             .map_or(String::new(), |last| short(ends[last]))
     }
 }
 
-/// Text as XML allows it: other characters are left out.
+/// Escapes a text for XML. Control characters become spaces, and other invalid characters are omitted.
 fn escaped(text: &str) -> String {
     let mut escaped = String::new();
     for letter in text.chars() {
@@ -131,7 +131,7 @@ mod tests {
         assert!(style.width(&short) > 85.0);
         assert_eq!(style.fit(text, 1000.0), text);
         assert_eq!(style.fit(text, 0.0), "");
-        // A digit, a space and an A in Noto Sans: 572, 260 and 639 thousandths, in bold 572, 260 and 690.
+        // Widths of a digit, a space and an A in thousandths: regular 572, 260 and 639, bold 572, 260 and 690.
         let [regular, bold] = [TextStyle::LABEL, TextStyle::STRONG].map(|style| style.width("0 A"));
         assert!((regular - 14.0 * 1.471).abs() < 1e-9 && (bold - 14.0 * 1.522).abs() < 1e-9);
     }

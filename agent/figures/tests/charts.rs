@@ -1,13 +1,13 @@
-//! Charts of data that nobody wished for: still XML, still a picture, nothing off the page.
+//! Charts of unusual data: they must be valid XML, and all texts must be on the page.
 
 use emberwatch_figures::{
-    Bar, Color, Curve, Ladder, Lines, MOST_CURVES, Named, Panel, Scale, Shade, Snapshot,
+    Bar, Color, Curve, Ladder, Lines, MAX_CURVES, Named, Panel, Scale, Shade, Snapshot,
 };
 use ndarray::{Array2, Array3};
 use roxmltree::Document;
 
 const BLUE: Color = Color(0x00, 0x72, 0xb2);
-/// Expects XML, finite numbers, texts that stay on the page, and a white rim; gives the texts.
+/// Checks for valid XML, finite numbers, and texts inside the page's margin. Returns the texts.
 fn check(svg: &str) -> Vec<String> {
     assert!(!svg.contains("NaN") && !svg.contains("inf\""), "{svg}");
     let document = Document::parse(svg).expect("XML");
@@ -156,13 +156,13 @@ fn there_are_as_many_curves_as_colours_and_one_point_is_seen() {
     for panels in [vec![all.clone()], vec![all, other]] {
         let svg = lines(panels).svg().expect("a point");
         let texts = check(&svg);
-        assert!(texts.contains(&format!("curve {}", MOST_CURVES - 1)));
-        assert!(!texts.contains(&format!("curve {MOST_CURVES}")));
-        assert!(svg.matches("<circle").count() >= MOST_CURVES);
+        assert!(texts.contains(&format!("curve {}", MAX_CURVES - 1)));
+        assert!(!texts.contains(&format!("curve {MAX_CURVES}")));
+        assert!(svg.matches("<circle").count() >= MAX_CURVES);
     }
 }
 
-/// States of a grid, frame and beliefs about them.
+/// The states of a grid, a frame, and a belief.
 struct Step {
     truth: Array2<u8>,
     frame: Array2<u8>,
@@ -215,7 +215,7 @@ fn snapshots_show_each_cell_in_its_colour() {
     assert_eq!(step.truth, ndarray::arr2(&[[0, 0, 1], [2, 0, 0]]));
     let svg = snapshot(&step).svg();
     let document = Document::parse(&svg).expect("XML");
-    // The first panel, the truth: neighbours in a row are one rectangle.
+    // In the first panel, the truth, equal neighbours in a row form one rectangle.
     for (color, n_rectangles) in [("#0072b2", 2), ("#e6b43c", 1), ("#c8321e", 1)] {
         let is_of = |fill| fill == Some(color);
         let mut all = document.descendants().filter(|it| it.has_tag_name("path"));

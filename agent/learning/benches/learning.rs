@@ -1,4 +1,4 @@
-//! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
+//! Duration of updates at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use emberwatch_belief::Belief;
@@ -28,7 +28,7 @@ fn parameters(sees_own_state: bool) -> Parameters {
     Parameters::first(dimensions, 0)
 }
 
-/// What random walks, or straight flights, see of a made-up world.
+/// A replay buffer with frames of random walks, or of straight flights, in a made-up world.
 fn replay(is_straight: bool) -> BlockReplay {
     let mut replay = BlockReplay::new(64, 64 * 64);
     replay.begin(0);

@@ -49,11 +49,11 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
 
 /// Like [`named`], for the kinds that options can be learned on.
 ///
-/// Frames update such a belief. It either knows the model or was learned, not both. No network decides on its hidden
-/// vector.
+/// Frames update such a belief. It either knows the model or was learned, not both. Its learner does not choose
+/// objectives.
 ///
 /// # Errors
-/// If there is no such kind. The error lists the labels of all that there are.
+/// If there is no such kind. The error lists the labels of all valid kinds.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     let serves = |kind: &&BeliefKind| {
         let has_one_source = !kind.knows_model || kind.learned_by.is_none();

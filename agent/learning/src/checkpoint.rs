@@ -1,9 +1,9 @@
-//! What a learner keeps between runs, in one safetensors file: weights and the optimiser's moments as tensors by
-//! name, everything else as one value that bincode encodes, the tensor of bytes `state`.
+//! Checkpoints: everything that a learner keeps between runs, in one safetensors file. Weights and the optimiser's
+//! moments are named tensors. Everything else is encoded by bincode in the byte tensor `state`.
 //!
-//! Written next to the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
-//! which learner and which format it is of, and a digest tells damage that keeps its form. Equal contents are equal bytes,
-//! so trainings can be compared by a hash of their checkpoints.
+//! A checkpoint is written to a temporary file and renamed, so that readers find a complete file. The file records its
+//! learner and its format, and a digest reveals damaged values. Equal contents result in equal bytes, so that trainings
+//! can be compared by a hash of their checkpoints.
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
@@ -23,27 +23,26 @@ use std::io::Read;
 use std::path::Path;
 use thiserror::Error;
 
-/// Entries of the metadata.
+/// Keys of the metadata.
 const KIND: &str = "emberwatch.kind";
 const FORMAT: &str = "emberwatch.format";
 const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 
-/// The tensor of bytes.
+/// Name of the byte tensor.
 const STATE: &str = "state";
 
-/// How states are encoded: integers of fixed size.
+/// Encoding of the state: integers have a fixed size.
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// Largest file that is written or read, bytes: 200 times what a full replay of 64 x 64 cells and 3
-/// states needs.
+/// Maximum size of a checkpoint in bytes, 200 times the size with a full replay buffer for 64 x 64 cells and 3 states.
 const MAX_BYTES: u64 = 1 << 32;
 
-/// Largest count: far from where one more would not fit.
+/// Maximum count, so low that increments cannot overflow.
 const MAX_COUNT: u64 = 1 << 53;
 
-/// The form is right and the numbers are not those that were written.
+/// A well-formed file whose values differ from the written ones.
 #[derive(Debug, Error)]
 #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
 pub struct WrongDigest {
@@ -54,7 +53,7 @@ pub struct WrongDigest {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
     pub shape: Vec<usize>,
-    /// Its numbers, row-major.
+    /// The values, row-major.
     pub numbers: Vec<f32>,
 }
 
@@ -66,7 +65,7 @@ pub struct Contents {
 }
 
 impl Contents {
-    /// Tensors and state; the settings are still to be added.
+    /// Creates contents from tensors and a state. The settings are empty.
     pub fn new(tensors: impl IntoIterator<Item = NamedTensor>, state: &impl Serialize) -> Self {
         let tensors = tensors.into_iter();
         let tensor = |(name, shape, numbers)| (name, Tensor { shape, numbers });
@@ -84,34 +83,37 @@ impl Contents {
         self.state = state.expect("invariant: states hold values and sequences of known length");
     }
 
-    /// The state, as a learner's type.
+    /// Decodes the state as a learner's type.
     pub fn state<S: DeserializeOwned>(&self) -> Result<S> {
         use bincode::serde::decode_from_slice as decode;
-        // The limit is part of a type: the smallest one, so that a small file cannot ask for much memory.
+        // The limit is a const parameter. Small files get a low limit, so that they cannot request much memory.
         let decoded = match self.state.len() {
             0..0x1_0000 => decode(&self.state, FORM.with_limit::<0x10_0000>()),
             0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
             _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
         };
         let (state, length) =
-            decoded.map_err(|error| wrong(STATE, "that of its learner", error))?;
+            decoded.map_err(|error| wrong(STATE, "the state of its learner", error))?;
         let got = self.state.len();
         check(length == got, STATE, format!("{length} bytes"), got)?;
         Ok(state)
     }
 
-    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    /// Returns the values of a tensor.
+    ///
+    /// # Errors
+    /// If the tensor is missing, has another shape, or has values that are not finite.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         let tensor = self.tensors.get(name);
         let tensor =
-            tensor.with_context(|| format!("{name}: expected shape {expected:?}, got none"))?;
+            tensor.with_context(|| format!("{name}: expected a tensor {expected:?}, got none"))?;
         let (shape, got) = (format!("shape {expected:?}"), format!("{:?}", tensor.shape));
         check(tensor.shape == expected, name, shape, got)?;
         check_numbers(name, &tensor.numbers, expected.iter().product())?;
         Ok(tensor.numbers.clone())
     }
 
-    /// The tensors whose names begin so.
+    /// Returns the tensors whose names begin with a prefix.
     pub fn part(&self, prefix: &str) -> Part<'_> {
         Part {
             contents: self,
@@ -119,7 +121,7 @@ impl Contents {
         }
     }
 
-    /// Refuses means of squares, whose roots are taken, that are negative.
+    /// Checks that mean squares, whose roots are computed later, are not negative.
     pub fn check_squares(&self) -> Result<()> {
         let ends = [".second_moment", "running_var"];
         let is_square = |name: &str| {
@@ -128,18 +130,18 @@ impl Contents {
         let mut squares = self.tensors.iter().filter(|(name, _)| is_square(name));
         squares.try_for_each(|(name, tensor)| {
             let least = tensor.numbers.iter().copied().fold(0.0, f32::min);
-            check(least >= 0.0, name, "numbers from 0 on", least)
+            check(least >= 0.0, name, "no negative numbers", least)
         })
     }
 
     pub fn settings(&self) -> Result<AgentConfig> {
         let is_there = !self.settings.is_empty();
-        check(is_there, SETTINGS, "those of an agent", "none")?;
+        check(is_there, SETTINGS, "the settings of an agent", "none")?;
         let config = AgentConfig::from_toml(&self.settings);
-        config.map_err(|error| wrong(SETTINGS, "those of an agent", error))
+        config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 
-    /// Against damage, not malice.
+    /// Returns a checksum of all contents. It reveals damage, not manipulation.
     pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
@@ -152,7 +154,7 @@ impl Contents {
     }
 }
 
-/// Tensors of a checkpoint whose names begin alike.
+/// The tensors of a checkpoint whose names have a common prefix.
 #[derive(Debug, Clone)]
 pub struct Part<'a> {
     contents: &'a Contents,
@@ -160,7 +162,7 @@ pub struct Part<'a> {
 }
 
 impl Part<'_> {
-    /// A part of this part.
+    /// Returns the tensors whose names continue with a further prefix.
     pub fn part(&self, prefix: &str) -> Self {
         Self {
             contents: self.contents,
@@ -168,31 +170,31 @@ impl Part<'_> {
         }
     }
 
-    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    /// Returns the values of a tensor, like [`Contents::tensor`].
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         self.contents
             .tensor(&format!("{}{name}", self.prefix), expected)
     }
 
-    /// The axes of a tensor, if it is there.
+    /// Returns the shape of a tensor, if it exists.
     pub fn shape(&self, name: &str) -> Option<&[usize]> {
         let tensor = self.contents.tensors.get(&format!("{}{name}", self.prefix));
         tensor.map(|tensor| &*tensor.shape)
     }
 }
 
-/// Writes a checkpoint of a kind of learner, whole or not at all.
+/// Writes a checkpoint for a kind of learner, completely or not at all.
 ///
 /// # Errors
-/// Where the system refuses; the file is then as it was.
+/// If the system reports an error. An existing file then remains unchanged.
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let of_file = || format!("checkpoint {}", path.display());
     let bytes = encode(kind, contents).with_context(of_file)?;
-    // It holds beliefs about worlds, which are their owner's.
+    // It contains beliefs about worlds, which are private to their owner.
     replace_file(path, &bytes, Readers::Owner).with_context(of_file)
 }
 
-/// Reads a checkpoint, and tells of which kind it is.
+/// Reads a checkpoint. Returns its kind and its contents.
 pub fn read(path: &Path) -> Result<(String, Contents)> {
     let bytes = || {
         let found = std::fs::metadata(path)?;
@@ -209,7 +211,7 @@ pub fn read(path: &Path) -> Result<(String, Contents)> {
     contents.with_context(|| format!("checkpoint {}", path.display()))
 }
 
-/// A checkpoint of a kind of learner as bytes.
+/// Encodes a checkpoint for a kind of learner.
 pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     let tensors = contents.tensors.iter();
     let tensor = |(name, tensor): (&String, &Tensor)| {
@@ -237,7 +239,7 @@ pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The format of a kind's state. Transitions of a DQN have had their own discounts since format 5.
+/// Returns the format of a kind's state. In format 5, each transition of a DQN has its own discount.
 fn version(kind: &str) -> &'static str {
     match kind {
         "autoencoder" | "decisions" => "5",
@@ -245,7 +247,7 @@ fn version(kind: &str) -> &'static str {
     }
 }
 
-/// Sorts the header by name: safetensors writes its texts in the random order of a hash map. The length stays the same.
+/// Sorts the header by name: safetensors writes metadata in the random order of a hash map. The length is unchanged.
 fn sort_header(file: &mut [u8]) {
     type Header = BTreeMap<String, BTreeMap<String, serde_json::Value>>;
     const WRITTEN: &str = "invariant: safetensors wrote a header of its length";
@@ -256,14 +258,14 @@ fn sort_header(file: &mut [u8]) {
     header[..sorted.len()].copy_from_slice(&sorted);
 }
 
-/// The checkpoint that bytes are, and its kind.
+/// Decodes a checkpoint. Returns its kind and its contents.
 pub fn decode(bytes: &[u8]) -> Result<(String, Contents)> {
     let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let mut texts = metadata.metadata().clone().unwrap_or_default();
     let kind = texts
         .remove(KIND)
-        .with_context(|| format!("{KIND}: expected a learner, got none"))?;
+        .with_context(|| format!("{KIND}: expected the name of a learner, got none"))?;
     let (expected, got) = (version(&kind), texts.remove(FORMAT));
     check(
         got.as_deref() == Some(expected),
@@ -302,16 +304,16 @@ fn check_size(n_bytes: u64) -> Result<()> {
 }
 
 fn damaged(error: SafeTensorError) -> anyhow::Error {
-    anyhow!("expected a whole safetensors file, got one that is damaged or cut off: {error}")
+    anyhow!("expected a complete safetensors file, got a damaged or truncated one: {error}")
 }
 
-/// Refuses a field that does not fit.
+/// Returns an error about a field unless `fits`.
 pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) -> Result<()> {
     ensure!(fits, wrong(name, expected, got));
     Ok(())
 }
 
-/// What is wrong with a tensor or a field of the state.
+/// Creates an error about a tensor or a field of the state.
 pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
     anyhow!("{name}: expected {expected}, got {got:#}")
 }
@@ -322,7 +324,7 @@ pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
     counts.try_for_each(|&(name, count)| check(count <= MAX_COUNT, name, &expected, count))
 }
 
-/// Refuses other than so many finite numbers.
+/// Checks that there are `length` numbers, all of them finite.
 pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usize) -> Result<()> {
     let mut floats = numbers.iter().map(|&number| number.into());
     let wrong = floats.find(|number: &f64| !number.is_finite());
@@ -331,7 +333,7 @@ pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usi
     check(fits, name, format!("{length} finite numbers"), got)
 }
 
-/// Refuses a belief about other states or on another grid.
+/// Checks a belief's number of states and its grid.
 pub fn check_belief(name: &str, belief: &Belief, n_states: usize, shape: Shape) -> Result<()> {
     let expected = format!("{n_states} states on {shape}");
     let got = format!("{} states on {}", belief.n_states(), belief.shape());
@@ -394,7 +396,7 @@ mod tests {
             let first = encode("tests", &contents).expect("small");
             let (_, read) = decode(&first).expect("whole");
             assert_eq!(read, contents);
-            // Each map has its own order: of 24, ten in a row would hardly be the same.
+            // Each hash map has one of 24 random orders, so ten equal results in a row are no coincidence.
             for _ in 0..10 {
                 assert!(encode("tests", &contents).expect("small") == first);
             }
@@ -412,7 +414,7 @@ mod tests {
             read.map_err(|error| format!("{error:#}"))
         };
         let check = |bytes: &[u8], what: String| match read(bytes) {
-            // Space that pads the header may change without a change of meaning.
+            // A change in the header's padding has no effect.
             Ok(got) => assert!(bytes.len() == whole.len() && got == contents(), "{what}"),
             Err(error) => assert!(
                 error.contains("checkpoint.safetensors: ") && error.contains("expected"),
@@ -434,7 +436,7 @@ mod tests {
             (
                 "emberwatch.kind",
                 "emberwatch.kinb",
-                "kind: expected a learner, got none",
+                "kind: expected the name of a learner, got none",
             ),
             (
                 r#"format":"4""#,
@@ -457,7 +459,7 @@ mod tests {
         let got = contents();
         for (name, words) in [
             ("kernel", "kernel: expected shape [4], got [2, 2]"),
-            ("bias", "bias: expected shape [4], got none"),
+            ("bias", "bias: expected a tensor [4], got none"),
         ] {
             assert_eq!(got.tensor(name, &[4]).expect_err(name).to_string(), words);
         }
@@ -467,7 +469,7 @@ mod tests {
                 got.state::<u64>().map(drop),
                 "state: expected 8 bytes, got ",
             ),
-            (forged.map(drop), "state: expected that of its learner"),
+            (forged.map(drop), "state: expected the state of its learner"),
             (
                 read(Path::new("no/such")).map(drop),
                 "checkpoint no/such: No such file",

@@ -1,4 +1,4 @@
-//! The agent's settings: defaults or the paper's preset, then a TOML file's.
+//! The agent's settings: the defaults or the paper's preset, overridden by a TOML file.
 
 mod sections;
 
@@ -17,8 +17,8 @@ use toml::{Table, Value};
 /// Every setting with its default and meaning.
 const DEFAULTS: &str = include_str!("../agent.toml");
 
-/// Where what the authors ran differs: moves clamped after the sum, a uniform first belief, the autoencoder and
-/// the DQN with steps of constant size.
+/// The authors' settings that differ from the defaults: moves clamped after their sum, a uniform first belief, and
+/// constant step sizes for the autoencoder and the DQN.
 const PAPER: &str = r#"
 shooting_integration = "clamp_sum"
 prior = "uniform"
@@ -27,7 +27,7 @@ autoencoder.step_size.power = 0.0
 dqn.step_size.power = 0.0
 "#;
 
-/// Settings of planners and estimators; `config/agent.toml` says what each means.
+/// Settings of planners and estimators. `config/agent.toml` explains each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AgentConfig {
     pub beam_width: usize,
@@ -36,7 +36,7 @@ pub struct AgentConfig {
     pub prior: PriorKind,
     pub prior_worlds: usize,
     pub seed: u64,
-    /// The name of what `train` learns with.
+    /// The name of the learner that `train` uses.
     pub learner: String,
     pub kernels: KernelKind,
     pub full_frames: bool,
@@ -58,12 +58,12 @@ pub enum PriorKind {
 }
 
 impl PriorKind {
-    /// Each kind with its name and what it says.
+    /// Each kind with its name and a description.
     pub const ALL: [(Self, &str, &str); 3] = [
         (
             Self::Simulated,
             "simulated",
-            "How often each cell of simulated worlds is in each state after the server's burn-in",
+            "Frequencies of each cell's states in simulated worlds after the server's burn-in",
         ),
         (Self::Initial, "initial", "The model's initial distribution"),
         (Self::Uniform, "uniform", "Every state equally likely"),
@@ -77,15 +77,15 @@ impl Default for AgentConfig {
 }
 
 impl AgentConfig {
-    /// What the authors ran.
+    /// Returns the settings of the paper's authors.
     pub fn paper() -> Self {
         Self::from_toml(PAPER).expect("invariant: the preset is settings")
     }
 
-    /// The defaults, and a text's settings in their place.
+    /// Parses settings from TOML. Settings that the text omits keep their defaults.
     ///
     /// # Errors
-    /// Names the first setting that is unknown or out of its range.
+    /// If a setting is unknown or out of range. The error names the first one.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings: Table = DEFAULTS.parse()?;
         replace(&mut settings, text.parse()?, "")?;
@@ -97,7 +97,7 @@ impl AgentConfig {
     /// Checks every setting.
     ///
     /// # Errors
-    /// Names the first that is out of its range.
+    /// If a setting is out of range. The error names the first one.
     pub fn check(&self) -> Result<()> {
         let ranges = [
             ("beam_width", self.beam_width as f64, 1.0, 1e4),
@@ -113,7 +113,7 @@ impl AgentConfig {
         self.decisions.check()
     }
 
-    /// The prior for a server with this burn-in.
+    /// Returns the prior for a server with the given burn-in, in steps.
     pub fn prior(&self, burn_in: u64) -> Prior {
         match self.prior {
             PriorKind::Simulated => Prior::Simulated {
@@ -125,17 +125,17 @@ impl AgentConfig {
         }
     }
 
-    /// Seed of a planner: its world's, told apart by the agent's own.
+    /// Combines the seeds of a world and of the agent into the seed of a planner.
     pub fn planner_seed(&self, world_seed: u64) -> u64 {
         world_seed ^ self.seed.rotate_left(32)
     }
 }
 
-/// Puts settings in the place of others of the same names.
+/// Overrides settings with settings of the same names. `section` is the prefix for errors.
 fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
     for (name, value) in by {
         match (settings.get_mut(&name), value) {
-            (None, _) => bail!("{section}{name}: expected a setting's name"),
+            (None, _) => bail!("{section}{name}: expected a known setting"),
             (Some(Value::Table(settings)), Value::Table(by)) => {
                 replace(settings, by, &format!("{section}{name}."))?;
             }
@@ -157,7 +157,7 @@ mod tests {
         let written = toml::to_string(&config).expect("TOML");
         assert_eq!(AgentConfig::from_toml(&written).expect("valid"), config);
         let error = AgentConfig::from_toml("[dqn]\ngama = 1").expect_err("no such setting");
-        assert_eq!(error.to_string(), "dqn.gama: expected a setting's name");
+        assert_eq!(error.to_string(), "dqn.gama: expected a known setting");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Files that are written whole or not at all.
+//! Files that are written completely or not at all.
 
 use anyhow::{Context, Result};
 use std::fs::{File, OpenOptions};
@@ -10,15 +10,15 @@ use std::path::{Path, PathBuf};
 /// Who may read a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Readers {
-    /// Whoever the process lets read its files.
+    /// Everyone whom the process's umask allows.
     Any,
     Owner,
 }
 
-/// Writes a temporary file next to `path` and renames it, so that readers find all or nothing.
+/// Writes a temporary file next to `path` and renames it, so that readers find a complete file.
 ///
 /// # Errors
-/// Names the file, which is then as it was.
+/// If the system reports an error. The error names the file, which remains unchanged.
 pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
     let written = || {
         let (temporary, mut file) = create_temporary(path, readers)?;
@@ -35,10 +35,10 @@ pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
     written().with_context(|| format!("write {}", path.display()))
 }
 
-/// Checks that [`replace_file`] can create its temporary file, before the work whose result it is to hold.
+/// Checks that [`replace_file`] can create its temporary file. Called before long computations whose result is saved.
 ///
 /// # Errors
-/// Names the file, with the system's reason.
+/// If it cannot. The error names the file and the system's reason.
 pub fn check_replaceable(path: &Path) -> Result<()> {
     let created = create_temporary(path, Readers::Owner);
     let checked = created.and_then(|(temporary, _)| Ok(std::fs::remove_file(temporary)?));
@@ -46,10 +46,10 @@ pub fn check_replaceable(path: &Path) -> Result<()> {
 }
 
 fn create_temporary(path: &Path, readers: Readers) -> Result<(PathBuf, File)> {
-    let name = path.file_name().context("expected a file's name")?;
+    let name = path.file_name().context("expected the name of a file")?;
     let name = format!(".{}.{}", name.display(), std::process::id());
     let temporary = path.with_file_name(name);
-    // A file that an earlier process of this number left may have other readers.
+    // An earlier process with the same ID may have left a file with other permissions.
     let _ = std::fs::remove_file(&temporary);
     let mut options = OpenOptions::new();
     options.write(true).create_new(true);
@@ -58,7 +58,7 @@ fn create_temporary(path: &Path, readers: Readers) -> Result<(PathBuf, File)> {
         options.mode(0o600);
     }
     #[cfg(not(unix))]
-    let _ = readers; // A file has the readers of its folder.
+    let _ = readers; // The folder determines who may read the file.
     let file = options.open(&temporary)?;
     Ok((temporary, file))
 }

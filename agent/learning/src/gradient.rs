@@ -1,12 +1,12 @@
-//! Parameters for a [`BayesFilter`](emberwatch_belief::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
-//! and first belief that maximise the likelihood of what was seen ([`Optimiser`]; no bias). Read `parameters`, then
-//! `recursion` for one pass and its derivatives, then `optimiser`.
+//! Maximum likelihood for the parameters of a [`BayesFilter`](emberwatch_belief::estimation::BayesFilter): weights `w`,
+//! observation matrix `O` and first belief, without a bias ([`Optimiser`]). Start with `parameters` in
+//! `emberwatch_belief`, then read `recursion` for one pass and its derivatives, then `optimiser`.
 //!
-//! What the data do not tell: the scale of `w` (eq. 3 divides it out), and the order and, in part, the
-//! meaning of the states. Two parameter sets that predict every observation alike cannot be told
-//! apart; so a cell that "often looks latent" may stand for the true latent one, whose cells mostly
-//! look normal. Labels are anchored where learning starts (state i looks like observation i), and
-//! by a prior on the state that pays most: it is seen almost surely.
+//! The data do not determine the scale of `w` (eq. 3 divides it out), the order of the states, and part of their
+//! meaning. Parameter sets that predict all observations equally well are indistinguishable. For example, a learned
+//! state that "often looks latent" may stand for the true latent state, which mostly looks normal. Two things fix the
+//! labels: the initial parameters, in which state i looks like observation i, and a prior that the state with the
+//! highest reward is observed almost surely.
 
 mod adam;
 mod convolution;

@@ -1,14 +1,14 @@
-//! What was learned: the contents of checkpoints, one value of each type.
+//! Learned values: the contents of checkpoints, at most one value of each type.
 
 use std::any::Any;
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Values that checkpoints hold, for the beliefs and goals that act on them. Clones share the values.
+/// Values from checkpoints, for the beliefs and goals that use them. Clones share the values.
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     values: Vec<Arc<dyn Value>>,
-    /// The digest of each checkpoint, in the order they were read.
+    /// The digest of each checkpoint, in the order of reading.
     pub digests: Vec<String>,
 }
 
@@ -17,7 +17,7 @@ trait Value: Any + Debug + Send + Sync {}
 impl<T: Any + Debug + Send + Sync> Value for T {}
 
 impl Learned {
-    /// The value of a type, if a checkpoint holds one.
+    /// Returns the value of a type, if a checkpoint contained one.
     pub fn get<T: Any>(&self) -> Option<&T> {
         let mut values = self.values.iter();
         values.find_map(|value| {
@@ -26,7 +26,7 @@ impl Learned {
         })
     }
 
-    /// As [`Self::get`], to be kept.
+    /// Returns shared ownership of the value of a type, like [`Self::get`].
     pub fn shared<T: Any + Send + Sync>(&self) -> Option<Arc<T>> {
         let mut values = self.values.iter();
         values.find_map(|value| {
@@ -35,7 +35,7 @@ impl Learned {
         })
     }
 
-    /// Puts a value in the place of one of its type. Returns whether there was another.
+    /// Stores a value, replacing a value of the same type. Returns whether the replaced value was different.
     pub fn put<T: Any + Debug + Send + Sync + PartialEq>(&mut self, value: T) -> bool {
         let is_other = self.get::<T>().is_some_and(|before| *before != value);
         self.values.retain(|before| {

@@ -1,13 +1,13 @@
-//! What learns while it acts, as a training drives it. Pure: frames in, paths out.
+//! Learners: agents that learn while they act. `train` drives them. Pure: frames in, paths out.
 //!
-//! A learner is one file, with its constructor and its facts, and a line in [`LEARNERS`].
+//! Each kind of learner is a constant in its own file, and has an entry in [`LEARNERS`].
 
 mod base;
 pub mod decisions;
 pub mod filter;
-mod left;
 pub mod network;
 pub mod neural;
+mod resume_point;
 #[cfg(test)]
 pub(crate) mod tests;
 mod update;
@@ -22,7 +22,7 @@ use emberwatch_model::built_in::listed;
 use emberwatch_network::Device;
 use std::path::Path;
 
-/// All learners.
+/// All kinds of learner.
 pub const LEARNERS: &[&LearnerKind] = &[
     &filter::FILTER,
     &neural::NEURAL,
@@ -30,10 +30,10 @@ pub const LEARNERS: &[&LearnerKind] = &[
     &decisions::DECISIONS,
 ];
 
-/// The learner of a name.
+/// Finds a kind of learner by its name.
 ///
 /// # Errors
-/// Names them all.
+/// If there is no such learner. The error lists the names of all learners.
 pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     let found = LEARNERS.iter().copied().find(|kind| kind.name == name);
     found.ok_or_else(|| {
@@ -42,20 +42,20 @@ pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     })
 }
 
-/// The learner that writes checkpoints with a name.
+/// Finds the learner that writes a kind of checkpoint.
 ///
 /// # Errors
-/// Lists the names of all checkpoints.
+/// If there is no such kind. The error lists all kinds of checkpoint.
 pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
     let mut kinds = LEARNERS.iter().copied();
     let kind = kinds.find(|kind| kind.checkpoints.contains(&name));
     kind.with_context(|| {
         let names = listed(LEARNERS.iter().map(|kind| kind.checkpoints[0]));
-        format!("expected a checkpoint of one of {names}, got one of {name}")
+        format!("expected a checkpoint of kind {names}, got kind {name}")
     })
 }
 
-/// What some checkpoints hold, of each kind one at most; networks compute on `device`.
+/// Reads the learned values of some checkpoints, at most one of each kind. Networks compute on `device`.
 pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> Result<Learned> {
     let mut learned = Learned::default();
     for path in paths {
@@ -66,7 +66,7 @@ pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> R
     Ok(learned)
 }
 
-/// What one checkpoint holds, of whatever kind.
+/// Decodes the learned values of one checkpoint of any kind.
 pub fn from_bytes(bytes: &[u8]) -> Result<Learned> {
     let (kind, contents) = checkpoint::decode(bytes)?;
     let mut learned = Learned::default();

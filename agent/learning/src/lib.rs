@@ -1,24 +1,24 @@
-//! What agents learn and what they act on: estimators with networks, learners, decisions, their checkpoints, and the
-//! policies that put belief, planner and objective together. Pure but for checkpoints and kept beliefs in files: frames
-//! in, paths out.
+//! Learning agents: estimators with networks, learners, decisions, their checkpoints, and policies, which combine a
+//! belief, a planner and a goal. Only checkpoints and cached first beliefs use files; the rest is pure: frames in,
+//! paths out.
 //!
-//! Modules, each using only those below it:
+//! Each module uses only the modules below it in this list:
 //!
-//! - [`options`] -- beliefs about worlds and the plan of every option, for a learner outside
+//! - [`options`] -- beliefs about worlds and the plans of all options, for an external learner
 //! - [`served`] -- the worlds of a client, as an environment
-//! - [`learners`] -- what learns while it acts: filter, Algorithm 1, neural belief, decisions; reading checkpoints
-//! - [`rollout`] -- an agent at its world, and the step that all commands take
-//! - [`policy`] -- belief, planner and goal; names and parts of policies
-//! - [`beliefs`] -- kinds of belief: constructors and facts, what was learned for them
+//! - [`learners`] -- learners that act: filter, Algorithm 1, neural belief, decisions; loading checkpoints
+//! - [`rollout`] -- an agent with its world, and the step that all commands share
+//! - [`policy`] -- policies by name, and their parts: belief, planner and goal
+//! - [`beliefs`] -- kinds of belief: constructors, names and properties, learned models
 //! - [`learned`] -- the contents of checkpoints, by type
 //! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the parts of learners
 //! - [`config`] -- settings
-//! - [`mod@file`] -- files written whole or not at all
-//! - [`parallel`] -- tasks of several worlds at once
+//! - [`mod@file`] -- files that are written completely or not at all
+//! - [`parallel`] -- computation for several worlds at once
 
 #![allow(
     missing_docs,
-    reason = "the agent's inside: what names say is not said again"
+    reason = "internals of the agent: only names that need an explanation have one"
 )]
 
 pub mod beliefs;

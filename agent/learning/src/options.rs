@@ -1,4 +1,4 @@
-//! Beliefs about worlds of one robot each, and the plan of every option, for a learner that chooses among the options.
+//! Beliefs about single-robot worlds and the plans of all options, for a learner that chooses among the options.
 //! Pure: the caller flies the paths.
 
 use crate::beliefs::autoencoder::AutoencoderModel;
@@ -15,7 +15,7 @@ use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
 
-/// The planner settings of all options.
+/// What all worlds share: the model, the belief's kind and learned values, and the planner's settings.
 pub struct Crew {
     model: Model,
     shape: Shape,
@@ -38,15 +38,16 @@ pub struct Planned {
 #[derive(Debug, Clone)]
 pub struct Shown {
     pub frame: Frame,
-    /// Reward of the last path; `None` before the first.
+    /// Reward of the last path. `None` before the first path.
     pub reward: Option<f64>,
 }
 
 impl Crew {
-    /// `estimator`: keeps the beliefs. `None`: the checkpoint's estimator, or the known model's filter without one.
+    /// Creates the shared part. Without `estimator`, beliefs come from the checkpoint's estimator, or from the
+    /// known-model filter if there is no checkpoint.
     ///
     /// # Errors
-    /// If the checkpoint lacks the estimator, or comes from worlds of another form. The message begins with `checkpoint`.
+    /// If the checkpoint lacks the estimator, or its worlds had another form. The message begins with `checkpoint`.
     pub fn new(
         estimator: Option<&'static BeliefKind>,
         learned: Learned,
@@ -57,7 +58,7 @@ impl Crew {
         let kind = estimator.unwrap_or_else(|| usual(&learned));
         ensure!(
             learned.get::<AutoencoderModel>().is_none(),
-            "checkpoint: expected one of a belief that options are planned on, such as {}, got an autoencoder's",
+            "checkpoint: expected a belief that options can be planned on, such as {}, got an autoencoder",
             KNOWN.label
         );
         kind.learned(&learned).context("checkpoint")?;
@@ -67,7 +68,7 @@ impl Crew {
                 name: "options".into(),
                 belief: kind,
                 planner: &BY_OPTIONS,
-                // The learner outside chooses.
+                // The external learner chooses the option.
                 goal: Goal::Rule,
             },
             model,
@@ -90,12 +91,12 @@ impl Crew {
         self.shape
     }
 
-    /// Moves of a path.
+    /// Returns the number of moves per path.
     pub fn n_moves(&self) -> usize {
         self.n_moves
     }
 
-    /// Creates a belief before the first frame. `prior`: the first belief of filters that know the model.
+    /// Creates the belief about one world before its first frame. `prior` is the first belief of known-model filters.
     pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<Planned> {
         let conditions = Conditions {
             shape: self.shape,
@@ -113,8 +114,7 @@ impl Crew {
     }
 }
 
-/// The belief that a checkpoint is about: the one that decisions were learned on, otherwise the one that was learned, and
-/// without any the known model's.
+/// Returns the default belief: the belief of the learned decisions, otherwise the learned belief, otherwise [`KNOWN`].
 pub fn usual(learned: &Learned) -> &'static BeliefKind {
     let decided = learned
         .get::<LearnedDecisions>()
@@ -125,7 +125,7 @@ pub fn usual(learned: &Learned) -> &'static BeliefKind {
 }
 
 impl Planned {
-    /// Corrects the belief with a frame: it is the posterior afterwards.
+    /// Corrects the belief with a frame, and records the reward.
     pub fn see(&mut self, shown: &Shown) -> Result<()> {
         self.agent.correct(&shown.frame, None)?;
         if let Some(reward) = shown.reward {
@@ -146,12 +146,12 @@ impl Planned {
         self.planning = start.elapsed();
     }
 
-    /// Features and paths of the last plans, in the order of `OPTIONS`; empty before the first plan.
+    /// Returns the features and paths of the last plans, in the order of `OPTIONS`. Empty before the first plan.
     pub fn proposals(&self) -> &[Proposal] {
         &self.proposals
     }
 
-    /// The last flown option, for observers.
+    /// Records the flown option, and returns the intent that observers see.
     pub fn intent(&mut self, flown: Option<usize>) -> Intent {
         if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
             self.agent
@@ -164,7 +164,7 @@ impl Planned {
         &self.agent
     }
 
-    /// Continues from the belief that another agent left, like [`Agent::take_over`].
+    /// Resumes from the belief that another agent handed over, like [`Agent::take_over`].
     pub fn take_over(&mut self, kind: &str, bytes: &[u8]) -> bool {
         self.agent.handover_kind().is_some_and(|own| own == kind) && self.agent.take_over(bytes)
     }

@@ -1,8 +1,8 @@
-//! Tasks of several worlds at once.
+//! Computation for several worlds at once.
 
 use rayon::prelude::*;
 
-/// The results in order. One task alone is done here: handing it to another thread costs more than it gains.
+/// Runs tasks in parallel. Returns their results in order. A single task runs faster, on the calling thread.
 pub fn in_parallel<T: Send, U: Send>(
     tasks: impl IntoIterator<Item = T>,
     work: impl Fn(T) -> U + Sync,

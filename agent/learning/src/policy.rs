@@ -1,4 +1,4 @@
-//! A policy is a belief, a planner and a goal, such as `learned+spatial/beam/exploit`.
+//! Policies: combinations of a belief, a planner and a goal, such as `learned+spatial/beam/exploit`.
 
 mod decisions;
 mod help;

@@ -1,9 +1,9 @@
-//! Recent frames of one or more robots, in blocks that learners run through.
+//! A replay buffer for sequences: recent frames of one or more robots, in blocks.
 //!
-//! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
-//! length, the last of which may be shorter; a block keeps the belief before its first frame, which the learner that
-//! runs through the block before it renews. Frames of a block that is not full yet are not replayed while their
-//! track goes on. The oldest blocks go when there is no room.
+//! A *track* is the sequence of frames of one robot in one episode, without gaps. It is divided into blocks of equal
+//! length; the last block may be shorter. A block stores the belief before its first frame, which a learner updates at
+//! the end of the preceding block. A block is replayed once it is full or its track has ended. When the buffer is full,
+//! the oldest blocks are dropped.
 
 use crate::checkpoint::{check, check_counts, check_numbers, wrong};
 use anyhow::Result;
@@ -24,7 +24,7 @@ pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
-    /// The block that follows on its track.
+    /// The number of the next block on the track.
     next: u64,
 }
 
@@ -33,13 +33,13 @@ pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
     full: BTreeMap<u64, Block>,
-    /// The block that each robot's frames go into, by robot.
+    /// The block that receives each robot's frames, by robot.
     open: BTreeMap<u32, (u64, Block)>,
     n_opened: u64,
 }
 
 impl BlockReplay {
-    /// Room for `max_frames` frames, in blocks of at most `block_length`; for one block at least.
+    /// Creates a buffer for `max_frames` frames in blocks of at most `block_length`. It holds at least one block.
     pub fn new(block_length: usize, max_frames: usize) -> Self {
         Self {
             block_length,
@@ -50,7 +50,7 @@ impl BlockReplay {
         }
     }
 
-    /// Begins a new track of a robot; the last block of the one before ends here.
+    /// Begins a new track of a robot, which ends its previous track.
     pub fn begin(&mut self, robot: u32) {
         let block = self.new_block(None);
         if let Some((number, last)) = self.open.insert(robot, block)
@@ -64,10 +64,10 @@ impl BlockReplay {
         self.open.contains_key(&robot)
     }
 
-    /// Adds the next frame of a robot's track, and the belief before it where there is one.
+    /// Adds the next frame of a robot's track. `before` is the belief before the frame, if there is one.
     ///
     /// # Panics
-    /// If the robot's track was not begun.
+    /// If the robot has no track.
     pub fn push(&mut self, robot: u32, frame: &Frame, before: Option<&Belief>) {
         let sighting = |(cell, value)| Sighting {
             cell: cell as u32,
@@ -80,7 +80,7 @@ impl BlockReplay {
         }
         block.frames.push(sightings);
         if block.frames.len() == self.block_length {
-            // An empty belief stands for one that is still to be given.
+            // An empty belief is a placeholder until the first frame of the block.
             let following = self.new_block(Some(Vec::new()));
             let next = following.0;
             if let Some((id, mut block)) = self.open.insert(robot, following) {
@@ -94,17 +94,17 @@ impl BlockReplay {
         self.full.len()
     }
 
-    /// Numbers of the blocks that are full or ended, oldest first.
+    /// Returns the numbers of the full and ended blocks, oldest first.
     pub fn blocks(&self) -> impl Iterator<Item = u64> + '_ {
         self.full.keys().copied()
     }
 
-    /// Such a block that is still there.
+    /// Returns a full or ended block, unless it was dropped.
     pub fn block(&self, number: u64) -> Option<&Block> {
         self.full.get(&number)
     }
 
-    /// Hands the belief at the end of a block on to the block after it.
+    /// Stores the belief at the end of a block in the next block of its track.
     pub fn hand_on(&mut self, number: u64, belief: &[f32]) {
         let Some(next) = self.full.get(&number).map(|block| block.next) else {
             return;
@@ -114,7 +114,11 @@ impl BlockReplay {
         }
     }
 
-    /// Goes on from another replay with blocks of the same length; of more blocks than fit, the newest stay.
+    /// Loads the contents of a saved buffer with blocks of the same length. If they exceed the capacity, the newest
+    /// blocks are kept.
+    ///
+    /// # Errors
+    /// If the saved buffer is invalid, or belongs to another grid, model or sensor.
     pub fn resume(
         &mut self,
         other: Self,
@@ -130,7 +134,8 @@ impl BlockReplay {
         let open = open.map(|(number, block)| (*number, block, false));
         for (number, block, is_full) in full.chain(open) {
             let fits = number < other.n_opened;
-            check(fits, "replay.blocks", "numbers of opened blocks", number)?;
+            let expected = format!("numbers below {}", other.n_opened);
+            check(fits, "replay.blocks", expected, number)?;
             let (n_frames, most) = (block.frames.len(), self.block_length);
             let expected = if is_full { 1..=most } else { 0..=most - 1 };
             check(
@@ -187,7 +192,7 @@ impl Block {
         }
         match self.start.as_deref() {
             None => Ok(()),
-            // Still to be given.
+            // The placeholder of a block without frames.
             Some([]) if self.frames.is_empty() => Ok(()),
             Some(start) => {
                 let dim = (n_states, shape.height(), shape.width());
@@ -211,14 +216,14 @@ mod tests {
         Frame::from_bytes(shape, 9, &[255, value, 255]).expect("test frame")
     }
 
-    /// About two states of three cells, another for each number.
+    /// A belief about two states on three cells, different for each number.
     fn belief(number: u8) -> Belief {
         let p = f32::from(number) / 16.0;
         let states = Probabilities::from_shape_fn((2, 1, 3), |(state, _, _)| [p, 1.0 - p][state]);
         Belief::from_probabilities(states).expect("valid")
     }
 
-    /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
+    /// A buffer for 3 blocks of 2 frames, with frames of two worlds in turn.
     fn replay(n_frames: u8) -> BlockReplay {
         let mut replay = BlockReplay::new(2, 7);
         replay.begin(0);
@@ -265,7 +270,7 @@ mod tests {
         replay.hand_on(1, &[9.0]);
         assert_eq!(start(&replay, 2), given);
         assert_eq!(start(&replay, 3), Some(vec![9.0]));
-        replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
+        replay.hand_on(2, &[8.0]); // The next block is not full.
         replay.hand_on(77, &[8.0]);
     }
 
@@ -287,7 +292,7 @@ mod tests {
             (4, 2, None),
         ];
         assert_eq!(kept.collect::<Vec<_>>(), expected);
-        replay.hand_on(2, &[8.0]); // nobody to hand on to
+        replay.hand_on(2, &[8.0]); // There is no next block.
         replay.begin(0);
         replay.begin(0);
         assert_eq!(replay.blocks().last(), Some(4), "without frames no block");
@@ -337,7 +342,7 @@ mod tests {
         check(|it| full(it).frames.clear(), words);
         let words = "replay.frames: expected blocks of 1..=2 frames, got 3";
         check(|it| full(it).frames.push(Vec::new()), words);
-        let words = "replay.blocks: expected numbers of opened blocks, got 3";
+        let words = "replay.blocks: expected numbers below 3, got 3";
         check(|it| it.n_opened = 3, words);
         let words = "replay.n_opened: expected at most 9007199254740992, got 18446744073709551615";
         check(|it| it.n_opened = u64::MAX, words);

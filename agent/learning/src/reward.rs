@@ -1,22 +1,22 @@
-//! Which state pays: the reward of each state, estimated from the rewards of paths.
+//! The reward of each state, estimated from the rewards of paths.
 //!
-//! A path's reward is the sum of its distinct cells' rewards (paper eq. 18), so its expectation
-//! is `sum_s r[s] x[s]` with `x[s]` the sum of the posteriors of state s over the visited cells. `r` is
-//! found by least squares with forgetting, as early posteriors are poor. A learned filter has no
-//! other way to know which of its states is the fire.
+//! A path's reward is the sum of the rewards of its distinct cells (paper eq. 18). Its expectation is
+//! `sum_s r[s] x[s]`, where `x[s]` is the sum of the posteriors of state s over the visited cells. `r` is estimated by
+//! least squares with exponential forgetting, because early posteriors are poor. A learned filter has no other way to
+//! find out which of its states is the fire.
 
 use crate::checkpoint::check_numbers;
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use serde::{Deserialize, Serialize};
 
-/// Share of what was known that is kept at each path: a memory of 2,000 paths.
+/// Weight of the earlier sums after each path, which corresponds to a memory of 2,000 paths.
 const KEPT: f64 = 0.9995;
 
-/// Added to the diagonal, in squared cells: no state needs to have been met.
+/// Ridge term on the diagonal, in squared cells. It makes the system solvable if a state was never visited.
 const RIDGE: f64 = 1.0;
 
-/// What a path met: the expected number of the visited cells in each state, under the belief after it.
+/// Returns the expected number of visited cells in each state, under the posterior after the path's frame.
 pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> Vec<f64> {
     let n_cells = posterior.shape().n_cells();
     let planes = posterior.as_slice().chunks_exact(n_cells);
@@ -24,7 +24,7 @@ pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> 
     planes.map(cells).collect()
 }
 
-/// Sums of products of what was met, for least squares.
+/// An estimate of the reward of each state: the sums of the least-squares problem.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RewardEstimate {
     /// `sum x x'`, shape `[S, S]`.
@@ -41,13 +41,13 @@ impl RewardEstimate {
         }
     }
 
-    /// Refuses one from a checkpoint that is not of so many states.
+    /// Checks an estimate from a checkpoint: its shapes, and that its numbers are finite.
     pub fn check(&self, n_states: usize) -> Result<()> {
         check_numbers("reward.products", &self.products, n_states * n_states)?;
         check_numbers("reward.rewards", &self.rewards, n_states)
     }
 
-    /// Takes in a path: the expected number of visited cells in each state, and its reward.
+    /// Adds a path: the expected number of visited cells in each state, and its reward.
     pub fn add(&mut self, met: &[f64], reward: f64) {
         let n_states = self.rewards.len();
         for (state, &cells) in met.iter().enumerate() {
@@ -59,13 +59,13 @@ impl RewardEstimate {
         }
     }
 
-    /// The reward of a cell in each state.
+    /// Returns the estimated reward of a cell in each state.
     pub fn of_states(&self) -> Vec<f64> {
         let n = self.rewards.len();
         let mut matrix = self.products.clone();
         let mut solution = self.rewards.clone();
         (0..n).for_each(|i| matrix[i * n + i] += RIDGE);
-        // Gauss's elimination; positive definite, so without a search for pivots.
+        // Gaussian elimination. The matrix is positive definite, so that pivoting is unnecessary.
         for pivot in 0..n {
             for row in pivot + 1..n {
                 let factor = matrix[row * n + pivot] / matrix[pivot * n + pivot];
@@ -84,7 +84,7 @@ impl RewardEstimate {
         solution
     }
 
-    /// The state that pays most; `None` before any reward.
+    /// Returns the state with the highest reward. `None` before any reward.
     pub fn target(&self) -> Option<usize> {
         let rewards = self.of_states();
         let best = (0..rewards.len()).max_by(|&a, &b| rewards[a].total_cmp(&rewards[b]))?;

@@ -1,4 +1,4 @@
-//! An agent at its world, and the step that every command takes: plan, fly, see, predict. Pure: an environment flies.
+//! An agent with its world, and the step that all commands share: plan, fly, see, predict. Pure.
 
 pub mod agent;
 pub mod building;
@@ -12,10 +12,10 @@ use emberwatch_messages::message::RobotResult;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::{Cell, Grid, Move};
 
-/// One step of the worlds of an environment; `None` if it was stopped before they moved.
+/// Runs one step in all worlds of an environment. Returns `None` if the environment was stopped before they moved.
 ///
 /// # Errors
-/// If paths are not flown, or a frame is impossible under a belief.
+/// If the environment cannot fly the paths, or a frame is impossible under a belief.
 pub fn step(
     actor: &mut (impl Actor + ?Sized),
     environment: &mut impl Environment,
@@ -29,60 +29,60 @@ pub fn step(
     Ok(Some(records))
 }
 
-/// What acts on worlds: an agent, several, or what learns while it acts.
+/// An acting part: one or more agents, or a learner.
 pub trait Actor {
-    /// The path of each robot for step k -> k + 1.
+    /// Plans the path of each robot for step k -> k + 1.
     fn plan(&mut self) -> Vec<Vec<Move>>;
 
-    /// Takes in what each agent sees after the step; the beliefs are then posteriors, about X_{k+1}.
+    /// Corrects each agent's belief with its observation after the step. The beliefs are then posteriors about X_{k+1}.
     ///
     /// # Errors
     /// If a frame is impossible under a belief.
     fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>>;
 
-    /// Moves all beliefs to the next step.
+    /// Predicts all beliefs one step ahead.
     fn predict(&mut self);
 }
 
-/// Where it acts: a server's worlds, or worlds in this process.
+/// The worlds in which an actor acts, on a server or in this process.
 pub trait Environment {
-    /// Flies a path with each robot; returns what each agent sees then, or `None` if it was stopped before that.
+    /// Flies a path with each robot. Returns each agent's observation afterwards, or `None` if stopped before the step.
     ///
     /// # Errors
-    /// If the paths are not flown.
+    /// If the environment cannot fly the paths.
     fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>>;
 }
 
-/// An agent and what its world shows it: it plans for one robot there, or for several on one belief.
+/// An agent and its world's last observation. The agent plans for one robot, or for several robots on one belief.
 pub struct Rollout {
     pub agent: Agent,
     seen: Seen,
 }
 
-/// What a world shows to an agent.
+/// The observation of an agent.
 #[derive(Debug, Clone)]
 pub struct Seen {
-    /// Of the first robot that the agent plans for; its frame corrects the belief.
+    /// Observation of the agent's first robot. Its frame corrects the belief.
     pub observation: Observation,
-    /// What the step gave the others.
+    /// Results of the agent's other robots.
     pub others: Vec<RobotResult>,
-    /// The hidden states X_k, shape `[H, W]`, where they are published.
+    /// The hidden states X_k, shape `[H, W]`, if they are published.
     pub truth: Option<Grid<u8>>,
 }
 
-/// What a step changed for an agent.
+/// The result of a step for an agent.
 #[derive(Debug)]
 pub struct StepRecord {
-    /// What the world showed before.
+    /// The observation before the step.
     pub before: Observation,
-    /// What the step gave its first robot.
+    /// Reward of the agent's first robot.
     pub reward: f64,
-    /// How well the prediction before the frame fits it, where the estimator predicts frames.
+    /// Score of the predicted frame, if the estimator predicts frames.
     pub score: Option<Score>,
 }
 
 impl Seen {
-    /// What an agent sees that plans for these robots of one world, at least one.
+    /// Combines the observations of an agent's robots in one world. There must be at least one.
     pub fn new(observations: impl IntoIterator<Item = Observation>) -> Self {
         let mut observations = observations.into_iter();
         let first = observations.next();
@@ -95,12 +95,12 @@ impl Seen {
 }
 
 impl Rollout {
-    /// An agent that has not yet taken in what its world shows.
+    /// Creates a rollout. The observation has not corrected the agent's belief yet.
     pub fn new(agent: Agent, seen: Seen) -> Self {
         Self { agent, seen }
     }
 
-    /// An agent that has: its belief is about X_{k+1}.
+    /// Creates a rollout, corrects the belief with the observation, and predicts. The belief is then about X_{k+1}.
     pub fn begun(agent: Agent, seen: Seen) -> Result<Self> {
         let mut rollout = Self::new(agent, seen);
         rollout.correct()?;
@@ -108,13 +108,13 @@ impl Rollout {
         Ok(rollout)
     }
 
-    /// The paths for step k -> k + 1, one for each robot.
+    /// Plans the paths for step k -> k + 1, one for each robot.
     pub fn plan(&mut self) -> Vec<Plan> {
         let (cells, step) = (self.cells(), self.step());
         self.agent.plan(&cells, step)
     }
 
-    /// Takes in what the world shows after a step; the belief is then the posterior.
+    /// Corrects the belief with the observation after a step. The belief is then the posterior.
     pub fn see(&mut self, seen: Seen) -> Result<StepRecord> {
         let score = self.agent.score(&seen.observation.frame);
         let before = std::mem::replace(&mut self.seen, seen);
@@ -126,7 +126,7 @@ impl Rollout {
         })
     }
 
-    /// Takes in what the world shows now; the belief is then the posterior.
+    /// Corrects the belief with the stored observation, and records the reward. The belief is then the posterior.
     pub fn correct(&mut self) -> Result<()> {
         let Seen {
             observation, truth, ..
@@ -143,28 +143,28 @@ impl Rollout {
         &self.seen.observation
     }
 
-    /// The hidden states X_k, where they are published.
+    /// Returns the hidden states X_k, if they are published.
     pub fn truth(&self) -> Option<&Grid<u8>> {
         self.seen.truth.as_ref()
     }
 
-    /// The world's step k.
+    /// Returns the world's step k.
     pub fn step(&self) -> u64 {
         self.observation().world.step
     }
 
-    /// What the last step gave each robot that it plans for.
+    /// Returns the results of the last step for each of the agent's robots.
     pub fn results(&self) -> impl Iterator<Item = &RobotResult> {
         std::iter::once(&self.observation().robot).chain(&self.seen.others)
     }
 
-    /// Where these robots are.
+    /// Returns the cells of the agent's robots.
     pub fn cells(&self) -> Vec<Cell> {
         self.results().map(RobotResult::cell).collect()
     }
 }
 
-/// Agents, each on its own belief.
+/// Several agents, each with its own belief.
 impl Actor for Vec<Rollout> {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         paths_of(in_parallel(self, Rollout::plan))
@@ -179,13 +179,13 @@ impl Actor for Vec<Rollout> {
     }
 }
 
-/// The paths of all agents' plans, in order.
+/// Returns the paths of all agents' plans, in order.
 pub fn paths_of(plans: impl IntoIterator<Item = Vec<Plan>>) -> Vec<Vec<Move>> {
     let plans = plans.into_iter().flatten();
     plans.map(|plan| plan.moves).collect()
 }
 
-/// Gives each agent what it sees after the step; the beliefs are then posteriors.
+/// Corrects each agent's belief with its observation after the step. The beliefs are then posteriors.
 pub fn see_all<'a>(
     rollouts: impl IntoIterator<Item = &'a mut Rollout>,
     seen: Vec<Seen>,
@@ -195,7 +195,7 @@ pub fn see_all<'a>(
     records.into_iter().collect()
 }
 
-/// Moves all beliefs to the next step.
+/// Predicts all beliefs one step ahead.
 pub fn predict_all<'a>(rollouts: impl IntoIterator<Item = &'a mut Rollout>) {
     Agent::predict_all(rollouts.into_iter().map(|rollout| &mut rollout.agent));
 }

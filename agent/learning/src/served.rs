@@ -1,4 +1,4 @@
-//! The worlds of a client's robots, each with one agent: over a server, or in this process.
+//! The worlds of a client's robots, each with one agent, on a server or in this process.
 
 use crate::rollout::{Environment, Seen};
 use anyhow::Result;
@@ -14,15 +14,15 @@ pub struct Served<'a, B> {
 }
 
 impl<'a, B: Backend> Served<'a, B> {
-    /// `shows_all`: whether frames show every cell, where the server gives such.
+    /// Creates the environment. With `shows_all`, it requests frames that show every cell.
     pub fn new(client: &'a mut Client<B>, shows_all: bool) -> Self {
         Self { client, shows_all }
     }
 
-    /// What each agent sees now.
+    /// Returns the present observation of each agent.
     ///
     /// # Errors
-    /// If there is no answer.
+    /// If the backend does not answer.
     pub fn observe(&mut self) -> Result<Vec<Seen>> {
         let observations = self.client.observe(self.client.robots())?;
         let seen = observations.into_iter();
@@ -38,7 +38,7 @@ impl<B: Backend> Environment for Served<'_, B> {
         } else {
             self.client.step(robots, paths)?
         };
-        // Without hidden states: neither learners nor policies see any.
+        // Hidden states are omitted: neither learners nor policies may see them.
         let seen = observations.into_iter();
         Ok(Some(
             seen.map(|observation| Seen::new([observation])).collect(),

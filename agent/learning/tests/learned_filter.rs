@@ -1,4 +1,4 @@
-//! The learned filter against the known-model filter, finite differences and itself.
+//! Compares the learned filter with the known-model filter, with finite differences and with itself.
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
@@ -10,7 +10,7 @@ use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Cell, Frame, Model, Probabilities, Shape};
 use ndarray::{ArrayView, Axis};
 
-/// What a few cells of a made-up world show: no two frames see the same cells.
+/// Observations of a few cells of a made-up world. Different frames observe different cells.
 fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
     let n_cells = shape.n_cells() as u64;
     let mut cells: Vec<u64> = (0..6).map(|n| split_mix(frame, n) % n_cells).collect();
@@ -46,7 +46,7 @@ fn shape(height: usize, width: usize) -> Shape {
     Shape::new(height, width).expect("test shape")
 }
 
-/// The largest difference of two beliefs.
+/// The maximum difference between two beliefs.
 fn off(a: &Belief, b: &Belief) -> f32 {
     let differences = (&a.view() - &b.view()).mapv(f32::abs);
     differences.fold(0.0, |worst, d| d.max(worst))
@@ -67,14 +67,14 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
                     filter.predict();
                 }
             }
-            // 30 steps of roundings of 6e-8.
+            // 30 steps with rounding errors of 6e-8 each.
             let off = off(known.belief(), learned.belief());
             assert!(off < 1e-5, "{name} on {shape}: {off}");
         }
     }
 }
 
-/// `-ln P` of frames by the definition, in f64; `tables`: kernel, likelihood and first belief.
+/// Computes `-ln P` of frames by the definition, in f64. `tables` are kernel, likelihood and first belief.
 fn loss(
     dimensions: Dimensions,
     tables: &[Vec<f64>; 3],
@@ -106,7 +106,7 @@ fn loss(
     loss
 }
 
-/// Eqs. 2 and 3 by the definition.
+/// Computes eqs. 2 and 3 by the definition.
 fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
     let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
     let (n_cells, sees_own) = (shape.n_cells(), dimensions.sees_own_state);
@@ -165,8 +165,7 @@ fn check_gradients(dimensions: Dimensions, shape: Shape, from_belief: bool) {
                 moved[which][entry] += by;
                 loss(dimensions, &moved, shape, start, &frames)
             };
-            // Central differences: their error is of the order of the square of the step, 1e-10; that of sums of 32
-            // bits is larger.
+            // The error of central differences is about the squared step, 1e-10. The error of the f32 sums is larger.
             let expected = (moved(1e-5) - moved(-1e-5)) / 2e-5;
             let is_close = (got - expected).abs() <= 1e-4 * expected.abs().max(1.0);
             assert!(
@@ -233,7 +232,7 @@ fn learning_begins_alike_for_every_own_state() {
         filter.predict();
         filter.belief().clone()
     });
-    // Weights differ by noise of 10 %.
+    // The weights differ by a noise of 10 %.
     assert!(off(&one, &own) < 0.05);
 }
 
@@ -246,7 +245,7 @@ fn config() -> LearningConfig {
     }
 }
 
-/// A replay of two worlds with enough blocks for [`config`].
+/// A replay buffer with frames of two worlds, with enough blocks for [`config`].
 fn replay(n_frames: u64) -> BlockReplay {
     let shape = shape(10, 12);
     let mut replay = BlockReplay::new(8, 1000);
@@ -321,7 +320,7 @@ fn a_number_that_is_not_finite_stops_training_by_name() {
     let before = format!("{parameters:?}");
     let mut optimiser = Optimiser::new(parameters, shape(10, 12), config(), 0);
     let error = optimiser.update(&mut replay(40), None).expect_err("NaN");
-    let words = "update 1: likelihood: expected finite numbers, got a parameter that is not";
+    let words = "update 1: likelihood: expected finite numbers, got a NaN or infinite parameter";
     assert_eq!(error.to_string(), words);
     assert_eq!(format!("{:?}", optimiser.parameters()), before);
 }

@@ -1,4 +1,4 @@
-//! One program: each would link candle.
+//! All integration tests in one program, because linking candle takes long.
 
 mod learned_filter;
 mod rollout;

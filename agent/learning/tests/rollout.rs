@@ -1,4 +1,4 @@
-//! The step of agents that plan for one robot or several.
+//! The step of agents that plan for one or more robots.
 
 use emberwatch_belief::Belief;
 use emberwatch_learning::beliefs::Conditions;
@@ -16,7 +16,7 @@ fn shape() -> Shape {
     Shape::new(8, 9).expect("test shape")
 }
 
-/// What robots in some cells see of a made-up world.
+/// The observation of robots in some cells of a made-up world.
 fn seen(step: u64, cells: &[Cell]) -> Seen {
     let mut frame = Frame::empty(shape());
     for cell in (0..72).filter(|cell| split_mix(step, *cell).is_multiple_of(4)) {
@@ -96,7 +96,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         let mut team = robot(policy, &CELLS);
         let (own, of_team) = (alone.plan(), team.plan());
         assert_eq!((own.len(), of_team.len()), (1, 3), "{policy}");
-        // The same beliefs: planned first and alone, unless a teammate's answer was better.
+        // The beliefs are equal, so that the first robot alone has the same plan.
         let first = team.agent.plan(&CELLS[..1], team.step());
         assert_eq!(own, first, "{policy}");
     }

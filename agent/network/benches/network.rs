@@ -1,6 +1,8 @@
-//! Time of the networks at the paper's size, 64 x 64 cells; of the autoencoder with windows of 1,000 frames, hidden 16.
+//! Time of the networks at the paper's size, 64 x 64 cells. The autoencoder has windows of 1,000 frames and 16 hidden
+//! numbers.
 //!
-//! The authors' code on torch with two threads: an update 1,156 to 1,240 ms, an inference step 0.95 ms.
+//! For comparison, the authors' PyTorch code with two threads takes 1,156 to 1,240 ms for an update and 0.95 ms for an
+//! inference step.
 
 use criterion::{Criterion, criterion_group};
 use emberwatch_model::frame::Frame;
@@ -26,7 +28,7 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-/// What a random walk of 64 moves sees: about 33 cells, in patches of one value.
+/// Returns the frame of a random walk of 64 moves: about 33 cells, in patches of one value.
 fn path_frame(step: u64) -> Frame {
     let moves: Vec<Move> = (0..64)
         .map(|t| Move::from_low_bits(split_mix(step, t) >> 62))
@@ -59,7 +61,7 @@ fn network() -> Autoencoder {
     Autoencoder::new(settings, shape, 1, &Device::Cpu).expect("a network")
 }
 
-/// The first updates ask the system for memory, which the process keeps.
+/// Returns a network after some updates, because the first ones allocate memory, which the process keeps.
 fn warm_network(window: &Window) -> Autoencoder {
     let mut network = network();
     for _ in 0..5 {
@@ -136,8 +138,8 @@ fn flight_frame(step: u64) -> Frame {
     frame
 }
 
-/// Measures the neural belief as a training uses it: from 64 lessons (`neural.batch`) an update takes the 16 that fill a
-/// batch, because long flights need whole grids.
+/// Measures the neural belief as in training. An update uses 16 of 64 lessons (`neural.batch`): they fill a batch,
+/// because long flights need whole grids.
 fn neural_belief(c: &mut Criterion) {
     let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());

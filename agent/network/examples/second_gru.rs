@@ -1,7 +1,7 @@
-//! A network with a layer more: a second GRU behind the first.
+//! A network with an additional layer: a second GRU after the first.
 //!
-//! Its gradients come from candle, its first values from a seed, and [`Adam`] finds its variables by name.
-//! `cargo run --release -p emberwatch-network --example second_gru`
+//! Candle computes its gradients, a seed determines its initial values, and [`Adam`] finds its variables by name. Run
+//! it with `cargo run --release -p emberwatch-network --example second_gru`
 
 use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;
@@ -44,7 +44,7 @@ impl TwoGrus {
     }
 }
 
-/// Frames of a grid whose left half shows 0 and whose right half shows 1.
+/// Creates frames of a grid whose left half shows 0 and whose right half shows 1.
 fn frames(grid: Shape) -> Vec<Frame> {
     let (_, width) = grid.dim();
     let frame = |step: usize| {
@@ -57,7 +57,7 @@ fn frames(grid: Shape) -> Vec<Frame> {
     (0..40).map(|step| frame(step % 7)).collect()
 }
 
-#[expect(clippy::print_stdout, reason = "an example shows what it does")]
+#[expect(clippy::print_stdout, reason = "the example prints its progress")]
 fn main() -> Result<()> {
     let shape = NetworkShape {
         grid: Shape::new(32, 32).map_err(candle_core::Error::wrap)?,

@@ -1,4 +1,4 @@
-//! Adam over candle variables, as PyTorch has it, with moments that can be saved.
+//! The Adam optimiser for candle variables, equivalent to PyTorch's, with moments that can be saved.
 
 use crate::error::{NetworkError, NotFinite};
 use crate::tensors::{Change, copied, named, set, zero_if_finite};
@@ -7,26 +7,26 @@ use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// Added to moments and subtracted again. Moments of zero gradients then stay at a few roundings of this and do not
-/// become subnormal numbers, with which some processors are a hundred times slower.
+/// Added to moments and subtracted again. Moments of zero gradients then stop at a few rounding errors of this number.
+/// They never become subnormal numbers, which some processors handle a hundred times more slowly.
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdamSettings {
-    /// Step size.
+    /// The learning rate.
     pub learning_rate: f32,
     /// Decay rates of the two moments.
     pub betas: [f32; 2],
-    /// Added to the root of the second moment.
+    /// Added to the square root of the second moment.
     pub epsilon: f32,
-    /// Larger gradients, by the root of the sum of all squares, are scaled to this.
+    /// Maximum Euclidean norm of all gradients together. Larger gradients are scaled down to it.
     pub max_norm: Option<f32>,
 }
 
 impl AdamSettings {
-    /// The authors' betas, .5 and .9, with a step size.
+    /// Returns the authors' settings, with betas 0.5 and 0.9, and the given learning rate.
     pub fn paper(learning_rate: f32) -> Self {
         Self {
             learning_rate,
@@ -37,7 +37,7 @@ impl AdamSettings {
     }
 }
 
-/// Variables that are learned, with Adam's two moments of each parameter.
+/// The optimiser: variables to learn, and the two moments of each parameter.
 #[derive(Debug, Clone)]
 pub struct Adam {
     variables: Variables,
@@ -47,7 +47,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// Before the first step.
+    /// Creates the optimiser before the first step.
     pub fn new(variables: Variables) -> Result<Self> {
         let parameters = variables.iter().filter(|(name, _)| !is_statistic(name));
         let moments = parameters.flat_map(|(name, var)| {
@@ -60,11 +60,11 @@ impl Adam {
         })
     }
 
-    /// One step against the gradients of a loss, which it returns.
+    /// Performs one step against the gradients of a loss, and returns the loss.
     ///
     /// # Errors
-    /// [`NetworkError`] names the first tensor with a number that is not finite, in the order of computation.
-    /// Nothing has changed then.
+    /// [`NetworkError`] names the first tensor, in the order of computation, with a number that is not finite. An error
+    /// changes nothing.
     pub fn update(
         &mut self,
         settings: &AdamSettings,
@@ -73,7 +73,8 @@ impl Adam {
         self.update_with(settings, loss, Vec::new(), "")
     }
 
-    /// [`Self::update`] with changes that go with it. `prefix` precedes the names of variables in errors.
+    /// Like [`Self::update`], but also applies the changes in `statistics`. `prefix` precedes the names of variables in
+    /// errors.
     pub(crate) fn update_with(
         &mut self,
         settings: &AdamSettings,
@@ -92,7 +93,7 @@ impl Adam {
         changes.extend(self.changes(settings, &gradients)?);
         let after = changes.iter();
         let after = after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor));
-        // In the order of computation.
+        // In the order of computation, so that the error names the cause.
         let all = named(&groups).chain(of_variables);
         let all: Vec<_> = all.chain([("loss".into(), loss)]).chain(after).collect();
         let loss = self.checked(&all, loss)?;
@@ -101,10 +102,11 @@ impl Adam {
         Ok(loss)
     }
 
-    /// The number of a scalar, copied with what tells whether all numbers of some tensors are finite.
+    /// Checks that all numbers of some tensors are finite. Returns the number of a scalar, copied together with the
+    /// checks.
     ///
     /// # Errors
-    /// Names the first tensor with a number that is not.
+    /// Names the first tensor with a number that is not finite.
     pub(crate) fn checked(
         &self,
         tensors: &[(String, &Tensor)],
@@ -125,13 +127,13 @@ impl Adam {
         NotFinite { update, tensor }.into()
     }
 
-    /// What a step moves.
+    /// Computes the changes of parameters and moments in a step.
     fn changes(&self, settings: &AdamSettings, gradients: &GradStore) -> Result<Vec<Change>> {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
         let rate = f64::from(settings.learning_rate) / bias[0];
         let scale = match settings.max_norm {
-            Some(most) => (f64::from(most) / self.norm(gradients)?).min(1.0),
+            Some(max_norm) => (f64::from(max_norm) / self.norm(gradients)?).min(1.0),
             None => 1.0,
         };
         let mut changes = Vec::new();
@@ -159,7 +161,7 @@ impl Adam {
         Ok(changes)
     }
 
-    /// The root of the sum of all gradients' squares.
+    /// Returns the Euclidean norm of all gradients together.
     fn norm(&self, gradients: &GradStore) -> Result<f64> {
         let gradients = self.variables.values().filter_map(|var| gradients.get(var));
         let squares = gradients.map(|it| it.sqr()?.sum_all());
@@ -167,22 +169,22 @@ impl Adam {
         Ok(squares.map(f64::from).sum::<f64>().sqrt())
     }
 
-    /// What is learned.
+    /// Returns the variables to learn.
     pub fn variables(&self) -> &Variables {
         &self.variables
     }
 
-    /// The moments, as `first.<name>` and `second.<name>`.
+    /// Returns the moments, as `first.<name>` and `second.<name>`.
     pub fn moments(&self) -> &Variables {
         &self.moments
     }
 
-    /// Steps so far.
+    /// Returns the number of steps so far.
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// Sets the number of steps, to go with loaded moments.
+    /// Sets the number of steps that belongs to loaded moments.
     pub(crate) fn set_steps(&mut self, steps: u64) {
         self.steps = steps;
     }
@@ -192,7 +194,7 @@ fn names(variable: &str) -> [String; 2] {
     ["first", "second"].map(|which| format!("{which}.{variable}"))
 }
 
-/// An old mean, with a new number's share in it.
+/// Updates an exponential moving average with new numbers.
 fn towards(old: &Var, new: &Tensor, beta: f64) -> Result<Tensor> {
     let mean = ((old.as_detached_tensor() * beta)? + (new * (1.0 - beta))?)?;
     (mean + FLUSH)? - FLUSH
@@ -208,7 +210,7 @@ mod tests {
         [("p".to_owned(), var)].into()
     }
 
-    /// A step of the variable `p` against the gradients `g` of `sum(p * g)`.
+    /// Performs a step of the variable `p` on the loss `sum(p * g)`, whose gradients are `g`.
     fn step(adam: &mut Adam, settings: &AdamSettings, g: [f32; 2]) {
         let g = Tensor::new(&g, &Device::Cpu).expect("tensor");
         let sum = (adam.variables["p"].as_tensor() * g).and_then(|product| product.sum_all());
@@ -216,8 +218,8 @@ mod tests {
         loss.expect("finite");
     }
 
-    /// `torch.optim.Adam([p], lr=.1, betas=(.5, .9))` on `p = 1, -2`, gradients `(.5, -3)`, `(.25, 4)`:
-    /// the formulas of Kingma and Ba in 64 bits.
+    /// Compares with the formulas of Kingma and Ba in 64 bits: `torch.optim.Adam([p], lr=.1, betas=(.5, .9))` on
+    /// `p = 1, -2` with gradients `(.5, -3)` and `(.25, 4)`.
     #[test]
     fn two_steps_are_those_of_the_published_formulas() {
         let settings = AdamSettings::paper(0.1);

@@ -1,4 +1,4 @@
-//! The network with its optimiser: frames in, predictors out; windows of frames in, learned parameters out.
+//! The network with its optimiser. It computes predictors from frames, and learns from windows of frames.
 
 use crate::adam::{Adam, AdamSettings};
 use crate::batch_norm::moved_statistics;
@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
 
-/// Sizes and step size.
+/// Settings of the autoencoder.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AutoencoderSettings {
@@ -26,16 +26,16 @@ pub struct AutoencoderSettings {
     pub encoding: usize,
     /// Length of the hidden vector h.
     pub hidden: usize,
-    /// Frames in a window that is learned from; all but the first are predicted.
+    /// Number of frames in a training window. All but the first are predicted.
     pub window: usize,
-    /// Frames remembered.
+    /// Capacity of the replay buffer, in frames.
     pub replay: usize,
-    /// The optimiser.
+    /// Settings of the optimiser.
     pub adam: AdamSettings,
 }
 
 impl AutoencoderSettings {
-    /// What the authors ran for their table.
+    /// Returns the settings that the authors used for their table.
     pub fn paper() -> Self {
         Self {
             encoding: 4,
@@ -46,7 +46,7 @@ impl AutoencoderSettings {
         }
     }
 
-    /// The authors' larger network, with the larger of their step sizes.
+    /// Returns the settings of the authors' larger network, with the larger of their learning rates.
     pub fn paper_large() -> Self {
         Self {
             encoding: 16,
@@ -57,8 +57,7 @@ impl AutoencoderSettings {
     }
 }
 
-/// The network, its variables and its optimiser. Clones share the variables: each sees the updates that another
-/// makes.
+/// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
 #[derive(Clone)]
 pub struct Autoencoder {
     settings: AutoencoderSettings,
@@ -71,7 +70,7 @@ pub struct Autoencoder {
 }
 
 impl Autoencoder {
-    /// A new network of a seed, which is also that of its masks and hidden vectors.
+    /// Creates a network. The seed determines its initial variables, dropout masks and initial hidden vectors.
     pub fn new(
         settings: AutoencoderSettings,
         shape: NetworkShape,
@@ -92,42 +91,42 @@ impl Autoencoder {
         })
     }
 
-    /// Sizes and step size.
+    /// Returns the settings, with the current learning rate.
     pub fn settings(&self) -> &AutoencoderSettings {
         &self.settings
     }
 
-    /// Grid, states and observations.
+    /// Returns the sizes: grid, states, observations and vectors.
     pub fn shape(&self) -> &NetworkShape {
         &self.shape
     }
 
-    /// Updates so far.
+    /// Returns the number of updates so far.
     pub fn n_updates(&self) -> u64 {
         self.n_updates
     }
 
-    /// The model.
+    /// Returns the model.
     pub fn network(&self) -> &Network {
         &self.network
     }
 
-    /// Its parameters and running statistics.
+    /// Returns the parameters and running statistics.
     pub fn variables(&self) -> &Variables {
         self.adam.variables()
     }
 
-    /// Changes the step size.
+    /// Sets the learning rate.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// The learned observation matrix `O`, row-major `[observation][state]`; columns sum to one.
+    /// Returns the learned observation matrix `O`, row-major `[observation][state]`. Columns sum to one.
     pub fn observation_matrix(&self) -> Result<Vec<f32>, NetworkError> {
         Ok(numbers_of(&self.network.observation_matrix()?)?)
     }
 
-    /// `h_0 ~ N(0, I)` of a run, the same for a seed.
+    /// Draws `h_0 ~ N(0, I)` for a run. It depends only on the seed.
     pub fn first_hidden(&self) -> Vec<f32> {
         self.draw_hidden(u64::MAX)
     }
@@ -137,26 +136,29 @@ impl Autoencoder {
         (0..self.shape.hidden).map(|_| normal(&mut rng)).collect()
     }
 
-    /// The hidden vector that has read a frame too, after a hidden vector and a window of this one frame.
+    /// Computes the next hidden vector from a hidden vector and a window with a single frame.
     ///
     /// # Errors
-    /// [`NetworkError`] for a number that is not finite, or where the device fails.
+    /// [`NetworkError`] if a number is not finite, or the device fails.
     ///
     /// # Panics
     /// If the frame does not fit the network.
     pub fn advance(&self, window: &Window, hidden: &[f32]) -> Result<Vec<f32>, NetworkError> {
-        assert!(window.fits(&self.shape), "frame: grid or observations");
+        assert!(
+            window.fits(&self.shape),
+            "frame: expected the network's grid and observations"
+        );
         let hidden = self.network.forward(&Pass::inference(window), hidden)?;
         let hidden = numbers_of(&hidden)?;
         if hidden.iter().all(|number| number.is_finite()) {
             Ok(hidden)
         } else {
-            // Softmax and ReLU would make numbers again of what is none.
+            // Check here, because softmax and ReLU could turn NaN into finite numbers.
             Err(self.adam.not_finite("the hidden vector".into()))
         }
     }
 
-    /// The predictor `u` that a hidden vector stands for, `[S, H, W]`.
+    /// Computes the predictor `u` from a hidden vector, `[S, H, W]`.
     pub fn predict(&self, hidden: &[f32]) -> Result<Probabilities, NetworkError> {
         let (height, width) = self.shape.grid.dim();
         let hidden = Tensor::from_slice(hidden, (1, hidden.len()), &self.device)?;
@@ -168,17 +170,20 @@ impl Autoencoder {
         Ok(predictor.expect("invariant: one number per state and cell"))
     }
 
-    /// One step of Adam on a window, with dropout and `h_0` from this update's streams; the loss before it.
-    /// Nothing has changed after an error.
+    /// Performs one step of Adam on a window, with dropout and `h_0` from this update's random streams. Returns the
+    /// loss before the step.
+    ///
+    /// # Errors
+    /// [`NetworkError`] if a number is not finite, or the device fails. An error changes nothing.
     ///
     /// # Panics
-    /// If the window has no targets or does not fit the network.
+    /// If the window has no cells to predict or does not fit the network.
     pub fn update(&mut self, window: &Window) -> Result<f64, NetworkError> {
         let dropout = Dropout::draw(window.len(), self.seed, self.n_updates);
         self.update_with(window, &dropout, &self.draw_hidden(self.n_updates))
     }
 
-    /// [`Self::update`] with given masks and `h_0`.
+    /// Like [`Self::update`], with given masks and `h_0`.
     pub fn update_with(
         &mut self,
         window: &Window,
@@ -186,7 +191,10 @@ impl Autoencoder {
         first: &[f32],
     ) -> Result<f64, NetworkError> {
         assert!(window.has_targets(), "window: expected cells to predict");
-        assert!(window.fits(&self.shape), "window: grid or observations");
+        assert!(
+            window.fits(&self.shape),
+            "window: expected the network's grid and observations"
+        );
         let pass = Pass::training(window, dropout);
         let loss = self.network.loss(&pass, first)?;
         let statistics = moved_statistics(self.variables(), &pass.into_moments())?;
@@ -197,8 +205,8 @@ impl Autoencoder {
         Ok(f64::from(loss))
     }
 
-    /// Everything that a resumed run needs but settings, seed and [`Self::counters`]: variables by PyTorch's
-    /// names, Adam's moments as `adam.first.<name>` and `adam.second.<name>`.
+    /// Returns the tensors of a checkpoint: the variables by PyTorch's names, and Adam's moments as `adam.first.<name>`
+    /// and `adam.second.<name>`. A resumed run also needs the settings, the seed and [`Self::counters`].
     pub fn named_tensors(&self) -> Result<Vec<NamedTensor>, NetworkError> {
         Ok(named_numbers(&self.groups())?)
     }
@@ -207,16 +215,16 @@ impl Autoencoder {
         [("", self.variables()), ("adam.", self.adam.moments())]
     }
 
-    /// Steps of Adam, and updates.
+    /// Returns the number of Adam's steps, and the number of updates.
     pub fn counters(&self) -> [u64; 2] {
         [self.adam.steps(), self.n_updates]
     }
 
-    /// Takes over what [`Self::named_tensors`] and [`Self::counters`] gave, of a network of the same sizes.
-    /// `find` gives the numbers of a name and shape.
+    /// Loads the results of [`Self::named_tensors`] and [`Self::counters`] of a network with the same sizes. `find`
+    /// returns the numbers for a name and a shape.
     ///
     /// # Errors
-    /// As of `find`, or where the device fails; nothing has changed then.
+    /// If `find` or the device fails. An error changes nothing.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -229,10 +237,10 @@ impl Autoencoder {
         Ok(())
     }
 
-    /// Takes over parameters and statistics alone, as of a network trained with PyTorch.
+    /// Loads only the parameters and statistics, for example from a network trained with PyTorch.
     ///
     /// # Errors
-    /// As of `find`, or where the device fails; nothing has changed then.
+    /// If `find` or the device fails. An error changes nothing.
     pub fn load_variables<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,

@@ -1,4 +1,4 @@
-//! Batch normalisation: moments of the window in training, running ones otherwise.
+//! Batch normalisation, with moments of the window in training and running statistics otherwise.
 
 use crate::ops::norm::{EPSILON, Moments};
 use crate::pass::{KeptMoments, Pass};
@@ -7,7 +7,7 @@ use crate::variables::Variables;
 use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
-/// Share of a new window in the running statistics, as in PyTorch.
+/// Weight of a new window in the running statistics, as in PyTorch.
 const MOMENTUM: f64 = 0.1;
 
 /// The parameters and running statistics of one normalisation.
@@ -32,18 +32,18 @@ impl BatchNorm {
         })
     }
 
-    /// Gamma and beta, as our operators take them.
+    /// Returns gamma and beta, for our operators.
     pub(crate) fn weights(&self) -> [&Tensor; 2] {
         [&self.gamma, &self.beta]
     }
 
-    /// The moments to normalise with: in training those of the window.
+    /// Returns the moments to normalise with. In training, these are the moments of the window, which it also stores.
     pub(crate) fn moments(&self, pass: &Pass<'_>, of_window: Moments) -> Result<Moments> {
         if !pass.trains() {
             return Ok(Moments {
                 mean: exact(&self.mean)?,
                 variance: exact(&self.variance)?,
-                // No gradient goes through moments that are given.
+                // With an infinite count, no gradient propagates through the moments.
                 count: f64::INFINITY,
             });
         }
@@ -54,7 +54,7 @@ impl BatchNorm {
         Ok(of_window)
     }
 
-    /// The stock path: normalises `u [frames, channels, rows, cols]`.
+    /// Normalises `u [frames, channels, rows, cols]` with candle's operators.
     pub(crate) fn forward(&self, u: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let channels = u.dim(1)?;
         let per_channel = |tensor: &Tensor| tensor.reshape((1, channels, 1, 1));
@@ -80,7 +80,7 @@ fn exact(tensor: &Tensor) -> Result<Vec<f64>> {
     tensor.flatten_all()?.to_dtype(DType::F64)?.to_vec1()
 }
 
-/// What the running statistics become after a window.
+/// Computes the new running statistics after a window.
 pub(crate) fn moved_statistics(
     variables: &Variables,
     moments: &[KeptMoments],
@@ -88,7 +88,7 @@ pub(crate) fn moved_statistics(
     let mut moved = Vec::with_capacity(2 * moments.len());
     for kept in moments {
         let [mean, variance] = &kept.moments;
-        // PyTorch keeps the variance of the sample, divided by the number of values less one.
+        // PyTorch stores the sample variance, which is divided by the number of values minus one.
         let variance = (variance * (kept.count / (kept.count - 1.0).max(1.0)))?;
         for (what, new) in [("running_mean", mean), ("running_var", &variance)] {
             let name = format!("{}.{what}", kept.norm);

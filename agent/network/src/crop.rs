@@ -1,25 +1,26 @@
-//! Parts of grids, as the network that keeps space takes them.
+//! Crops of grids, the input of the U-Net.
 
 use crate::unet::ALIGNMENT;
 use emberwatch_model::grid::Shape;
 
-/// Cells that a crop has beyond those to predict, on both sides together: what lies further away says little of them.
+/// Margin of a crop around the cells to predict, on both sides together, in cells. Cells further away hardly matter.
 const MARGINS: usize = 24;
 
-/// A part of a grid, with sides that the network's strides divide; it may reach beyond the grid's lower and right edge.
+/// A rectangular part of a grid, with sides that are multiples of [`ALIGNMENT`]. It may extend beyond the grid's lower
+/// and right edges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Crop {
-    /// The row and column of its first cell.
+    /// Row and column of the upper left cell.
     pub first: [usize; 2],
-    /// Rows and columns.
+    /// Number of rows and columns.
     pub sides: [usize; 2],
 }
 
-/// The first and the last row of some cells, then their columns.
+/// The bounding box of some cells: first and last row, then first and last column.
 pub(crate) type Extent = [[usize; 2]; 2];
 
 impl Crop {
-    /// The whole of a grid.
+    /// Returns the crop that contains the whole grid.
     pub fn whole(shape: Shape) -> Self {
         let (height, width) = shape.dim();
         Self {
@@ -28,7 +29,7 @@ impl Crop {
         }
     }
 
-    /// The sides of crops that hold cells of any of some extents.
+    /// Returns sides that fit each of the given extents with margins.
     pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
         let whole = Self::whole(shape);
         [0, 1].map(|axis| {
@@ -38,24 +39,24 @@ impl Crop {
         })
     }
 
-    /// The one of such sides with an extent in its middle, as far as the grid goes.
+    /// Returns the crop with the given sides and an extent at its centre, moved to lie inside the aligned grid.
     pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
         let whole = Self::whole(shape);
         let first = [0, 1].map(|axis| {
             let middle = (extent[axis][0] + extent[axis][1]).div_ceil(2);
-            let most = whole.sides[axis] - sides[axis];
-            let first = middle.saturating_sub(sides[axis] / 2).min(most);
-            // The strides fall as on the whole grid.
+            let max_first = whole.sides[axis] - sides[axis];
+            let first = middle.saturating_sub(sides[axis] / 2).min(max_first);
+            // Align, so that strides sample the same cells as on the whole grid.
             first / ALIGNMENT * ALIGNMENT
         });
         Self { first, sides }
     }
 }
 
-/// The extent of some cells by their row-major index.
+/// Returns the extent of some cells, given by row-major indices.
 ///
 /// # Panics
-/// If there is none.
+/// If there are no cells.
 pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize>) -> Extent {
     let mut extent = [[usize::MAX, 0]; 2];
     for cell in cells.map(|cell| shape.cell(cell)) {

@@ -1,4 +1,4 @@
-//! `Decoder(h)` of paper eq. 9: a seed of few cells, doubled four times, with Dropout2d, normalisation and ReLU
+//! `Decoder(h)` of paper eq. 9. It doubles a seed of a few cells four times, with Dropout2d, normalisation and ReLU
 //! between.
 
 use crate::batch_norm::BatchNorm;
@@ -17,23 +17,23 @@ use crate::variables::uniform_init;
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 
-/// Places of the transposed convolutions and of the normalisations after them in the authors' list of layers.
+/// Indices of the transposed convolutions, and of the normalisations after them, in the authors' list of layers.
 const CONVOLUTIONS: [usize; 5] = [0, 4, 8, 12, 16];
 const NORMS: [usize; 4] = [2, 6, 10, 14];
 
-/// Side of the doublings' kernels.
+/// Side of the kernels that double the size.
 const KERNEL: usize = 4;
 
-/// Hidden vectors to logits of states.
+/// The decoder, from hidden vectors to logits of states.
 #[derive(Debug)]
 pub struct Decoder {
-    /// `[hidden, channels, rows, cols]`: on a single cell, a transposed convolution is a matrix.
+    /// The weights `[hidden, channels, rows, cols]` of a transposed convolution, which on a single cell is a matrix.
     seed: Tensor,
     levels: Vec<Level>,
     operators: Operators,
 }
 
-/// A normalisation, and the doubling behind it.
+/// A normalisation, and the transposed convolution after it.
 #[derive(Debug)]
 struct Level {
     norm: BatchNorm,
@@ -41,7 +41,7 @@ struct Level {
 }
 
 impl Decoder {
-    /// A decoder of these operators.
+    /// Creates a decoder that computes with the given operators.
     pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let [rows, cols] = shape.seed();
         let channels = DECODER_CHANNELS[0];
@@ -75,8 +75,8 @@ impl Decoder {
         })
     }
 
-    /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`, for predictions: through our
-    /// operators goes no gradient.
+    /// Computes the logits of all cells of the padded grid, `[frames, states, rows, cols]`, for predictions only: our
+    /// operators do not propagate gradients here.
     pub fn forward(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let z = self.seed(hidden)?;
         match self.operators {
@@ -92,7 +92,7 @@ impl Decoder {
         }
     }
 
-    /// The loss of what hidden vectors predict (eqs. 8 and 11): that of the window's targets.
+    /// Computes the loss of the predictions from hidden vectors at the window's targets (eqs. 8 and 11).
     pub fn loss(
         &self,
         hidden: &Tensor,
@@ -106,7 +106,8 @@ impl Decoder {
         }
     }
 
-    /// The loss is one number, so its gradients are computed with it, and the logits are no tensor.
+    /// Computes the loss and its gradients together, because the loss is a single number. No tensor of logits is
+    /// needed.
     fn own_loss(&self, z: &Tensor, observation: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let all = Mask::all(pass.window.len(), self.n_states()?);
         let layers = self.layers(pass, &all)?;
@@ -134,7 +135,7 @@ impl Decoder {
         last.kernels.dim(1)
     }
 
-    /// The doublings; `all` is the dropout behind the last.
+    /// Returns the layers that double the size. `all` is the mask after the last layer, which keeps all channels.
     fn layers<'a>(&'a self, pass: &'a Pass<'_>, all: &'a Mask) -> Result<Vec<Layer<'a>>> {
         let (_, _, mut rows, mut cols) = self.seed.dims4()?;
         let levels = self.levels.iter().enumerate();
@@ -167,7 +168,7 @@ impl Decoder {
             .collect()
     }
 
-    /// The first maps, `[frames, channels, rows, cols]`.
+    /// Computes the first maps, `[frames, channels, rows, cols]`.
     fn seed(&self, hidden: &Tensor) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
@@ -185,7 +186,7 @@ impl Decoder {
     }
 }
 
-/// Channels, rows and columns of the last result.
+/// Returns the channels, rows and columns of the last result.
 fn last_map(layers: &[Layer<'_>]) -> [usize; 3] {
     let last = layers.last().expect("invariant: four levels");
     last.conv.sizes.large

@@ -1,23 +1,23 @@
-//! Where a network computes.
+//! The device that a network computes on.
 
 use candle_core::{Device, Error, Result as CandleResult};
 use std::fmt;
 use std::str::FromStr;
 use thiserror::Error as ThisError;
 
-/// A kind of device, as on the command line.
+/// A kind of device, parsed from its name on the command line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum DeviceKind {
-    /// The processor, with our operators.
+    /// The CPU, with our operators.
     #[default]
     Cpu,
     /// The first NVIDIA GPU, with candle's operators.
     Cuda,
-    /// The first GPU of a Mac, with candle's operators.
+    /// The first Apple GPU, with candle's operators.
     Metal,
 }
 
-/// Why a device cannot be used.
+/// The reason why a device cannot be used.
 #[derive(Debug, ThisError)]
 #[error("{0}")]
 pub struct DeviceError(String);
@@ -26,7 +26,7 @@ impl DeviceKind {
     /// Opens the first device of the kind.
     ///
     /// # Errors
-    /// [`DeviceError`] for one that this program or machine lacks.
+    /// [`DeviceError`] if this program has no support for the device, or the device cannot be opened.
     pub fn open(self) -> Result<Device, DeviceError> {
         let (is_built, device): (_, fn(usize) -> CandleResult<Device>) = match self {
             Self::Cpu => return Ok(Device::Cpu),
@@ -35,11 +35,11 @@ impl DeviceKind {
         };
         if !is_built {
             return Err(DeviceError(format!(
-                "device {self}: expected a program that was built for it, got one without: build it with \
+                "device {self}: this program was built without support for it: rebuild it with \
                  `cargo build --release --features {self}`"
             )));
         }
-        let fails = |error: Error| format!("device {self}: expected one that works, got: {error}");
+        let fails = |error: Error| format!("device {self}: cannot open it: {error}");
         device(0).map_err(|error| DeviceError(fails(error)))
     }
 }

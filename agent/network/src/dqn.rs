@@ -1,9 +1,9 @@
-//! The DQN of paper section III.E (eqs. 16 to 21): what the next path is for.
+//! The DQN of paper section III.E (eqs. 16 to 21), which chooses the objective of the next path.
 //!
-//! It reads the autoencoder's hidden vector and gives the value of each objective, or it reads the numbers of each
-//! candidate path and gives that path's value ([`DqnShape`]). Each transition has its own discount: at the end of an
-//! episode, returns are of fewer steps ([`Track::end`]). The DQN stays on the CPU: its layers are so small that a copy to a
-//! device and back takes longer.
+//! It computes the value of each objective from the autoencoder's hidden vector, or the value of each candidate path
+//! from that path's features ([`DqnShape`]). Each transition has its own discount, because returns span fewer steps at
+//! the end of an episode ([`Track::end`]). The DQN always runs on the CPU: its layers are so small that copies to a
+//! device and back would take longer.
 
 mod learner;
 mod state;

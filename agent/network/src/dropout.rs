@@ -1,7 +1,7 @@
-//! Dropout2d: in training, each frame loses each channel with probability one half.
+//! Dropout2d: in training, each channel of each frame is dropped with probability one half.
 //!
-//! Kept channels are scaled by two, so that their mean stays. Our operators skip lost channels, so a mask
-//! is a list of channels as well as numbers to multiply with.
+//! Kept channels are scaled by two, which preserves the mean. A mask holds factors for candle's operators, and a list
+//! of kept channels for our operators, which skip dropped channels.
 
 use crate::shape::{DECODER_CHANNELS, ENCODER_CHANNELS};
 use candle_core::{DType, Device, Result, Tensor};
@@ -9,20 +9,20 @@ use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::sync::Arc;
 
-/// The channels kept and lost in each frame behind one layer. Clones share them.
+/// The kept and dropped channels of each frame after one layer. Clones share the data.
 #[derive(Debug, Clone)]
 pub struct Mask {
     scale: f32,
     channels: usize,
-    /// Per frame and channel: `scale`, or zero where it is lost.
+    /// The factor of each frame and channel: `scale`, or 0 for a dropped channel.
     scales: Arc<[f32]>,
     kept: Arc<[usize]>,
-    /// Where each frame's kept channels begin, and where the last one's end.
+    /// The start of each frame's kept channels, and the end of the last frame's.
     starts: Arc<[usize]>,
 }
 
 impl Mask {
-    /// Channels are kept where `keeps(frame, channel)`, and multiplied with `scale`.
+    /// Creates a mask that keeps the channels with `keeps(frame, channel)`, and multiplies them by `scale`.
     pub fn new(
         n_frames: usize,
         channels: usize,
@@ -48,54 +48,54 @@ impl Mask {
         }
     }
 
-    /// Every channel of every frame is kept as it is.
+    /// Creates a mask that keeps all channels of all frames unscaled.
     pub fn all(n_frames: usize, channels: usize) -> Self {
         Self::new(n_frames, channels, 1.0, |_, _| true)
     }
 
-    /// Number of frames.
+    /// Returns the number of frames.
     pub fn n_frames(&self) -> usize {
         self.starts.len() - 1
     }
 
-    /// What kept channels are multiplied with.
+    /// Returns the factor of kept channels.
     pub fn scale(&self) -> f32 {
         self.scale
     }
 
-    /// Number of channels.
+    /// Returns the number of channels.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// Channels that a frame keeps, ascending.
+    /// Returns the channels that a frame keeps, in ascending order.
     pub fn kept(&self, frame: usize) -> &[usize] {
         &self.kept[self.starts[frame]..self.starts[frame + 1]]
     }
 
-    /// Whether no frame loses a channel.
+    /// Returns whether all frames keep all channels.
     pub fn keeps_all(&self) -> bool {
         self.kept.len() == self.scales.len()
     }
 
-    /// All scales, `[frames, channels]`.
+    /// Returns the factors of all channels, `[frames, channels]`.
     pub fn tensor(&self, dtype: DType, device: &Device) -> Result<Tensor> {
         let dims = (self.n_frames(), self.channels);
         Tensor::from_slice(&self.scales, dims, device)?.to_dtype(dtype)
     }
 }
 
-/// The masks of one window behind all seven layers that have dropout.
+/// The masks of one window for all seven layers with dropout.
 #[derive(Debug, Clone)]
 pub struct Dropout {
     /// After the encoder's convolutions.
     pub encoder: [Mask; ENCODER_CHANNELS.len()],
-    /// After the decoder's transposed convolutions but the last.
+    /// After all transposed convolutions of the decoder but the last.
     pub decoder: [Mask; DECODER_CHANNELS.len()],
 }
 
 impl Dropout {
-    /// Every channel kept, as outside training.
+    /// Returns masks that keep all channels, as in inference.
     pub fn off(n_frames: usize) -> Self {
         Self {
             encoder: ENCODER_CHANNELS.map(|channels| Mask::all(n_frames, channels)),
@@ -103,7 +103,7 @@ impl Dropout {
         }
     }
 
-    /// The fair coins of an update under a seed.
+    /// Draws the masks of an update, with a fair coin for each frame and channel.
     pub fn draw(n_frames: usize, seed: u64, update: u64) -> Self {
         let mut rng = stream(seed, Purpose::Dropout, update);
         let mut toss = |channels: usize| {
@@ -134,7 +134,7 @@ mod tests {
             assert!(scaled.eq(mask.kept(frame).iter().copied()));
             n_kept += mask.kept(frame).len();
         }
-        // 25,600 fair coins: a deviation of 400 is five standard deviations.
+        // For 25,600 fair coins, a deviation of 400 is five standard deviations.
         assert!(n_kept.abs_diff(12_800) < 400, "{n_kept}");
     }
 

@@ -1,5 +1,4 @@
-//! `Encoder(y)` of paper eq. 9: three convolutions, each with Dropout2d, ReLU and normalisation, and a linear
-//! layer.
+//! `Encoder(y)` of paper eq. 9: three convolutions, each with Dropout2d, ReLU and normalisation, and a linear layer.
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
@@ -15,11 +14,11 @@ use crate::variables::uniform_init;
 use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::{Linear, Module, VarBuilder};
 
-/// Places of the convolutions and of the normalisations in the authors' list of layers.
+/// Indices of the convolutions and of the normalisations in the authors' list of layers.
 const STAGES: [(usize, usize); 3] = [(0, 3), (4, 7), (8, 11)];
 const LINEAR: usize = 13;
 
-/// Frames to encodings.
+/// The encoder, from frames to encodings.
 #[derive(Debug)]
 pub struct Encoder {
     stages: Vec<Stage>,
@@ -36,7 +35,7 @@ struct Stage {
 }
 
 impl Encoder {
-    /// An encoder of these operators.
+    /// Creates an encoder that computes with the given operators.
     pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let stages = STAGES.iter().zip(shape.convolutions());
         let stages = stages.map(|(places, shape)| Stage::new(vb, *places, shape));
@@ -51,7 +50,7 @@ impl Encoder {
         })
     }
 
-    /// The encodings of all frames, `[frames, encoding]`.
+    /// Computes the encodings of all frames, `[frames, encoding]`.
     pub fn forward(&self, pass: &Pass<'_>) -> Result<Tensor> {
         match self.operators {
             Operators::Stock => self.linear.forward(&self.stock(pass)?),
@@ -59,7 +58,8 @@ impl Encoder {
         }
     }
 
-    /// Maps are `[frames, channels, rows, cols]`.
+    /// Computes the flattened features `[frames, features]` with candle's operators. Maps are
+    /// `[frames, channels, rows, cols]`.
     fn stock(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let first = &self.stages[0];
         let (dtype, device) = (first.weight.dtype(), first.weight.device());
@@ -76,7 +76,7 @@ impl Encoder {
         x.flatten_from(1)
     }
 
-    /// The same, with the linear layer as one more convolution, whose kernel is as large as the map.
+    /// Computes the encodings with our operators. The linear layer is a convolution whose kernel covers the whole map.
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_frames, encoding) = (pass.window.len(), self.linear.weight().dim(0)?);
         let all = Mask::all(n_frames, encoding);
@@ -115,7 +115,10 @@ impl Encoder {
         let [channels, rows, cols] = large;
         let weight = self.linear.weight();
         let weight = weight.reshape((encoding, channels, rows, cols))?;
-        let bias = self.linear.bias().expect("invariant: made with a bias");
+        let bias = self
+            .linear
+            .bias()
+            .expect("invariant: the linear layer has a bias");
         layers.push(layer(sizes, &weight, bias, norm, &all)?);
         let moments =
             |index: usize, of_window| self.stages[index - 1].norm.moments(pass, of_window);
@@ -137,7 +140,7 @@ impl Encoder {
     }
 }
 
-/// A convolution with `weight [channels out, channels in, rows, cols]`.
+/// Creates the layer of a convolution with `weight [channels out, channels in, rows, cols]`.
 fn layer<'a>(
     sizes: Sizes,
     weight: &Tensor,

@@ -1,34 +1,34 @@
-//! What may go wrong in a network.
+//! Errors of the networks.
 
 use thiserror::Error;
 
-/// A number that is not finite: training must stop.
+/// A number that is not finite, after which training must stop.
 #[derive(Debug, Clone, Error, PartialEq)]
-#[error("update {update}: expected finite numbers, got one that is not in {tensor}")]
+#[error("update {update}: expected finite numbers, got NaN or infinity in {tensor}")]
 pub struct NotFinite {
-    /// Updates before this one.
+    /// Number of updates before the failed one.
     pub update: u64,
-    /// The tensor, a gradient's with the prefix `gradient of`; or the loss.
+    /// Name of the tensor. Gradients have the prefix `gradient of`, and the loss is named `loss`.
     pub tensor: String,
 }
 
-/// Why a step or an update failed; nothing has changed then.
+/// The reason why a step or an update failed. A failure changes nothing.
 #[derive(Debug, Clone, Error, PartialEq)]
 pub enum NetworkError {
-    /// The numbers.
+    /// A number is not finite.
     #[error(transparent)]
     NotFinite(#[from] NotFinite),
-    /// A saved transition of another DQN.
+    /// A saved transition does not fit the DQN.
     #[error("dqn.transitions: {at}: expected {expected}, got {got}")]
     Transition {
-        /// Which one, the oldest first.
+        /// Index of the transition, the oldest first.
         at: usize,
-        /// What it must have.
+        /// The required properties.
         expected: String,
-        /// What it has.
+        /// The transition's properties.
         got: String,
     },
-    /// The device, as for want of memory.
+    /// The device failed, for example because it ran out of memory.
     #[error("the network's device: {0}")]
     Device(String),
 }

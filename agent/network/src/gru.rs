@@ -7,7 +7,7 @@ use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::sigmoid;
 
-/// A GRU, gates in torch's order: reset, update, candidate.
+/// A GRU with the gates in PyTorch's order: reset, update, candidate.
 #[derive(Debug)]
 pub struct Gru {
     w_ih: Tensor,
@@ -35,13 +35,17 @@ impl Gru {
         })
     }
 
-    /// The hidden vectors after each of the inputs `[steps, inputs]`, `[steps, hidden]`; `first` is the one
-    /// before them.
+    /// Computes the hidden vector after each input, `[steps, hidden]`, from inputs `[steps, inputs]`. `first` is the
+    /// hidden vector before them.
     ///
     /// # Panics
     /// If `first` has another length.
     pub fn forward(&self, x: &Tensor, first: &[f32]) -> Result<Tensor> {
-        assert_eq!(first.len(), self.w_hh.dim(1)?, "hidden vector: length");
+        assert_eq!(
+            first.len(),
+            self.w_hh.dim(1)?,
+            "hidden vector: expected the GRU's length"
+        );
         let inputs = x.matmul(&self.w_ih.t()?)?.broadcast_add(&self.b_ih)?;
         match (self.operators, inputs.dtype()) {
             (Operators::Own, _) => gru_sequence(&inputs, &self.w_hh, &self.b_hh, first),
@@ -50,7 +54,7 @@ impl Gru {
         }
     }
 
-    /// One copy there, one back.
+    /// Computes the sequence on the CPU, with one copy in each direction.
     fn through_the_cpu(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
         let all = [inputs, &self.w_hh, &self.b_hh];
         let flat = all.map(|tensor| tensor.flatten_all());

@@ -1,14 +1,15 @@
-//! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11)
-//! and the DQN (section III.E); and the neural belief, which learns by the autoencoder's loss and keeps space.
+//! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11) and the DQN
+//! (section III.E). The crate also has a neural belief, which minimises the autoencoder's loss and preserves the grid.
 //!
-//! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`]
-//! (its updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`]. Layers take their
-//! variables from a `VarBuilder` of [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence, decoder and U-Net have an
-//! operator of ours with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on
-//! GPUs.
+//! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`] (its
+//! updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`].
 //!
-//! To add a layer, make it in `Network::new` and call it in `Network::forward`; `examples/second_gru.rs`
-//! does so outside.
+//! Layers create their variables through a `VarBuilder` from [`variables`], and candle's `backward()` computes all
+//! gradients. Encoder, recurrence, decoder and U-Net each have two implementations: our operators with hand-written
+//! kernels and gradients (`ops`), and candle's stock operators, which also run on GPUs.
+//!
+//! To add a layer, create it in `Network::new` and call it in `Network::forward`. `examples/second_gru.rs` shows how to
+//! add one outside this crate.
 
 mod adam;
 mod autoencoder;

@@ -12,7 +12,7 @@ use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::softmax;
 
-/// Encoder, recurrence, decoder and observation matrix, by the authors' names.
+/// The network: encoder, recurrence, decoder and observation matrix. Its variables have the authors' names.
 #[derive(Debug)]
 pub struct Network {
     encoder: Encoder,
@@ -22,7 +22,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// A network whose layers ask `vb` for their variables.
+    /// Creates a network, whose layers request their variables from `vb`.
     pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, operators: Operators) -> Result<Self> {
         let (n_observations, n_states) = (shape.n_observations, shape.n_states);
         let gru = vb.pp("rnn_layer");
@@ -34,32 +34,32 @@ impl Network {
         })
     }
 
-    /// The hidden vectors that have read each frame, `[frames, hidden]`; `first` is the one before. A layer
-    /// more is a line more here.
+    /// Computes the hidden vector after each frame, `[frames, hidden]`. `first` is the hidden vector before the window.
+    /// An additional layer needs one more line here.
     pub fn forward(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
         let x = self.encoder.forward(pass)?;
         self.gru.forward(&x, first)
     }
 
-    /// The loss of what the window's frames say about their successors (eqs. 8 and 11).
+    /// Computes the loss of the predictions of each frame from the frames before it (eqs. 8 and 11).
     pub fn loss(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, first)?;
         self.decoder.loss(&hidden, &self.observation, pass)
     }
 
-    /// The predictors that hidden vectors stand for, `[frames, states, rows, cols]` of the padded grid.
+    /// Computes the predictors from hidden vectors, `[frames, states, rows, cols]` of the padded grid.
     pub fn predict(&self, pass: &Pass<'_>, hidden: &Tensor) -> Result<Tensor> {
         softmax(&self.decoder.forward(hidden, pass)?, 1)
     }
 
-    /// The observation matrix `O`, `[observations, states]`; each column sums to one.
+    /// Returns the observation matrix `O`, `[observations, states]`. Each column sums to one.
     pub fn observation_matrix(&self) -> Result<Tensor> {
         self.observation.matrix()
     }
 }
 
 impl NetworkShape {
-    /// How many numbers the network's parameters and statistics have; none of them is made.
+    /// Counts the numbers in the network's parameters and statistics without allocating them.
     pub fn n_numbers(&self) -> usize {
         count_numbers(|vb| Network::new(&vb, self, Operators::Own))
     }
@@ -72,8 +72,8 @@ mod tests {
 
     #[test]
     fn numbers_are_counted_before_they_are_made() {
-        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192
-        // + 768, observation matrix 9; four numbers per channel for each of the seven normalisations.
+        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192 + 768,
+        // observation matrix 9, and four numbers for each of the 296 channels of the seven normalisations.
         assert_eq!(shape(64).n_numbers(), 197_181 + 4 * 296);
         assert!(shape(4096).n_numbers() > 40_000_000);
     }

@@ -1,8 +1,8 @@
-//! The neural belief: a network that keeps space, from what was seen to the distribution of what will be seen, learned
-//! from masked frames alone.
+//! The neural belief: a network on the grid that predicts the distribution of each cell's next observation from past
+//! observations. It learns from masked frames alone.
 //!
-//! The idea and the loss are the dynamic autoencoder's (paper section III.B, eqs. 8 and 11); in the place of one hidden
-//! vector for the whole grid, each cell remembers what it showed and when.
+//! The idea and the loss come from the dynamic autoencoder (paper section III.B, eqs. 8 and 11). Instead of one hidden
+//! vector for the whole grid, each cell stores its last observations and their ages.
 
 use crate::adam::{Adam, AdamSettings};
 use crate::crop::{Crop, extent};
@@ -19,7 +19,8 @@ use rayon::prelude::*;
 use std::fmt;
 use std::sync::Arc;
 
-/// Adam's decays (PyTorch's defaults), and the norm at which gradients are clipped.
+/// Settings of Adam: PyTorch's default decay rates, and the norm at which gradients are clipped. Each update sets the
+/// learning rate.
 const ADAM: AdamSettings = AdamSettings {
     learning_rate: 0.0,
     betas: [0.9, 0.999],
@@ -27,19 +28,19 @@ const ADAM: AdamSettings = AdamSettings {
     max_norm: Some(1.0),
 };
 
-/// Least probability of an observation, so that none is ruled out.
+/// Minimum probability of an observation, so that no observation is impossible.
 const LEAST: f64 = 1e-6;
 
-/// Cells of a batch: 16 grids of 64 x 64, or 40 crops of 40 x 40.
+/// Maximum number of cells in a batch: 16 grids of 64 x 64, or 40 crops of 40 x 40.
 const BATCH_CELLS: usize = 65_536;
 
 /// Maximum number of cells in one pass of predictions with candle's operators: 64 grids of 64 x 64.
 const PASS_CELLS: usize = 262_144;
 
-/// What was seen in a world, and what the filter that is corrected predicts there, `[O, H, W]`.
+/// The sightings of a world, and the prediction of the filter that the network corrects, `[O, H, W]`, if there is one.
 pub type Seen<'a> = (&'a Sightings, Option<&'a Probabilities>);
 
-/// The network, its variables and its optimiser. Clones share the variables: each sees the updates that another makes.
+/// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
 #[derive(Clone)]
 pub struct NeuralBelief {
     n_observations: usize,
@@ -50,19 +51,20 @@ pub struct NeuralBelief {
     adam: Adam,
 }
 
-/// A frame to predict, and what was seen before it.
+/// A training example: a frame to predict, and the sightings before it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lesson {
-    /// What was seen before.
+    /// The sightings before the frame.
     pub before: Sightings,
-    /// The cells that the frame shows, by row-major index, and their values; at least one.
+    /// The row-major index and the value of each observed cell, at least one.
     pub frame: Vec<(usize, u8)>,
-    /// What the filter that the network corrects predicted of each of these cells, `[cells, O]`; empty without one.
+    /// The prediction for these cells by the filter that the network corrects, `[cells, O]`. Empty if there is no
+    /// filter.
     pub base: Vec<f32>,
 }
 
 impl NeuralBelief {
-    /// A new network of a seed, for worlds with so many observations.
+    /// Creates a network with initial parameters from a seed, for worlds with `n_observations` observations.
     pub fn new(n_observations: usize, seed: u64, device: &Device) -> Result<Self, NetworkError> {
         let operators = Operators::on(device, DType::F32);
         Self::with_operators(n_observations, seed, device, operators)
@@ -93,30 +95,30 @@ impl NeuralBelief {
         Arc::as_ptr(&self.unet).addr()
     }
 
-    /// Number of values that a cell may show.
+    /// Returns the number of values that a cell may show.
     pub fn n_observations(&self) -> usize {
         self.n_observations
     }
 
-    /// Updates so far.
+    /// Returns the number of updates so far.
     pub fn n_updates(&self) -> u64 {
         self.adam.steps()
     }
 
-    /// Its parameters.
+    /// Returns the parameters.
     pub fn variables(&self) -> &Variables {
         self.adam.variables()
     }
 
-    /// Its parameters as plain numbers.
+    /// Returns the parameters as plain numbers.
     pub fn parameters(&self) -> Result<Vec<NamedTensor>, NetworkError> {
         Ok(named_numbers(&[("", self.variables())])?)
     }
 
-    /// Takes over what [`Self::parameters`] gave. `find` gives the numbers of a name and shape.
+    /// Loads the result of [`Self::parameters`]. `find` returns the numbers for a name and a shape.
     ///
     /// # Errors
-    /// As of `find`, or where the device fails; nothing has changed then.
+    /// If `find` or the device fails. An error changes nothing.
     pub fn set_parameters<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -125,11 +127,11 @@ impl NeuralBelief {
         Ok(set(&changes).map_err(NetworkError::from)?)
     }
 
-    /// The distribution of what each cell will show in the present step, `[O, H, W]`. `base`: that of the filter that it
-    /// corrects.
+    /// Predicts the distribution of each cell's observation in the current step, `[O, H, W]`. `base` is the prediction
+    /// of the filter that the network corrects.
     ///
     /// # Errors
-    /// For a number that is not finite, or where the device fails.
+    /// If a number is not finite, or the device fails.
     pub fn predict(
         &self,
         sightings: &Sightings,
@@ -139,17 +141,17 @@ impl NeuralBelief {
         Ok(all.swap_remove(0))
     }
 
-    /// Predicts several worlds of one grid like [`Self::predict`]. Either all worlds have a base, or none has. Our operators
-    /// predict one world per thread, candle's operators many worlds in one pass.
+    /// Predicts several worlds with the same grid, like [`Self::predict`]. Either all worlds have a base, or none has.
+    /// Our operators predict one world per thread, and candle's operators many worlds in one pass.
     ///
     /// # Errors
-    /// As of [`Self::predict`].
+    /// Like [`Self::predict`].
     pub fn predict_all(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
         let Some((first, _)) = worlds.first() else {
             return Ok(Vec::new());
         };
         let passes = match self.operators {
-            // Handing it to another thread costs more than it gains.
+            // For a single world, another thread costs more than it saves.
             Operators::Own if worlds.len() == 1 => {
                 vec![self.predict_in_one_pass(worlds)].into_iter().collect()
             }
@@ -160,8 +162,8 @@ impl NeuralBelief {
                     .collect()
             }
             Operators::Stock => {
-                let most = (PASS_CELLS / first.shape().n_cells()).max(1);
-                let passes = worlds.chunks(most);
+                let max_worlds = (PASS_CELLS / first.shape().n_cells()).max(1);
+                let passes = worlds.chunks(max_worlds);
                 passes
                     .map(|worlds| self.predict_in_one_pass(worlds))
                     .collect()
@@ -198,11 +200,11 @@ impl NeuralBelief {
         Ok(worlds.map(world).collect())
     }
 
-    /// The mean cross-entropy of what the cells of lessons of one grid show (paper eqs. 8 and 11). The network reads crops
-    /// around these cells, and no more lessons than fit into a batch.
+    /// Computes the mean cross-entropy of the cells of some lessons with the same grid (paper eqs. 8 and 11). The
+    /// network reads crops around these cells. Lessons beyond the size of a batch are ignored.
     ///
     /// # Panics
-    /// If there is no lesson, or one without cells, or if some have a base and others have none.
+    /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
     pub fn loss(&self, lessons: &[Lesson]) -> Result<Tensor, NetworkError> {
         let shape = lessons[0].before.shape();
         let extents = lessons.iter().map(|it| extent(shape, it.cells()));
@@ -230,7 +232,7 @@ impl NeuralBelief {
             .collect();
         assert!(
             base.is_empty() || base.len() == cells.len() * self.n_observations,
-            "lessons: expected a base of all cells, or none"
+            "lessons: expected a base for all cells or for no cell"
         );
         Ok(match self.operators {
             Operators::Own => self.loss_at(&images, &cells, values, &base)?,
@@ -257,7 +259,8 @@ impl NeuralBelief {
         log_p.mean_all()?.neg()
     }
 
-    /// Computes the same loss from all cells, weighted by whether they were observed, without gather or scatter.
+    /// Computes the same loss as a weighted sum over all cells, without gather or scatter. Unobserved cells have weight
+    /// 0.
     fn loss_of_all(
         &self,
         images: &Tensor,
@@ -289,7 +292,10 @@ impl NeuralBelief {
         (log_softmax(&logits, 1)? * weights)?.sum_all()
     }
 
-    /// One step of Adam on lessons; the loss before it. Nothing has changed after an error.
+    /// Performs one step of Adam on lessons, and returns the loss before it.
+    ///
+    /// # Errors
+    /// If a number is not finite, or the device fails. An error changes nothing.
     pub fn update(&mut self, learning_rate: f32, lessons: &[Lesson]) -> Result<f64, NetworkError> {
         let loss = self.loss(lessons)?;
         let settings = AdamSettings {
@@ -299,8 +305,8 @@ impl NeuralBelief {
         Ok(f64::from(self.adam.update(&settings, &loss)?))
     }
 
-    /// Everything that a resumed run needs but [`Self::n_updates`]: parameters, and Adam's moments as
-    /// `adam.first.<name>` and `adam.second.<name>`.
+    /// Returns the tensors of a checkpoint: the parameters, and Adam's moments as `adam.first.<name>` and
+    /// `adam.second.<name>`. A resumed run also needs [`Self::n_updates`].
     pub fn named_tensors(&self) -> Result<Vec<NamedTensor>, NetworkError> {
         Ok(named_numbers(&self.groups())?)
     }
@@ -309,10 +315,11 @@ impl NeuralBelief {
         [("", self.variables()), ("adam.", self.adam.moments())]
     }
 
-    /// Takes over what [`Self::named_tensors`] gave after so many updates. `find` gives the numbers of a name and shape.
+    /// Loads the result of [`Self::named_tensors`] after `n_updates` updates. `find` returns the numbers for a name and
+    /// a shape.
     ///
     /// # Errors
-    /// As of `find`, or where the device fails; nothing has changed then.
+    /// If `find` or the device fails. An error changes nothing.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -324,6 +331,7 @@ impl NeuralBelief {
         Ok(())
     }
 
+    /// Returns the logarithms of probabilities, each at least [`LEAST`].
     fn logarithms<'a>(
         &self,
         probabilities: impl Iterator<Item = &'a f32>,
@@ -333,7 +341,7 @@ impl NeuralBelief {
         Tensor::from_vec(logarithms.collect(), shape.into(), &self.device)
     }
 
-    /// What the network reads of crops of these sides, `[crops, features, rows, cols]`.
+    /// Computes the network's input for crops with the given sides, `[crops, features, rows, cols]`.
     fn images<'a>(
         &self,
         crops: impl Iterator<Item = (&'a Sightings, &'a Crop)>,

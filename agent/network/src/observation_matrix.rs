@@ -1,4 +1,4 @@
-//! The observation matrix `O`, and the loss of paper eqs. 8 and 11 behind it.
+//! The observation matrix `O`, and the loss of paper eqs. 8 and 11, which depends on it.
 
 use crate::ops::cell_loss::LOG_FLOOR;
 use crate::window::Window;
@@ -6,15 +6,15 @@ use candle_core::{Result, Tensor};
 use candle_nn::ops::softmax;
 use candle_nn::{Init, VarBuilder};
 
-/// `P(y | x)`, learned.
+/// The learned observation matrix `P(y | x)`.
 #[derive(Debug)]
 pub struct ObservationMatrix {
-    /// Before the softmax of each column, `[observations, states]`.
+    /// The logits, `[observations, states]`. The softmax runs over each column.
     weight: Tensor,
 }
 
 impl ObservationMatrix {
-    /// A matrix for so many observations and states.
+    /// Creates a matrix for the given numbers of observations and states.
     pub fn new(vb: &VarBuilder<'_>, n_observations: usize, n_states: usize) -> Result<Self> {
         let (mean, stdev) = (0.0, 1.0);
         let dims = (n_observations, n_states);
@@ -22,28 +22,27 @@ impl ObservationMatrix {
         Ok(Self { weight })
     }
 
-    /// The matrix, `[observations, states]`; each column sums to one.
+    /// Returns the matrix, `[observations, states]`. Each column sums to one.
     pub fn matrix(&self) -> Result<Tensor> {
         softmax(&self.weight, 0)
     }
 
-    /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[frames, states,
-    /// rows, cols]`, by stock operators: the sum over all cells with a weight each, so that nothing is gathered or
-    /// scattered.
+    /// Computes the mean cross-entropy of the cells to predict in a window, from logits `[frames, states, rows, cols]`,
+    /// with candle's operators. It is a weighted sum over all cells, so that nothing is gathered or scattered.
     pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
         let matrix = self.matrix()?;
         let u = softmax(logits, 1)?.permute((0, 2, 3, 1))?;
         let q = u.reshape(((), matrix.dim(1)?))?.matmul(&matrix.t()?)?;
         let [hits, misses] = weights(logits, window, &q)?;
         let hit = (hits * (&q + LOG_FLOOR)?.log()?)?;
-        // Rounding may take q above one.
+        // Rounding may make q larger than 1.
         let miss = (misses * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
         (hit + miss)?.sum_all()
     }
 }
 
-/// What the logarithms of each cell's observations count in the loss, if they were seen and if they were not,
-/// `[cells, observations]` as `q`.
+/// Returns the weights of the terms `log q` and `log(1 - q)` in the loss, each `[cells, observations]` like `q`. The
+/// first are nonzero for the observed values, the second for the other values of observed cells.
 fn weights(logits: &Tensor, window: &Window, q: &Tensor) -> Result<[Tensor; 2]> {
     let (_, _, rows, cols) = logits.dims4()?;
     let (n, weight) = (q.dim(1)?, -1.0 / window.all_targets().len() as f32);

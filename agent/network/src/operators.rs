@@ -1,20 +1,22 @@
-//! Which operators a network computes with.
+//! The choice between our operators and candle's.
 
 use candle_core::{DType, Device};
 
-/// The implementation of the networks' operators. Both give the same results up to rounding.
+/// The implementation of the networks' operators. Both compute the same results, up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operators {
     /// Hand-written kernels and gradients (`ops`), for 32-bit floats on the CPU.
     Own,
-    /// Candle's, arranged for a device that is slow to copy from and slow to scatter: losses are sums over all cells with
-    /// a weight each, and an update copies few numbers back. For any device and any floats. The recurrence alone
-    /// goes through the CPU: a thousand steps of a few numbers are a thousand times a dozen launches.
+    /// Candle's operators, for any device and any floats.
+    ///
+    /// They suit devices on which copies to the host and scatter operations are slow. Losses are weighted sums over all
+    /// cells, and an update copies only a few numbers back. Only the recurrence runs on the CPU, because on a GPU each
+    /// of its thousand small steps would take a dozen kernel launches.
     Stock,
 }
 
 impl Operators {
-    /// The fastest that compute there.
+    /// Returns the fastest operators for a device and a number type.
     pub fn on(device: &Device, dtype: DType) -> Self {
         if device.is_cpu() && dtype == DType::F32 {
             Self::Own

@@ -1,14 +1,14 @@
-//! What the layers are told about one pass over a window.
+//! The context of one pass over a window, which all layers share.
 
 use crate::dropout::{Dropout, Mask};
 use crate::window::Window;
 use candle_core::Tensor;
 use std::cell::RefCell;
 
-/// One pass: the frames, and either the dropout of training or none.
+/// One pass over a window of frames, for training with dropout or for inference without.
 ///
-/// In training, normalisations use the moments of the window and leave them here; afterwards they use the
-/// running ones.
+/// In training, normalisations use the moments of the window, and store them here. In inference, they use the running
+/// statistics.
 #[derive(Debug)]
 pub struct Pass<'a> {
     /// The frames.
@@ -18,22 +18,22 @@ pub struct Pass<'a> {
     moments: RefCell<Vec<KeptMoments>>,
 }
 
-/// The moments of a window behind one normalisation.
+/// The moments of a window at one normalisation.
 #[derive(Debug)]
 pub(crate) struct KeptMoments {
     /// The name of the normalisation.
     pub(crate) norm: String,
-    /// Mean and variance of each channel; the variance is the population's.
+    /// Mean and population variance of each channel.
     pub(crate) moments: [Tensor; 2],
-    /// Values per channel.
+    /// Number of values per channel.
     pub(crate) count: f64,
 }
 
 impl<'a> Pass<'a> {
-    /// An update's pass.
+    /// Creates the pass of an update.
     ///
     /// # Panics
-    /// If the window is empty, or a mask is of another number of frames.
+    /// If the window is empty, or a mask has another number of frames.
     pub fn training(window: &'a Window, dropout: &Dropout) -> Self {
         let masks = dropout.encoder.iter().chain(&dropout.decoder);
         let fits = masks
@@ -41,7 +41,7 @@ impl<'a> Pass<'a> {
             .all(|mask| mask.n_frames() == window.len());
         assert!(
             fits && !window.is_empty(),
-            "window: no frame, or other frames than the masks"
+            "window: expected at least one frame, and as many frames as the masks"
         );
         Self {
             window,
@@ -51,7 +51,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// An estimator's pass, with running statistics and every channel.
+    /// Creates the pass of an estimator, with running statistics and without dropout.
     pub fn inference(window: &'a Window) -> Self {
         Self {
             window,
@@ -76,13 +76,13 @@ impl<'a> Pass<'a> {
     pub(crate) fn keep_moments(&self, norm: &str, moments: [Tensor; 2], count: f64) {
         self.moments.borrow_mut().push(KeptMoments {
             norm: norm.into(),
-            // No gradient goes through them.
+            // Gradients do not propagate through the running statistics.
             moments: moments.map(|tensor| tensor.detach()),
             count,
         });
     }
 
-    /// The window's moments.
+    /// Returns the moments that the normalisations stored.
     pub(crate) fn into_moments(self) -> Vec<KeptMoments> {
         self.moments.into_inner()
     }

@@ -1,4 +1,4 @@
-//! The rolling memory of frames that the network learns from (paper section III.B).
+//! The replay buffer of frames that the autoencoder learns from (paper section III.B).
 
 use crate::window::Window;
 use emberwatch_model::frame::Frame;
@@ -7,19 +7,19 @@ use rand_chacha::rand_core::Rng;
 use std::collections::VecDeque;
 use std::ops::Range;
 
-/// The last frames of one robot, oldest first, in tracks without gaps.
+/// The last frames of one robot, the oldest first. A *track* is a sequence of frames without gaps.
 #[derive(Debug, Clone)]
 pub struct FrameReplay {
     capacity: usize,
     frames: VecDeque<Frame>,
-    /// Frames that were ever remembered.
+    /// Number of frames that were ever added.
     n_pushed: u64,
-    /// The numbers of frames with which tracks begin.
+    /// The number of the first frame of each track but the oldest.
     begins: VecDeque<u64>,
 }
 
 impl FrameReplay {
-    /// An empty memory of `capacity` frames. (The authors': 5,000.)
+    /// Creates an empty buffer for `capacity` frames. The authors use 5,000.
     pub fn new(capacity: usize) -> Self {
         Self {
             capacity,
@@ -29,12 +29,12 @@ impl FrameReplay {
         }
     }
 
-    /// Begins a new track: no window holds frames before and after this.
+    /// Starts a new track. No window spans frames of two tracks.
     pub fn begin(&mut self) {
         self.begins.push_back(self.n_pushed);
     }
 
-    /// Remembers a frame, and forgets the oldest if there are too many.
+    /// Adds a frame. Removes the oldest if the buffer is full.
     pub fn push(&mut self, frame: Frame) {
         if self.frames.len() == self.capacity {
             self.frames.pop_front();
@@ -47,12 +47,12 @@ impl FrameReplay {
         }
     }
 
-    /// The number of the oldest frame that is remembered.
+    /// Returns the number of the oldest frame in the buffer.
     fn n_oldest(&self) -> u64 {
         self.n_pushed - self.frames.len() as u64
     }
 
-    /// Where windows of some length may start, as ranges of places.
+    /// Returns the possible starts of windows with some length, as ranges of indices.
     fn starts(&self, length: usize) -> Vec<Range<usize>> {
         let oldest = self.n_oldest();
         let begins = self.begins.iter().map(|begin| (begin - oldest) as usize);
@@ -62,29 +62,29 @@ impl FrameReplay {
         tracks.filter(|starts| !starts.is_empty()).collect()
     }
 
-    /// The frames, oldest first.
+    /// Returns the frames, the oldest first.
     pub fn frames(&self) -> impl Iterator<Item = &Frame> {
         self.frames.iter()
     }
 
-    /// The places of frames with which tracks begin, but for the oldest frame's.
+    /// Returns the index of the first frame of each track but the oldest.
     pub fn tracks(&self) -> impl Iterator<Item = u64> {
         let oldest = self.n_oldest();
         self.begins.iter().map(move |begin| begin - oldest)
     }
 
-    /// Frames remembered.
+    /// Returns the number of frames.
     pub fn len(&self) -> usize {
         self.frames.len()
     }
 
-    /// Whether nothing is remembered.
+    /// Returns whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
 
-    /// Consecutive frames of one track from a random one on: those of an update under a seed. None while
-    /// no track has `length` frames.
+    /// Returns `length` consecutive frames of one track, from a random start that depends on the seed and the update.
+    /// Returns `None` if no track has `length` frames.
     pub fn window(&self, length: usize, seed: u64, update: u64) -> Option<Window> {
         let starts: Vec<usize> = self.starts(length).into_iter().flatten().collect();
         let mut rng = stream(seed, Purpose::Replay, update);
@@ -132,7 +132,7 @@ mod tests {
             }
             replay.push(frame.clone());
         }
-        // Places 0 to 9 hold frames 20 to 29.
+        // Indices 0 to 9 hold frames 20 to 29.
         assert_eq!(replay.starts(1), [0..1, 1..5, 5..6, 6..10]);
         assert_eq!(replay.starts(4), [1..2, 6..7]);
         assert!(replay.window(5, 0, 0).is_none());

@@ -1,27 +1,27 @@
-//! The sizes of every layer, from the grid and the numbers of states and observations.
+//! The sizes of all layers, computed from the grid and the numbers of states and observations.
 //!
-//! The authors' network is for 64 x 64 cells. Ours fits any grid by two rules that leave theirs as it is:
+//! The authors' network is for 64 x 64 cells. Ours fits any grid by two rules, which do not change that network:
 //!
-//! - The decoder doubles a seed of `ceil(H / 16) x ceil(W / 16)` cells four times; what lies beyond the
-//!   grid's lower and right edge is cut off. (64 x 64: 4 x 4.)
-//! - The encoder sees a grid of that padded size, unseen beyond the edge, and no kernel is larger than
-//!   its input.
+//! - The decoder doubles a seed of `ceil(H / 16) x ceil(W / 16)` cells four times (4 x 4 cells for 64 x 64). The result
+//!   beyond the grid's lower and right edges is cut off.
+//! - The encoder reads a grid of that padded size, without observations beyond the edges. Kernels are reduced to the
+//!   size of their input.
 
 use emberwatch_model::grid::Shape;
 
-/// Channels after each convolution of the encoder.
+/// Number of channels after each convolution of the encoder.
 pub const ENCODER_CHANNELS: [usize; 3] = [32, 16, 8];
 
-/// Channels after each transposed convolution of the decoder but the last.
+/// Number of channels after each transposed convolution of the decoder but the last.
 pub const DECODER_CHANNELS: [usize; 4] = [128, 64, 32, 16];
 
 /// Kernel side and stride of the encoder's convolutions.
 const ENCODER_KERNELS: [(usize, usize); 3] = [(8, 4), (4, 2), (3, 1)];
 
-/// Cells of the padded grid per side of a seed cell: four doublings.
+/// Side of a seed cell in cells of the padded grid, after four doublings.
 const SEED_CELL: usize = 16;
 
-/// Everything that decides a tensor's size.
+/// The sizes from which all tensor shapes follow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NetworkShape {
     /// The grid, H x W.
@@ -39,33 +39,33 @@ pub struct NetworkShape {
 /// One convolution of the encoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ConvShape {
-    /// Channels of its input.
+    /// Number of input channels.
     pub channels_in: usize,
-    /// Channels of its output.
+    /// Number of output channels.
     pub channels_out: usize,
-    /// Rows and columns.
+    /// Rows and columns of the kernel.
     pub kernel: [usize; 2],
-    /// Of rows and columns.
+    /// The stride of rows and columns.
     pub stride: usize,
-    /// Rows and columns.
+    /// Rows and columns of the input.
     pub input: [usize; 2],
-    /// Rows and columns.
+    /// Rows and columns of the output.
     pub output: [usize; 2],
 }
 
 impl NetworkShape {
-    /// The decoder's first cells, `ceil(H / 16) x ceil(W / 16)`.
+    /// Returns the size of the decoder's seed, `ceil(H / 16) x ceil(W / 16)`.
     pub fn seed(&self) -> [usize; 2] {
         let (height, width) = self.grid.dim();
         [height.div_ceil(SEED_CELL), width.div_ceil(SEED_CELL)]
     }
 
-    /// Rows and columns of the padded grid, what the decoder's doublings give.
+    /// Returns the rows and columns of the padded grid, the size of the decoder's output.
     pub fn padded(&self) -> [usize; 2] {
         self.seed().map(|side| side * SEED_CELL)
     }
 
-    /// The encoder's convolutions.
+    /// Returns the encoder's convolutions.
     pub fn convolutions(&self) -> [ConvShape; 3] {
         let (mut input, mut channels_in) = (self.padded(), self.n_observations);
         std::array::from_fn(|stage| {
@@ -84,7 +84,7 @@ impl NetworkShape {
         })
     }
 
-    /// Length of the encoder's last map, flattened.
+    /// Returns the length of the encoder's last map, flattened.
     pub fn features(&self) -> usize {
         let [.., last] = self.convolutions();
         last.channels_out * last.output[0] * last.output[1]

@@ -1,45 +1,45 @@
-//! What was last seen in each cell of a world and when: all that the neural belief is computed from.
+//! The last observations of each cell of a world, and their ages: the input of the neural belief.
 
 use crate::crop::Crop;
 use emberwatch_model::frame::{Frame, UNOBSERVED};
 use emberwatch_model::grid::Shape;
 use serde::{Deserialize, Serialize};
 
-/// Bytes of a [`Sighting`] in [`Sightings::to_bytes`].
+/// Number of bytes of a [`Sighting`] in [`Sightings::to_bytes`].
 const SIGHTING_BYTES: usize = 5;
 
-/// Ages from which on a sighting counts as this old, steps.
+/// Maximum age of a sighting in steps. Older sightings have the same features.
 const OLDEST: usize = 4000;
 
-/// Steps in which a sighting fades to `1/e`: what is seen changes quickly in some worlds and slowly in others.
+/// Numbers of steps in which the freshness of a sighting decays to `1/e`. Some worlds change quickly, others slowly.
 const FADING_STEPS: [f32; 3] = [10.0, 60.0, 400.0];
 
-/// The value that a cell showed, if it was seen, and in which step.
+/// The value that a cell showed, and the step in which it was seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sighting {
-    /// [`UNOBSERVED`] before the first.
+    /// The observed value, or [`UNOBSERVED`] if the cell was not seen.
     pub value: u8,
-    /// On the count of [`Sightings`].
+    /// The step by the counter of [`Sightings`].
     pub step: u32,
 }
 
-/// The last and the last but one sighting of each cell.
+/// The two latest sightings of each cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sightings {
     shape: Shape,
     step: u32,
-    /// Row-major.
+    /// The last sighting of each cell and the one before, row-major.
     cells: Vec<[Sighting; 2]>,
 }
 
-/// Numbers that depend on ages, from 0 to [`OLDEST`].
+/// The features of cells, with a table of the numbers that depend on ages from 0 to [`OLDEST`].
 #[derive(Debug, Clone)]
 pub struct Features {
     n_observations: usize,
     ages: Vec<Age>,
 }
 
-/// What an age is to the network.
+/// The features of an age.
 #[derive(Debug, Clone, Copy)]
 struct Age {
     freshness: [f32; 3],
@@ -54,7 +54,7 @@ impl Sighting {
 }
 
 impl Sightings {
-    /// Before the first frame.
+    /// Creates the sightings before the first frame.
     pub fn new(shape: Shape) -> Self {
         Self {
             shape,
@@ -63,19 +63,19 @@ impl Sightings {
         }
     }
 
-    /// The grid.
+    /// Returns the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// Takes in a frame of the present step.
+    /// Records the frame of the current step.
     pub fn see(&mut self, frame: &Frame) {
         for (cell, value) in frame.observed() {
             self.see_cell(cell, value);
         }
     }
 
-    /// Takes in what a cell shows in the present step.
+    /// Records the value that a cell shows in the current step.
     pub fn see_cell(&mut self, cell: usize, value: u8) {
         let step = self.step;
         let [last, before] = &mut self.cells[cell];
@@ -83,18 +83,18 @@ impl Sightings {
         *last = Sighting { value, step };
     }
 
-    /// Goes on to the next step.
+    /// Advances to the next step.
     pub fn pass(&mut self) {
         self.step = self.step.saturating_add(1);
     }
 
-    /// The value that a cell showed last, and how many steps ago; `None` before.
+    /// Returns the value that a cell showed last, and its age in steps, or `None` if the cell was never seen.
     pub fn last(&self, cell: usize) -> Option<(u8, u32)> {
         let [last, _] = self.cells[cell];
         (last.value != UNOBSERVED).then(|| (last.value, self.step - last.step))
     }
 
-    /// Whether they are of a grid and of so many observations.
+    /// Returns whether the sightings fit a grid and a number of observations.
     pub fn are_of(&self, shape: Shape, n_observations: usize) -> bool {
         let fits = |seen: &Sighting| {
             let is_value = usize::from(seen.value) < n_observations || seen.value == UNOBSERVED;
@@ -105,7 +105,8 @@ impl Sightings {
             && self.cells.iter().flatten().all(fits)
     }
 
-    /// Little-endian: the step as `u32`; of each cell the last sighting and the one before, as value and step.
+    /// Encodes the sightings as little-endian numbers: the current step as `u32`, then for each cell the last sighting
+    /// and the one before, each as its value (`u8`) and step (`u32`).
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = self.step.to_le_bytes().to_vec();
         for seen in self.cells.iter().flatten() {
@@ -115,7 +116,8 @@ impl Sightings {
         bytes
     }
 
-    /// Of such bytes; `None` if they are not those of a grid with so many observations.
+    /// Decodes the bytes of [`Self::to_bytes`], or returns `None` if they do not fit the grid and the number of
+    /// observations.
     pub fn from_bytes(bytes: &[u8], shape: Shape, n_observations: usize) -> Option<Self> {
         let (step, seen) = bytes.split_first_chunk()?;
         let (seen, []) = seen.as_chunks::<SIGHTING_BYTES>() else {
@@ -141,7 +143,7 @@ impl Sightings {
 }
 
 impl Features {
-    /// For worlds with so many observations.
+    /// Creates the table for worlds with `n_observations` observations.
     pub fn new(n_observations: usize) -> Self {
         let age = |age: usize| Age {
             freshness: FADING_STEPS.map(|steps| (-(age as f32) / steps).exp()),
@@ -153,14 +155,17 @@ impl Features {
         }
     }
 
-    /// Numbers of a cell: of each observation its freshness when it was seen last, by three measures, and when it was
-    /// seen before that; whether the cell was never seen, the logarithm of its age, whether it lies inside the grid, and
-    /// how long ago it was seen before the last time.
+    /// Returns the number of features of a cell, which are in this order:
+    ///
+    /// - one-hot codes of the last observation, weighted by its freshness on three time scales (3 per observation)
+    /// - a one-hot code of the observation before, weighted by its freshness (1 per observation)
+    /// - whether the cell was never seen, the logarithm of its age, whether it is inside the grid, and the freshness of
+    ///   the observation before on the longest time scale
     pub fn n_channels(n_observations: usize) -> usize {
         4 * n_observations + 4
     }
 
-    /// Writes the features of a crop's cells, `[features, rows, cols]`, over zeros.
+    /// Writes the features of a crop's cells, `[features, rows, cols]`, to a slice of zeros.
     pub fn write(&self, sightings: &Sightings, crop: &Crop, to: &mut [f32]) {
         let [height, width] = crop.sides;
         let (rows, cols) = sightings.shape.dim();
@@ -175,7 +180,7 @@ impl Features {
         }
     }
 
-    /// Calls `to(feature, number)` for those that are not zero.
+    /// Calls `to(feature, number)` for each nonzero feature of a cell.
     fn write_cell(&self, sightings: &Sightings, cell: usize, mut to: impl FnMut(usize, f32)) {
         let n = self.n_observations;
         let [last, before] = sightings.cells[cell].map(|seen| {
@@ -207,7 +212,7 @@ mod tests {
         Shape::new(1, 3).expect("test shape")
     }
 
-    /// Cell 0 shows 1, then after five steps 0; cell 1 shows 2 then; cell 2 nothing.
+    /// Cell 0 shows 1, and after five steps 0. Cell 1 shows 2 after five steps. Cell 2 is never seen.
     fn sightings() -> Sightings {
         let mut sightings = Sightings::new(shape());
         let frame = |values| Frame::from_bytes(shape(), 3, values).expect("test frame");
@@ -260,7 +265,7 @@ mod tests {
             assert_eq!(read(&bytes[..cut]), None);
         }
         let mut late = bytes;
-        late[5] = 16; // A step after the present one.
+        late[5] = 16; // A step after the current one.
         assert_eq!(read(&late), None);
     }
 }

@@ -1,8 +1,8 @@
-//! A small U-Net: from the features of cells to the logits of what will be seen there.
+//! A small U-Net, which maps the features of cells to the logits of their next observations.
 //!
-//! Images are `[batch, channels, rows, cols]`, with sides that [`ALIGNMENT`] divides. Two strides of 2, and back by nearest
-//! doubling with what was there before; residual layers, no normalisation. The head begins at zero: all observations
-//! alike.
+//! Images are `[batch, channels, rows, cols]`, with sides that are multiples of [`ALIGNMENT`]. Two convolutions with
+//! stride 2 halve the image. Nearest-neighbour upsampling with skip connections doubles it again. There are residual
+//! layers and no normalisation. The head starts at zero, so all observations are equally probable at first.
 
 use crate::operators::Operators;
 use crate::ops::doubled_sum::DoubledSum;
@@ -11,16 +11,16 @@ use crate::variables::uniform_init;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
-/// What sides of images are multiples of: two strides of 2.
+/// The sides of images are multiples of this number, because of two strides of 2.
 pub const ALIGNMENT: usize = 4;
 
-/// Channels at full, half and quarter size.
+/// Number of channels at full, half and quarter size.
 const CHANNELS: [usize; 3] = [16, 24, 32];
 
-/// A cell and its eight neighbours, in the order of a kernel's taps.
+/// Number of cells in a 3 x 3 patch, in the order of a kernel's taps.
 const AROUND: usize = 9;
 
-/// Features of cells to logits of observations.
+/// The network, from features of cells to logits of observations.
 #[derive(Debug)]
 pub struct UNet {
     full: Layer,
@@ -41,7 +41,7 @@ struct Layer {
 }
 
 impl UNet {
-    /// A network whose layers ask `vb` for their variables.
+    /// Creates a network, whose layers request their variables from `vb`.
     pub fn new(
         vb: &VarBuilder<'_>,
         n_features: usize,
@@ -80,7 +80,7 @@ impl UNet {
         })
     }
 
-    /// The logits of all cells, `[batch, observations, rows, cols]`.
+    /// Computes the logits of all cells, `[batch, observations, rows, cols]`.
     pub fn logits(&self, x: &Tensor) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
@@ -88,8 +88,8 @@ impl UNet {
         self.head.forward(&last.residual(&full)?)
     }
 
-    /// The logits of some cells, `[cells, observations]`: the last layers compute no others. A cell is its image, row and
-    /// column.
+    /// Computes the logits of the given cells, `[cells, observations]`. The last layers skip all other cells. A cell is
+    /// given by its image, row and column.
     pub fn logits_at(&self, x: &Tensor, cells: &[[usize; 3]]) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
@@ -110,7 +110,7 @@ impl UNet {
         self.head.dense(&(last.dense(&patches)?.relu()? + middle)?)
     }
 
-    /// What lies before the last doubling: features at full and at half size.
+    /// Computes the inputs of the last upsampling: features at full size and at half size.
     fn features(&self, x: &Tensor) -> Result<[Tensor; 2]> {
         let full = self.full.forward(x)?;
         let [strided, same] = &self.down[0];
@@ -123,14 +123,14 @@ impl UNet {
         Ok([full, same.residual(&half)?])
     }
 
-    /// An image whose cells are repeated, the sum with one of twice its size, and ReLU.
+    /// Doubles the size of an image by repeating its cells, adds an image of that size, and applies ReLU.
     fn doubled_sum(&self, small: &Tensor, large: &Tensor) -> Result<Tensor> {
         if self.head.operators == Operators::Own {
             return small.apply_op2(large, DoubledSum);
         }
         let (batch, channels, rows, cols) = small.dims4()?;
-        // Not `upsample_nearest2d`, whose gradient candle has for whole batches of one stride alone, nor `index_select`, whose
-        // gradient has one thread for each channel on a GPU.
+        // Candle limits the gradient of `upsample_nearest2d` to whole batches with one stride, and its gradient of
+        // `index_select` uses only one GPU thread per channel.
         let x = small.reshape((batch * channels, rows, 1, cols))?;
         let x = x.broadcast_as((batch * channels, rows, 2, cols))?;
         let x = x.reshape((batch * channels * 2 * rows, cols, 1))?;
@@ -168,7 +168,7 @@ impl Layer {
         }
     }
 
-    /// The same by candle's layers.
+    /// Computes [`Self::forward`] with candle's operators.
     fn stock(&self, x: &Tensor) -> Result<Tensor> {
         let ImageConv {
             kernel,
@@ -190,14 +190,14 @@ impl Layer {
         }
     }
 
-    /// Of patches as rows, before ReLU.
+    /// Applies the convolution, without ReLU, to patches `[patches, kernel * kernel * channels in]`.
     fn dense(&self, patches: &Tensor) -> Result<Tensor> {
         patches.matmul(&self.weight)?.broadcast_add(&self.bias)
     }
 }
 
-/// The patches of some cells: where their cells lie among those of all images, at full and half size, and which lie
-/// inside.
+/// The indices of the cells in 3 x 3 patches around some cells, among the cells of all images, at full and at half
+/// size. `is_inside` is 1 for cells inside the image and 0 for others.
 struct Around {
     full: Vec<u32>,
     half: Vec<u32>,

@@ -1,5 +1,5 @@
-//! Named variables whose first values come from our own seeded streams: candle's generator on the CPU
-//! cannot be seeded.
+//! Named variables with initial values from our own seeded streams, because candle's random numbers on the CPU cannot
+//! be seeded.
 
 use candle_core::{DType, Device, Result, Shape, Tensor, Var};
 use candle_nn::init::NormalOrUniform;
@@ -12,13 +12,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Variables by name, in the order of names.
+/// Variables by name, in alphabetical order.
 pub type Variables = BTreeMap<String, Var>;
 
-/// Makes a model of layers that ask a [`VarBuilder`] for their variables; returns it and these.
+/// Builds a model whose layers request their variables from a [`VarBuilder`]. Returns the model and its variables.
 ///
-/// A variable's first value depends on the seed and its own name alone, so a new layer leaves the others'
-/// as they were.
+/// A variable's initial value depends only on the seed and its own name. So an added layer does not change the initial
+/// values of other layers.
 pub fn build<M>(
     seed: u64,
     dtype: DType,
@@ -40,18 +40,18 @@ pub fn build<M>(
     Ok((model, named.collect()))
 }
 
-/// Whether a name is that of a running statistic, which no gradient moves.
+/// Returns whether a name denotes a running statistic, which has no gradient.
 pub(crate) fn is_statistic(name: &str) -> bool {
     name.ends_with("running_mean") || name.ends_with("running_var")
 }
 
-/// As PyTorch's layers begin: uniform in plus minus one over the root of `fan_in`.
+/// Returns the initialisation of PyTorch's layers: uniform within ±`1 / sqrt(fan_in)`.
 pub(crate) fn uniform_init(fan_in: usize) -> Init {
     let up = 1.0 / (fan_in.max(1) as f64).sqrt();
     Init::Uniform { lo: -up, up }
 }
 
-/// How many numbers a model's variables have; none of them is made.
+/// Counts the numbers in a model's variables without allocating them.
 pub(crate) fn count_numbers<M>(model: impl FnOnce(VarBuilder<'static>) -> Result<M>) -> usize {
     let count = Arc::new(AtomicUsize::new(0));
     let backend = Box::new(Counting(count.clone()));
@@ -60,18 +60,18 @@ pub(crate) fn count_numbers<M>(model: impl FnOnce(VarBuilder<'static>) -> Result
     count.load(Ordering::Relaxed)
 }
 
-/// Uniform in [0, 1), in steps of 2^-24.
+/// Draws a uniform number from `0..1`, in steps of 2^-24.
 pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f32 {
     (rng.next_u32() >> 8) as f32 / (1 << 24) as f32
 }
 
-/// Standard normal, by Box and Muller.
+/// Draws a standard normal number by the Box-Muller method.
 pub(crate) fn normal(rng: &mut ChaCha8Rng) -> f32 {
     let radius = (-2.0 * (1.0 - uniform(rng)).ln()).sqrt();
     radius * (std::f32::consts::TAU * uniform(rng)).cos()
 }
 
-/// By which a uniform distribution's bound exceeds its standard deviation.
+/// Ratio of the bound of a symmetric uniform distribution to its standard deviation.
 const SQRT_3: f64 = 1.732_050_807_568_877_2;
 
 struct Seeded {
@@ -121,7 +121,7 @@ impl SimpleBackend for Seeded {
             let mut variables = variables.expect("invariant: no layer panicked");
             variables.insert(name.to_owned(), Var::from_tensor(&first)?);
         }
-        // What is there already is shared, if it has this shape.
+        // A variable that exists already is shared, if its shape is the same.
         self.variables.get(shape, name, init, dtype, device)
     }
 
@@ -141,7 +141,7 @@ struct Counting(Arc<AtomicUsize>);
 impl SimpleBackend for Counting {
     fn get(&self, s: Shape, _: &str, _: Init, dtype: DType, device: &Device) -> Result<Tensor> {
         self.0.fetch_add(s.elem_count(), Ordering::Relaxed);
-        // One number, read everywhere.
+        // A single number with a broadcast shape.
         Tensor::zeros((), dtype, device)?.broadcast_as(s)
     }
 
@@ -154,7 +154,7 @@ impl SimpleBackend for Counting {
     }
 }
 
-/// FNV-1a (Fowler, Noll, Vo).
+/// Computes the FNV-1a hash (Fowler, Noll, Vo).
 fn hash(name: &str) -> u64 {
     name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
@@ -192,11 +192,11 @@ mod tests {
             mean: 0.0,
             stdev: 2.0,
         };
-        // 1,000 draws: a deviation of 0.1 in 2 is more than two of its standard deviations.
+        // With 1,000 draws, a deviation of 0.1 from 2 is more than two standard deviations.
         let spread = root_of_mean_square(numbers(1, "a", normal));
         assert!((1.9..2.1).contains(&spread), "{spread}");
         assert_eq!(largest(numbers(1, "a", Init::Const(3.0))), 3.0);
-        // ReLU's gain is the root of two, and the fan of a vector 1.
+        // The gain of ReLU is the square root of 2, and a vector has a fan of 1.
         let kaiming = numbers(1, "a", candle_nn::init::DEFAULT_KAIMING_NORMAL);
         let spread = root_of_mean_square(kaiming);
         assert!((1.34..1.49).contains(&spread), "{spread}");

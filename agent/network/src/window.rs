@@ -1,4 +1,4 @@
-//! Consecutive frames as lists of what was seen, the form in which the network reads them.
+//! Consecutive frames as lists of observations: the input of the network.
 
 use crate::shape::NetworkShape;
 use candle_core::{DType, Device, Result, Tensor};
@@ -13,16 +13,16 @@ pub(crate) struct Visit {
     pub(crate) value: u8,
 }
 
-/// Consecutive frames: all are read, and all but the first predicted. Clones share them.
+/// Consecutive frames. The network reads all frames, and predicts all but the first. Clones share the data.
 #[derive(Debug, Clone)]
 pub struct Window {
     visits: Arc<[Visit]>,
-    /// Where each frame's visits begin, and where the last ends.
+    /// The start of each frame's visits, and the end of the last frame's.
     starts: Arc<[usize]>,
 }
 
 impl Window {
-    /// A window of frames of one grid.
+    /// Creates a window from frames of one grid.
     pub fn new<'a>(frames: impl IntoIterator<Item = &'a Frame>) -> Self {
         let (mut visits, mut starts) = (Vec::new(), vec![0]);
         for frame in frames {
@@ -38,7 +38,7 @@ impl Window {
         Self { visits, starts }
     }
 
-    /// So many frames that show nothing.
+    /// Creates a window of frames without observations.
     pub(crate) fn blank(n_frames: usize) -> Self {
         Self {
             visits: Arc::new([]),
@@ -46,22 +46,23 @@ impl Window {
         }
     }
 
-    /// Number of frames.
+    /// Returns the number of frames.
     pub fn len(&self) -> usize {
         self.starts.len() - 1
     }
 
-    /// Whether it holds no frame.
+    /// Returns whether the window has no frame.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The visited cells of one frame, in row-major order.
+    /// Returns the visited cells of one frame, in row-major order.
     pub(crate) fn visits(&self, frame: usize) -> &[Visit] {
         &self.visits[self.starts[frame]..self.starts[frame + 1]]
     }
 
-    /// What is to be predicted after a frame: the visited cells of the next one, none after the last.
+    /// Returns the cells to predict after a frame: the visited cells of the next frame, or no cells after the last
+    /// frame.
     pub(crate) fn targets(&self, frame: usize) -> &[Visit] {
         if frame + 1 < self.len() {
             self.visits(frame + 1)
@@ -70,17 +71,17 @@ impl Window {
         }
     }
 
-    /// The targets of all frames: the terms of the loss.
+    /// Returns the cells to predict after all frames, which are the terms of the loss.
     pub(crate) fn all_targets(&self) -> &[Visit] {
         &self.visits[self.starts[1.min(self.len())]..]
     }
 
-    /// Whether there is anything to predict.
+    /// Returns whether there are cells to predict.
     pub fn has_targets(&self) -> bool {
         !self.all_targets().is_empty()
     }
 
-    /// Whether each visit is a cell and an observation of the network.
+    /// Returns whether all cells and observations exist in the network.
     pub(crate) fn fits(&self, shape: &NetworkShape) -> bool {
         let (height, width) = shape.grid.dim();
         self.visits.iter().all(|visit| {
@@ -90,7 +91,8 @@ impl Window {
         })
     }
 
-    /// The frames as `[frames, observations, rows, cols]` of the padded grid; zero where nothing was seen.
+    /// Returns a one-hot encoding of the frames, `[frames, observations, rows, cols]` of the padded grid. Cells without
+    /// an observation are 0.
     pub(crate) fn one_hot(
         &self,
         n_observations: usize,

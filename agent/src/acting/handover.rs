@@ -1,5 +1,5 @@
-//! How an agent goes on with what another believed: from the belief that it left with the server, or
-//! else from the frames that the server keeps.
+//! How an agent continues from a former agent's belief: with the belief that it left with the server, or otherwise with
+//! the frames that the server keeps.
 
 use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
@@ -9,11 +9,11 @@ use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;
 
-/// Frames that are recalled before the lease is renewed: much less than the shortest lease takes.
+/// Number of frames to recall before the lease is renewed. Recalling them takes much less than the shortest lease.
 const RENEW_AFTER: u64 = 500;
 
-/// Gives an agent what is known of its world before the present frame; returns whether that frame is in it already,
-/// and the belief about X_{k+1}. `number`: that of its first robot.
+/// Restores an agent's belief from what the server keeps. Returns true if the belief already includes the present
+/// frame, and is about X_{k+1}. `number` is the agent's first robot on the server.
 pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result<bool> {
     if take_over_left(client, number, rollout)? {
         return Ok(true);
@@ -25,10 +25,10 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
     let first = first_kept(client, number, step)?;
     for past in first..step {
         if (past - first) % RENEW_AFTER == 0 {
-            client.renew()?; // Recalling is no use of the lease.
+            client.renew()?; // Recalling does not renew the lease.
         }
         if !recall(client, number, rollout, past)? {
-            client.renew()?; // Says so if the robot is another's by now.
+            client.renew()?; // Fails if another client holds the robot by now.
             break;
         }
     }
@@ -37,19 +37,19 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
             robot = number,
             first,
             step,
-            "going on from the frames that were kept"
+            "the belief was restored from the frames that the server keeps"
         );
     }
     Ok(false)
 }
 
-/// Brings an agent that missed steps to what its world shows now; its belief is then the posterior.
+/// Updates the belief of an agent that missed steps up to the present frame. The belief is then the posterior.
 pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
     let missed = rollout.step() + 1..seen.observation.world.step;
     if rollout.agent.policy().belief.input == Input::Frames {
         for past in missed {
             if !recall(client, number, rollout, past)? {
-                rollout.agent.predict(); // Nothing is known of what it saw, if anything.
+                rollout.agent.predict(); // The server does not keep the step's frame.
             }
         }
     }
@@ -57,7 +57,7 @@ pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: S
     Ok(())
 }
 
-/// Gives an agent the frame of an earlier step; returns whether it is kept.
+/// Updates an agent's belief with the frame of an earlier step. Returns false if the server does not keep it.
 fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) -> Result<bool> {
     let Ok(seen) = client.recall(number..number + 1, step) else {
         return Ok(false);
@@ -70,8 +70,7 @@ fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) ->
     Ok(true)
 }
 
-/// Gives an agent the belief that was left for it, if there is one; whatever it believed before is
-/// forgotten.
+/// Replaces an agent's belief with the belief that was left for it. Returns whether there was one that fits.
 pub fn take_over_left(
     client: &mut Client,
     number: u32,
@@ -89,13 +88,13 @@ pub fn take_over_left(
         tracing::info!(
             robot = number,
             step,
-            "going on from the belief that was left"
+            "the belief was taken over from the former agent"
         );
     }
     Ok(is_taken)
 }
 
-/// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one of a robot.
+/// Leaves an agent's belief about X_{k+1}, after its last observation, for a robot's next agent.
 pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
     let present = rollout.observation().world;
     let agent = &rollout.agent;
@@ -103,20 +102,20 @@ pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), 
         return Ok(());
     };
     match leave_belief(client, number, &present, &kind, &bytes) {
-        // A server that keeps no beliefs, or none that is so long.
+        // The server keeps no beliefs, or none of this length.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
             message,
             ..
         }) => {
-            tracing::debug!("the belief is not left: {message}");
+            tracing::debug!("the server does not keep the belief: {message}");
             Ok(())
         }
         left => left,
     }
 }
 
-/// The first step from which on all frames are kept; the present one where a server keeps none.
+/// Returns the first step from which the server keeps all frames, or the present step if it keeps none.
 fn first_kept(client: &mut Client, number: u32, step: u64) -> Result<u64, ConnectionError> {
     match client.recall(number..number + 1, 0) {
         Ok(_) => Ok(0),

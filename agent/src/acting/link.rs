@@ -1,4 +1,4 @@
-//! The way to one world of a server: paths out, what the agent sees back.
+//! The link to one world of a server: sends paths, and receives what the agent sees.
 
 use crate::client::truth::TruthFeed;
 use anyhow::Result;
@@ -9,29 +9,29 @@ use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// The lease on some robots of a world, and the hidden states of that world for policies that are told them.
+/// The lease on some robots of a world, and the world's hidden states for oracles.
 pub struct Link {
     pub client: Client,
     truth: Option<TruthFeed>,
-    /// The numbers of the robots that the agent plans for, the client's among them.
+    /// Numbers of the robots that the agent plans for, including the client's.
     robots: Range<u32>,
 }
 
-/// A link that gives up waiting for a step when it is time to stop.
+/// A link that stops waiting for a step when `stop` is set.
 pub struct Stoppable<'a> {
     link: &'a mut Link,
     stop: &'a AtomicBool,
 }
 
 impl Link {
-    /// `is_told`: whether the agent sees the hidden states, too.
+    /// `sees_truth`: whether the agent also receives the hidden states.
     pub fn new(
         client: Client,
         instance: &Instance,
         robots: Range<u32>,
-        is_told: bool,
+        sees_truth: bool,
     ) -> Result<Self> {
-        let truth = is_told.then(|| TruthFeed::open(instance, client.shape()));
+        let truth = sees_truth.then(|| TruthFeed::open(instance, client.shape()));
         Ok(Self {
             truth: truth.transpose()?,
             client,
@@ -39,12 +39,12 @@ impl Link {
         })
     }
 
-    /// As an environment, until `stop` is set.
+    /// Returns the link as an environment that stops waiting when `stop` is set.
     pub fn until<'a>(&'a mut self, stop: &'a AtomicBool) -> Stoppable<'a> {
         Stoppable { link: self, stop }
     }
 
-    /// What the world shows now.
+    /// Returns what the agent sees of the world's present state.
     pub fn observe(&mut self) -> Result<Seen> {
         let observations = self.client.observe(self.robots.clone())?;
         self.with_truth(observations)

@@ -1,4 +1,4 @@
-//! What an agent is told to do on one world of a running server, and whether that server can be acted on.
+//! The mission of an agent on one world of a running server, and checks that the server fits it.
 
 use crate::client::info::connect;
 use anyhow::{Result, bail, ensure};
@@ -20,35 +20,35 @@ use std::time::Duration;
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
-    /// The task that the server must have, and its model, unless it is recorded; `None`: any, or none.
+    /// The task that the server must have, with its model unless the task is recorded; `None`: any worlds.
     pub task: Option<(Task, Option<Model>)>,
     pub world: u32,
-    /// Which robots of the world to fly, on one belief.
+    /// Numbers of the robots to fly in the world, on one belief.
     pub robots: Range<u32>,
-    /// How much it has to do with the other robots of the world.
-    pub company: Company,
+    /// How the agent cooperates with the other robots of the world.
+    pub cooperation: Cooperation,
     pub policy: String,
     /// Steps to act for; 0: until stopped.
     pub steps: u64,
-    /// A step begins this long after the one before, or later; a stop waits for that.
+    /// Minimum time from one step's start to the next. A stop takes effect only after it.
     pub shortest_step: Duration,
     pub takeover: bool,
-    /// The model, where the server does not reveal its own.
+    /// The model to use if the server does not reveal its own.
     pub model: Option<Model>,
     pub config: AgentConfig,
-    /// What was learned, for policies that act on it.
+    /// Learned models, for policies that use them.
     pub learned: Learned,
 }
 
-/// What an agent has to do with robots of its world that others fly.
+/// How an agent cooperates with robots of its world that other agents fly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Company {
-    /// Nothing.
+pub enum Cooperation {
+    /// Ignores the other robots.
     Alone,
-    /// It sees what they see.
+    /// Uses the observations of all robots, and plans for its own.
     Shared,
-    /// It also plans for them, as they do for its own: agents that believe the same make the same plan for all, and
-    /// each flies its part.
+    /// Uses the observations of all robots, and plans for all. Agents with the same belief compute the same plan, and
+    /// each flies its own part.
     Team,
 }
 
@@ -89,7 +89,7 @@ impl Mission {
             same(&of_task("sensor_radius"), &radius, &got)?;
         }
         let Some(model) = model else {
-            return Ok(()); // a grid and states of the server's own
+            return Ok(()); // A recorded task does not set grid, burn-in or model.
         };
         same(&of_task("height"), &task.height, &info.height)?;
         same(&of_task("width"), &task.width, &info.width)?;
@@ -97,7 +97,7 @@ impl Mission {
         let got = info.model.as_deref().map(Model::from_toml).transpose()?;
         ensure!(
             got.as_ref().is_none_or(|got| got == model),
-            "instance {:?}: expected {} {}, got another",
+            "instance {:?}: expected {} {}, got another model",
             self.instance.name(),
             of_task("model"),
             model.file().name
@@ -105,24 +105,24 @@ impl Mission {
         Ok(())
     }
 
-    /// The numbers of its robots on a server.
+    /// Returns the numbers of the mission's robots on a server.
     pub(super) fn numbers(&self, info: &ServerInfo) -> Result<Range<u32>> {
         let (robots, team) = (&self.robots, info.n_robots);
         ensure!(
             !robots.is_empty() && robots.end <= team,
-            "robots: expected some of the world's 0..{team}, got {}..{}",
+            "robots: expected a part of the world's robots 0..{team}, got {}..{}",
             robots.start,
             robots.end
         );
         ensure!(
-            robots.len() == 1 || self.company == Company::Team,
-            "robots: expected one, or a team"
+            robots.len() == 1 || self.cooperation == Cooperation::Team,
+            "robots: expected one robot, or several with --team"
         );
         Ok(self.world * team + robots.start..self.world * team + robots.end)
     }
 }
 
-/// What a server says of itself, if it has the worlds.
+/// Returns a server's information. Fails if the server lacks one of the worlds.
 pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
     let info = connect(instance)?.info().clone();
     if worlds.end > info.n_worlds {
@@ -131,7 +131,7 @@ pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<Server
     Ok(info)
 }
 
-/// The states of recorded worlds as a model in which they do not change, if the server reveals them.
+/// Returns the states of recorded worlds as a model in which they never change, if the server reveals them.
 pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     let recorded = info.recorded_world.as_ref();
     let description = recorded.and_then(|recorded| recorded.description.as_deref());
@@ -140,11 +140,11 @@ pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     model.map(|model| model.with_radius(radius)).transpose()
 }
 
-/// The words for a policy that filters with a model, on recorded worlds.
+/// Returns the error text for a policy that filters with a model, on recorded worlds without one.
 pub fn needs_model(policy: &Policy) -> String {
     format!(
-        "policy {:?} filters with a model, and recorded worlds have none: expected --model FILE, or a policy that \
-         needs none, such as coverage or learned_beam",
+        "policy {:?} filters with a model, and recorded worlds have none: give --model FILE, or choose a policy \
+         without a model, such as coverage or learned_beam",
         policy.name
     )
 }
@@ -158,7 +158,7 @@ pub(super) fn model_of(
     let model = match (model, revealed) {
         (Some(given), Some(revealed)) if *given != revealed => {
             bail!(
-                "model: expected the server's own, {:?}, as it reveals it, got another, {:?}",
+                "model: expected the server's model {:?}, got a different model, {:?}",
                 revealed.file().name,
                 given.file().name
             );
@@ -166,11 +166,11 @@ pub(super) fn model_of(
         (Some(given), _) => given.clone(),
         (None, Some(revealed)) => revealed,
         (None, None) if info.recorded_world.is_some() => bail!(
-            "instance {:?} has recorded worlds, without a model: expected --model FILE",
+            "instance {:?} has recorded worlds without a model: give --model FILE",
             instance.name()
         ),
         (None, None) => bail!(
-            "instance {:?} does not reveal its model: expected --model FILE",
+            "instance {:?} does not reveal its model: give --model FILE",
             instance.name()
         ),
     };
@@ -178,17 +178,17 @@ pub(super) fn model_of(
     Ok(model)
 }
 
-/// Refuses a model for filters whose sensor is not the server's.
+/// Checks that a model for filters has the server's sensor and no-fly cells.
 fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     let (expected, got) = (info.n_observations, model.n_observations());
     ensure!(
         got == expected,
-        "model: expected the server's {expected} observations, got {got}"
+        "model: expected {expected} observation values as on the server, got {got}"
     );
     let airspace = info.airspace().map_err(anyhow::Error::msg)?;
     ensure!(
         model.airspace(info.shape()?)? == airspace,
-        "model: expected the server's sensor and no-fly cells, got others"
+        "model: expected the server's sensor radius and no-fly cells, got others"
     );
     Ok(())
 }

@@ -2,7 +2,9 @@
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::link::Link;
-use crate::acting::mission::{Company, Mission, info_of, model_of, needs_model, recorded_states};
+use crate::acting::mission::{
+    Cooperation, Mission, info_of, model_of, needs_model, recorded_states,
+};
 use crate::client::errors::is_late;
 use crate::client::info::{connect, is_belief_left};
 use crate::client::view::view;
@@ -23,39 +25,39 @@ use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-/// Time between two warnings of steps that went on without the agent.
+/// Minimum time between two warnings about missed steps.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
-/// An agent at its world.
+/// An agent that holds robots of one world.
 pub struct Pilot {
     link: Link,
     flyer: Flyer,
     model: Model,
     policy: Policy,
-    /// The belief before an episode's first frame, once it was needed.
+    /// The belief before an episode's first frame, computed when first needed.
     prior: Option<Belief>,
     warned: Option<Instant>,
 }
 
-/// The agent, and what its belief is shown on.
+/// The agent, and the feed on which its belief is published.
 struct Flyer {
-    /// Plans for its own robots, and for those of others in its team.
+    /// Plans for the agent's own robots and, in a team, for the other robots.
     rollout: Rollout,
-    /// The numbers of all these robots on the server.
+    /// Numbers on the server of all robots that the agent plans for.
     robots: Range<u32>,
-    /// The numbers of those that it flies itself.
+    /// Numbers on the server of the robots that it flies.
     own: Range<u32>,
     /// Robots of each world.
     team: u32,
-    /// Time that its last plan took.
+    /// Duration of the last planning.
     planning: Duration,
     feed: Feed,
-    /// Whether the next belief is shown in any case.
+    /// Whether the next belief is the last, which is always published.
     is_last: bool,
 }
 
 impl Pilot {
-    /// Acquires the robots where their world stands and takes in its last frame.
+    /// Acquires the robots in the present state of their world, and updates the belief with its last frame.
     pub fn attach(mission: &Mission) -> Result<Self> {
         let info = info_of(&mission.instance, &mission.worlds())?;
         mission.check_task(&info)?;
@@ -65,16 +67,17 @@ impl Pilot {
         let given = || model_of(&mission.instance, &info, mission.model.as_ref());
         let model = recorded.map_or_else(given, Ok)?;
         let policy = Policy::named(&mission.policy, &model)?;
-        // An agent that lacks something must not take robots from one that flies them.
+        // An agent that cannot act must not take robots over from an agent that can.
         check(mission, &info, (&model, &policy), is_recorded)?;
-        // What takes long is done before the lease begins to run, and not at all where a belief was left.
+        // Simulating the prior may take long, so it comes before the lease, and is skipped if a belief was left.
         if let Some(of_belief) = policy.belief.handover
             && is_belief_left(
                 &mission.instance,
                 numbers.start,
                 &handover_of(&of_belief(&model)),
             )?
-            && let Some(attached) = Self::go_on(mission, &info, &numbers, (&model, &policy))?
+            && let Some(attached) =
+                Self::continue_left(mission, &info, &numbers, (&model, &policy))?
         {
             return Ok(attached);
         }
@@ -88,8 +91,8 @@ impl Pilot {
         Ok(attached)
     }
 
-    /// Acquires the robots and takes over the belief that was left for the first.
-    fn go_on(
+    /// Acquires the robots and takes over the belief left for the first of them. Returns `None` if it is outdated.
+    fn continue_left(
         mission: &Mission,
         info: &ServerInfo,
         numbers: &Range<u32>,
@@ -101,12 +104,12 @@ impl Pilot {
         if take_over_left(client, numbers.start, rollout)? {
             return Ok(Some(attached));
         }
-        // Another agent acted since.
+        // Another agent has acted since the belief was found.
         attached.link.client.release()?;
         Ok(None)
     }
 
-    /// Acquires the robots for an agent before its first frame.
+    /// Acquires the robots and creates their agent, before its first frame.
     fn acquire(
         mission: &Mission,
         numbers: &Range<u32>,
@@ -114,14 +117,14 @@ impl Pilot {
     ) -> Result<Self> {
         let connection = connect(&mission.instance)?;
         let mut client = Client::acquire(connection, &mission.claim(numbers))?;
-        client.share_frames(mission.company != Company::Alone);
+        client.share_frames(mission.cooperation != Cooperation::Alone);
         let team = client.info().n_robots;
-        let robots = match mission.company {
-            Company::Team => mission.world * team..(mission.world + 1) * team,
+        let robots = match mission.cooperation {
+            Cooperation::Team => mission.world * team..(mission.world + 1) * team,
             _ => numbers.clone(),
         };
-        let is_told = policy.belief.input == Input::States;
-        let mut link = Link::new(client, &mission.instance, robots.clone(), is_told)?;
+        let sees_truth = policy.belief.input == Input::States;
+        let mut link = Link::new(client, &mission.instance, robots.clone(), sees_truth)?;
         let seen = link.observe()?;
         let (seed, step) = (seen.observation.world.seed, seen.observation.world.step);
         tracing::info!(
@@ -168,7 +171,11 @@ impl Pilot {
         self.link.client.reset(&[WorldSeed { world, seed }])?;
         let seen = self.link.observe()?;
         let seed = seen.observation.world.seed;
-        tracing::info!(world, seed, "the episode was truncated: the next begins");
+        tracing::info!(
+            world,
+            seed,
+            "the episode was truncated: the next one starts"
+        );
         let first = self.flyer.robots.start % self.flyer.team;
         let parts = (&self.model, &self.policy, &prior);
         let agent = agent(mission, &self.link.client, parts, (seed, first))?;
@@ -177,9 +184,9 @@ impl Pilot {
         self.begin()
     }
 
-    /// One step of the rollout, of the next episode if one has ended; returns the reward, or `None` if no path was
-    /// flown: it is time to stop, or the world has moved on without, and the agent has caught up. The last belief is
-    /// shown in any case.
+    /// Flies one step, in the next episode if the last one has ended. Returns the reward, or `None` if no path was
+    /// flown: because `stop` was set, or because the world stepped without the agent, which has caught up. The belief
+    /// after the last step is always published.
     pub fn step(
         &mut self,
         mission: &Mission,
@@ -197,27 +204,27 @@ impl Pilot {
         }
     }
 
-    /// Leaves the belief to the next agent of each robot.
+    /// Leaves the belief for the next agent of each robot.
     pub fn leave(&mut self) -> Result<(), ConnectionError> {
         let mut numbers = self.flyer.own.clone();
         numbers.try_for_each(|number| leave(&mut self.link.client, number, &self.flyer.rollout))
     }
 
-    /// Gives the robots back, and ends when observers have had time to see the last belief.
+    /// Releases the robots. Returns when observers have had time to see the last belief.
     pub fn release(self) -> Result<(), ConnectionError> {
         let released = self.link.client.release();
         self.flyer.feed.end();
         released
     }
 
-    /// Takes in what the world did meanwhile.
+    /// Updates the belief after steps that the world made without the agent.
     fn catch_up(&mut self) -> Result<()> {
         let before = self.flyer.rollout.step();
         let seen = self.link.observe()?;
         let step = seen.observation.world.step;
         if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
             self.warned = Some(Instant::now());
-            tracing::warn!("late: the world went on from step {before} to {step}; catching up");
+            tracing::warn!("late: the world advanced from step {before} to {step}; catching up");
         }
         let (client, rollout) = (&mut self.link.client, &mut self.flyer.rollout);
         catch_up(client, self.flyer.robots.start, rollout, seen)?;
@@ -229,7 +236,7 @@ impl Pilot {
 }
 
 impl Actor for Flyer {
-    /// Plans for its own robots and for those of others that flew; returns the paths of its own.
+    /// Plans for its own robots, and for other robots that flew in the last step. Returns the own paths.
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let is_planned = self.is_planned();
@@ -257,7 +264,7 @@ impl Actor for Flyer {
 }
 
 impl Flyer {
-    /// Shows the posterior to observers, if it is time or in any case.
+    /// Publishes the posterior to observers if it is due, or if it is the last.
     fn show(&mut self) {
         if self.feed.is_due() || self.is_last {
             let world = self.own.start / self.team;
@@ -266,20 +273,20 @@ impl Flyer {
         }
     }
 
-    /// What the last step gave its own robots.
+    /// Returns the last step's reward, summed over its own robots.
     fn reward(&self) -> f64 {
         let own = self.own_indices();
         let results = self.rollout.results().skip(own.start).take(own.len());
         results.map(|result| result.reward).sum()
     }
 
-    /// Which of the robots that it plans for are its own.
+    /// Returns the indices of its own robots among all planned robots.
     fn own_indices(&self) -> Range<usize> {
         let index = |number: u32| (number - self.robots.start) as usize;
         index(self.own.start)..index(self.own.end)
     }
 
-    /// For which of its robots it plans now: its own, and those of others that flew.
+    /// Returns for each robot whether to plan for it: for its own robots, and for other robots that flew.
     fn is_planned(&self) -> Vec<bool> {
         let (own, team) = (self.own_indices(), self.team);
         let hovered = self.rollout.observation().world.hovered;
@@ -290,7 +297,7 @@ impl Flyer {
     }
 }
 
-/// Refuses a policy that cannot act on a server's world.
+/// Checks that a policy can act on a server's world.
 fn check(
     mission: &Mission,
     info: &ServerInfo,
@@ -332,7 +339,7 @@ fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -
     )?)
 }
 
-/// An agent before its first frame, of a world's seed and the number of its first robot there.
+/// Creates an agent before its first frame. `seed` is the world's; `first` is the agent's first robot in the world.
 fn agent(
     mission: &Mission,
     client: &Client,

@@ -1,4 +1,4 @@
-//! The agent's life on one world: attach, act, reconnect, leave.
+//! The life cycle of an agent on one world: attach, act, reconnect, release.
 
 use crate::acting::mission::Mission;
 use crate::acting::pilot::Pilot;
@@ -13,14 +13,13 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Summary {
-    /// Steps in which its paths were flown.
+    /// Steps in which the agent's paths were flown.
     pub steps: u64,
-    /// Sum of their rewards, of all robots that it flew.
+    /// Rewards of these steps, summed over the agent's robots.
     pub reward: f64,
 }
 
-/// Acts until the steps are done or `stop` is set, in one episode after the other. Waits for a server that ends,
-/// however often.
+/// Acts in successive episodes until the steps are done or `stop` is set. If the server ends, waits for a new one.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
@@ -36,11 +35,11 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
             Ok(Some(reward)) => {
                 summary.steps += 1;
                 summary.reward += reward;
-                report.tell(&summary);
+                report.log(&summary);
             }
             Ok(None) => {}
             Err(error) if is_outage(&error) => {
-                tracing::warn!("{error}; waiting for it to come back");
+                tracing::warn!("{error}; waiting for the server to come back");
                 match attach_again(mission, stop)? {
                     Some(again) => pilot = again,
                     None => {
@@ -52,7 +51,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
             Err(error) => return Err(error),
         }
     }
-    // After an outage nobody knows where the world stands.
+    // After an outage the world's state is unknown, so no belief is left.
     let left = if is_in_step { pilot.leave() } else { Ok(()) };
     let released = pilot.release();
     match left.and(released).map_err(anyhow::Error::from) {
@@ -67,7 +66,7 @@ struct Report {
 }
 
 impl Report {
-    fn tell(&mut self, summary: &Summary) {
+    fn log(&mut self, summary: &Summary) {
         let elapsed = self.since.elapsed();
         if elapsed < REPORT_INTERVAL {
             return;
@@ -86,14 +85,14 @@ impl Report {
     }
 }
 
-/// Attaches to a server that has come back; `None` if it is time to stop.
+/// Attaches again when the server has come back. Returns `None` if `stop` is set first.
 fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Pilot>> {
     let mut mission = mission.clone();
     mission.takeover = false;
     while !stop.load(Ordering::Relaxed) {
         match Pilot::attach(&mission) {
             Ok(pilot) => return Ok(Some(pilot)),
-            // The server did not end, it paused: our former connection holds the robots still.
+            // The server only paused: this process's former connection still holds the robots.
             Err(error) if is_own_lease(&error) && !mission.takeover => mission.takeover = true,
             Err(error) if is_outage(&error) => {
                 mission.takeover = false;
@@ -105,7 +104,7 @@ fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Pilot>> {
     Ok(None)
 }
 
-/// Whether a robot is taken by this very process.
+/// Returns whether the robots are held by this process.
 fn is_own_lease(error: &anyhow::Error) -> bool {
     let own_pid = u64::from(std::process::id());
     refusal(error).is_some_and(|(status, detail, _)| (status, detail) == (Status::Busy, own_pid))

@@ -1,8 +1,8 @@
-//! The worlds on which policies are compared: all policies meet the same ones.
+//! The worlds on which policies are compared, the same for all policies.
 //!
-//! Worlds of one server are used in three parts: the *main* worlds, on which policies act; as many
-//! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
-//! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
+//! One server's worlds form three groups: the *main* worlds, on which policies act; the same number of *scouts* with
+//! the same seeds, one step ahead, for clairvoyant policies; and one *spare*, for full observations. A scout shows the
+//! main world's exact future, because a world does not depend on the robots' paths.
 
 use crate::acting::mission::{check_recorded, needs_model, recorded_states};
 use crate::benchmark::team::Team;
@@ -24,17 +24,17 @@ use emberwatch_protocol::{Client, Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
-/// Most main worlds of a batch: with scouts and a spare, their hidden states fit a reader's buffer.
+/// Maximum number of main worlds in a batch. With scouts and a spare, their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
 
-/// How long the lease on a comparison's worlds lives without use.
+/// Time to live of an unused lease on a comparison's worlds.
 const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds of one server, held for a comparison.
 pub struct Arena {
     instance: Instance,
     client: Client,
-    /// Where the hidden states are published.
+    /// `None` if the server does not publish hidden states.
     truth: Option<TruthFeed>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
     model: Model,
@@ -43,12 +43,12 @@ pub struct Arena {
     main: Range<u32>,
     scouts: Range<u32>,
     spare: Option<u32>,
-    /// Robots that an agent flies: one, or all of its world.
+    /// Number of robots per agent: one, or all robots of a world.
     crew: usize,
 }
 
 impl Arena {
-    /// Acquires up to `n_seeds` main worlds, as many scouts if asked, and a spare if there is one.
+    /// Acquires up to `n_seeds` main worlds, the same number of scouts if needed, and a spare if there is one.
     pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self> {
         let unfit =
             |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
@@ -56,15 +56,16 @@ impl Arena {
         let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
         let per_main = if needs_scouts { 2 } else { 1 };
         let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
-        let needs =
-            format!("{per_main} worlds for these policies, it has {n_worlds}: --worlds {per_main}");
+        let needs = format!(
+            "{per_main} worlds for these policies, got {n_worlds}: start the server with --worlds {per_main}"
+        );
         ensure!(n_main > 0, unfit(&needs));
         let used = n_main * per_main;
         let spare = (n_worlds > used).then_some(used);
         let claim = Claim {
             robots: 0..(used + u32::from(spare.is_some())) * team,
             takeover: false,
-            // Simulating the prior may take long; closing the connection ends the lease all the same.
+            // Simulating the prior may take long. Closing the connection still ends the lease at once.
             time_to_live: Some(LEASE),
         };
         let client = Client::acquire(connection, &claim)?;
@@ -73,7 +74,9 @@ impl Arena {
             None => info.model.as_deref().map(Model::from_toml).transpose()?,
             recorded => recorded,
         };
-        let model = model.with_context(|| unfit("the model, for filters: --reveal-model true"))?;
+        let model = model.with_context(|| {
+            unfit("the model, for filters: start the server with --reveal-model true")
+        })?;
         let truth = info
             .publish_truth
             .then(|| TruthFeed::open(instance, client.shape()));
@@ -103,7 +106,7 @@ impl Arena {
         &self.model
     }
 
-    /// The model with which beliefs predict.
+    /// Returns the model with which beliefs predict.
     pub fn known_model(&self) -> &Model {
         self.known.as_ref().unwrap_or(&self.model)
     }
@@ -118,7 +121,7 @@ impl Arena {
         Ok(())
     }
 
-    /// Whether its worlds were recorded, and no model was given for them.
+    /// Returns whether the worlds were recorded and no model was given for beliefs.
     pub fn lacks_model(&self) -> bool {
         self.info().recorded_world.is_some() && self.known.is_none()
     }
@@ -135,7 +138,7 @@ impl Arena {
         self.truth.is_some()
     }
 
-    /// Number of main worlds: how many seeds are run at a time.
+    /// Returns the number of main worlds, which is the number of seeds that run at a time.
     pub fn batch_size(&self) -> usize {
         self.main.len()
     }
@@ -144,10 +147,10 @@ impl Arena {
         self.info().n_robots as usize
     }
 
-    /// From here on agents fly as members of such a team.
+    /// Sets the kind of team in which robots fly from now on.
     pub fn fly_as(&mut self, team: Team) {
         self.crew = if team.is_joint() { self.n_robots() } else { 1 };
-        // One robot alone sees all that its team sees.
+        // With one robot per world, shared frames are the robot's own.
         self.client.share_frames(team != Team::Alone);
     }
 
@@ -155,7 +158,7 @@ impl Arena {
         self.n_robots() / self.crew
     }
 
-    /// Starts the main worlds (and scouts) with these seeds; returns what their agents see at k = 0, world by world.
+    /// Starts the main worlds (and scouts) with these seeds; returns what agents see at k = 0, by world.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
         let orders = |first: u32| {
             seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
@@ -175,7 +178,7 @@ impl Arena {
         Ok(self.seen(observations, &truth))
     }
 
-    /// The main worlds of these seeds, as an environment whose next step is `step`.
+    /// Returns the main worlds of these seeds as an environment whose next step is `step`.
     pub fn batch<'a>(&'a mut self, seeds: &'a [u64], step: u64) -> Batch<'a> {
         Batch {
             arena: self,
@@ -184,10 +187,10 @@ impl Arena {
         }
     }
 
-    /// The hidden states at `step` before the main worlds get there, from the scouts.
+    /// Returns the hidden states at `step` from the scouts, before the main worlds reach that step.
     ///
     /// # Errors
-    /// Also where they are not published.
+    /// Also if the server does not publish hidden states.
     pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let worlds = self.range(&self.scouts, seeds);
         let robots = self.robots(&worlds);
@@ -195,11 +198,11 @@ impl Arena {
         self.client.step(robots, &paths)?;
         let states = self.states(worlds, seeds, step)?;
         let states = states.into_iter().collect::<Option<_>>();
-        states.context("scouts: expected published hidden states, got none")
+        states.context("scouts need hidden states: start the server with --publish-truth")
     }
 
-    /// What a robot that sees every cell would have seen of a seed's world at a step, at least 1;
-    /// `None` if the server has no spare world or gives no full frames.
+    /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, at least 1. Returns
+    /// `None` if the server has no spare world or does not serve full frames.
     pub fn full_observation(&mut self, seed: u64, step: u64) -> Result<Option<Grid<u8>>> {
         let Some(spare) = self
             .spare
@@ -222,7 +225,7 @@ impl Arena {
             .map(|observation| observation.frame.values().to_owned()))
     }
 
-    /// A policy's agent for the world of a seed; `number`: which of the world's agents.
+    /// Creates a policy's agent for the world of a seed. `number` is the agent's index in the world.
     pub fn agent(
         &self,
         policy: &Policy,
@@ -242,7 +245,7 @@ impl Arena {
         building::agent(policy, config, &conditions, self.info().n_moves, seed)
     }
 
-    /// Refuses a policy that filters with a model on worlds that have none.
+    /// Refuses a policy that filters with a model, on worlds without a model.
     pub fn check_model(&self, policy: &Policy) -> Result<()> {
         ensure!(
             !(self.lacks_model() && policy.belief.knows_model),
@@ -251,7 +254,7 @@ impl Arena {
         Ok(())
     }
 
-    /// The hidden states of worlds at a step, where they are published.
+    /// Returns the hidden states of worlds at a step, or `None` for each world if they are not published.
     fn states(
         &self,
         worlds: Range<u32>,
@@ -289,7 +292,7 @@ impl Arena {
     }
 }
 
-/// Main worlds of an arena. Its agents see what they show world by world.
+/// Main worlds of an arena as an environment. What agents see is ordered by world.
 pub struct Batch<'a> {
     arena: &'a mut Arena,
     seeds: &'a [u64],

@@ -25,21 +25,21 @@ use std::borrow::Cow;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// The policy of the team that is told the true states.
+/// The policy of [`Team::Oracle`].
 const ORACLE: &str = "oracle_beam";
 
 #[derive(Debug, Clone)]
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
-    /// How the robots of a world act together, each with each policy.
+    /// Kinds of team. Each runs with each policy.
     pub teams: Vec<Team>,
     pub seeds: Range<u64>,
     pub steps: u64,
     /// Steps for which a cell counts as seen after a visit, at least 1.
     pub recent_steps: u32,
     pub config: AgentConfig,
-    /// What was learned, for policies that act on it.
+    /// Learned models, for policies that use them.
     pub learned: Learned,
     /// Whether beliefs of a known model begin with each world's hidden state.
     pub first_state_known: bool,
@@ -49,20 +49,20 @@ pub struct Comparison {
 pub struct Results {
     /// One run per policy, team and world, in the order of the policies.
     pub runs: Vec<PolicyRun>,
-    /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
+    /// Number of cells in the state that pays most, per step, averaged over worlds. The same for all policies.
     pub fire_cells: Vec<f32>,
-    /// The end of the first world's run, of its first robot, with the last policy whose snapshot tells most.
+    /// The last step of the first world's first robot, from the last policy with the highest [`Snapshot::rank`].
     pub snapshot: Option<Snapshot>,
 }
 
-/// One policy, and how the robots of a world act on it.
+/// One policy with one kind of team.
 #[derive(Debug, Clone, PartialEq)]
 struct Contestant {
     policy: Policy,
     team: Team,
 }
 
-/// Runs every policy on every world; `progress` is told of each policy and of each world step.
+/// Runs every policy on every world. Calls `progress` with a policy's name and the number of world steps just made.
 pub fn compare(
     arena: &mut Arena,
     comparison: &Comparison,
@@ -89,7 +89,7 @@ pub fn compare(
         prior: &prior,
         seeds,
     };
-    // What does not fit is refused before hours of what does.
+    // Refuse a policy that cannot run before other policies run for hours.
     for contestant in &contestants {
         let checked = game(contestant, &seeds[..1]).check(arena);
         checked.with_context(|| format!("policy {:?}", contestant.policy.name))?;
@@ -121,7 +121,7 @@ pub fn compare(
 }
 
 impl Comparison {
-    /// Pairs of a policy and a team that are compared.
+    /// Returns the number of pairs of a policy and a kind of team.
     pub fn n_contestants(&self) -> usize {
         let n_policies = |team: &Team| match team {
             Team::Oracle => 1,
@@ -130,7 +130,7 @@ impl Comparison {
         self.teams.iter().map(n_policies).sum()
     }
 
-    /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, besides its name and the worlds.
+    /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, except its name and worlds.
     pub fn policy_fingerprint(&self, policy: &Policy, model: &Model) -> String {
         let learned = policy.needs_checkpoint().then_some(&self.learned.digests);
         let model = toml::to_string(model.file()).expect("invariant: model files serialise");
@@ -144,7 +144,7 @@ impl Comparison {
         hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Each policy with each team, but the oracle once.
+    /// Returns each policy with each kind of team, but the oracle team only once.
     fn contestants(&self, model: &Model) -> Vec<Contestant> {
         let of_team = |&team: &Team| {
             let policies = match team {
@@ -181,12 +181,12 @@ struct Match<'a> {
 }
 
 impl Match<'_> {
-    /// Refuses a contestant that cannot act.
+    /// Checks that the contestant can act in the arena.
     fn check(&self, arena: &Arena) -> Result<()> {
         let policy = &self.contestant.policy;
-        let is_told = matches!(policy.belief.input, Input::States | Input::NextStates);
+        let needs_truth = matches!(policy.belief.input, Input::States | Input::NextStates);
         ensure!(
-            arena.shows_truth() || !(is_told || self.comparison.first_state_known),
+            arena.shows_truth() || !(needs_truth || self.comparison.first_state_known),
             "it needs the truth channel: start the server with --publish-truth"
         );
         arena.check_model(policy)?;
@@ -243,24 +243,25 @@ impl Match<'_> {
         arena.agent(&self.contestant.policy, config, prior, agent, learned)
     }
 
-    /// An agent's first belief, which is certain if the first state is known.
+    /// Returns an agent's first belief, which is certain if the first state is known.
     fn prior(&self, arena: &Arena, seen: &Seen) -> Result<Cow<'_, Belief>> {
         if !self.comparison.first_state_known {
             return Ok(Cow::Borrowed(self.prior));
         }
         let states = seen.truth.as_ref();
-        let states = states.context("expected published hidden states, got none")?;
+        let states =
+            states.context("expected hidden states: start the server with --publish-truth")?;
         let certain = Belief::from_states(states, arena.known_model().n_states())?;
         Ok(Cow::Owned(certain))
     }
 }
 
-/// The agents of a batch of worlds, and what is measured of each world.
+/// The agents of a batch of worlds, and the measurements of each world.
 struct Players<'a> {
-    /// World by world.
+    /// One for each agent, ordered by world.
     rollouts: Vec<Rollout>,
     worlds: Vec<WorldRun>,
-    /// The last plans of each agent, and the time that they took.
+    /// The last plans of each agent, and their duration.
     plans: Vec<(Vec<Plan>, Duration)>,
     /// The state that pays most.
     target: usize,
@@ -291,12 +292,12 @@ impl Actor for Players<'_> {
 }
 
 impl Players<'_> {
-    /// Agents of each world.
+    /// Returns the number of agents per world.
     fn n_agents(&self) -> usize {
         self.rollouts.len() / self.worlds.len()
     }
 
-    /// Tells clairvoyants the states that their next paths will meet, world by world.
+    /// Passes the next hidden states to the clairvoyant agents, world by world.
     fn foresee(&mut self, next: &[Grid<u8>]) -> Result<()> {
         let n_agents = self.n_agents();
         for (rollouts, next) in self.rollouts.chunks_mut(n_agents).zip(next) {
@@ -323,7 +324,7 @@ impl Players<'_> {
         }
     }
 
-    /// Shows the posteriors of the worlds whose turn it is.
+    /// Publishes the posteriors of the agents that are due.
     fn show(&mut self) {
         let (n_agents, n_robots) = (self.n_agents(), self.n_robots as u32);
         let crew = n_robots / n_agents as u32;
@@ -337,7 +338,7 @@ impl Players<'_> {
     }
 }
 
-/// An agent's plans, and the time that they took.
+/// Returns an agent's plans, and the duration of the planning.
 fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
     let start = Instant::now();
     (rollout.plan(), start.elapsed())

@@ -1,7 +1,7 @@
-//! How well learned beliefs predict what robots see, beside the known model's and none.
+//! Scores how well learned beliefs predict observations, compared with the known model and with class frequencies.
 //!
-//! All are fed the same frames, of paths that none of them, or the known-model filter, chose. What
-//! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
+//! All beliefs receive the same frames, from the paths of a guide: a random walk, or beam search with the known model.
+//! The score is each frame's log-likelihood per visited cell, under the prediction made before the frame.
 
 use crate::benchmark::arena::Arena;
 use anyhow::Result;
@@ -23,7 +23,7 @@ pub struct Evaluation<'a> {
     pub seeds: Range<u64>,
     pub steps: u64,
     pub config: &'a AgentConfig,
-    /// Only their estimators count.
+    /// Policies whose estimators are scored. Their planners are not used.
     pub policies: &'a [Policy],
     pub learned: &'a Learned,
 }
@@ -32,7 +32,7 @@ pub struct Evaluation<'a> {
 pub struct Scores {
     pub seed: u64,
     pub scores: Vec<Score>,
-    /// How often each value was seen.
+    /// Number of times that each observation value was seen.
     pub counts: Vec<u64>,
 }
 
@@ -67,8 +67,8 @@ pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Sc
     Ok(scores)
 }
 
-/// Score of telling each cell alike the frequencies with which each of the sensor's matrices showed values in all worlds,
-/// with hindsight.
+/// Returns the score of predicting the same value frequencies for every cell. The frequencies are those seen through
+/// each sensor matrix in all worlds, known with hindsight.
 pub fn score_of_frequencies(all: &[Scores], counts: &[u64], n_matrices: usize) -> Score {
     let total = |value: usize| all.iter().map(|scores| scores.counts[value]).sum::<u64>();
     let totals: Vec<u64> = (0..counts.len()).map(total).collect();
@@ -83,13 +83,13 @@ pub fn score_of_frequencies(all: &[Scores], counts: &[u64], n_matrices: usize) -
     score
 }
 
-/// Estimators on one world.
+/// The estimators on one world, and their scores.
 struct Candidates {
     estimators: Vec<Agent>,
     scores: Scores,
 }
 
-/// Who chooses the paths on a world, and the estimators there.
+/// Creates the guide that chooses the paths on a world, and the estimators to be scored.
 fn candidates(
     arena: &Arena,
     evaluation: &Evaluation<'_>,
@@ -116,7 +116,7 @@ fn candidates(
 }
 
 impl Candidates {
-    /// Scores each estimator's prediction of a frame, then feeds them with it.
+    /// Scores each estimator's prediction of a frame, then updates the estimators with the frame.
     fn look(&mut self, frame: &Frame) -> Result<()> {
         let scores = self.scores.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {

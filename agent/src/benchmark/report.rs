@@ -1,4 +1,4 @@
-//! What a comparison of policies looks like: a table, a CSV file and figures.
+//! Reports of a comparison of policies: a table, a CSV file and figures.
 //!
 //! Everything here turns finished [`PolicyRun`]s into text or a file; nothing here runs a policy.
 //! Read `statistics` first, then `table` and [`figures`]. [`training`] turns metrics into curves.

@@ -3,16 +3,16 @@
 use crate::benchmark::report::ALONE;
 use clap::ValueEnum;
 
-/// How the robots of a world act together. With one robot all are the same, but that on the truth.
+/// How the robots of a world act together. With one robot, all kinds but [`Self::Oracle`] are the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Team {
-    /// Each on its own belief of what it sees itself, as if there were no others
+    /// Each robot plans on its own observations, as if there were no other robots
     Alone,
-    /// Each on its own, but of what all see
+    /// Each robot plans for itself, on the observations of all robots
     Shared,
-    /// On one belief, by one plan
+    /// One agent plans for all robots, on one belief
     Joint,
-    /// By one plan on the true states, whatever the policies
+    /// One agent plans for all robots on the true states, whatever --policies says
     Oracle,
 }
 
@@ -26,7 +26,7 @@ impl Team {
         }
     }
 
-    /// Whether one agent flies all robots of a world.
+    /// Returns whether one agent flies all robots of a world.
     pub fn is_joint(self) -> bool {
         matches!(self, Self::Joint | Self::Oracle)
     }

@@ -29,16 +29,16 @@ pub struct WorldRun {
 #[derive(Default)]
 pub struct Tally {
     rewards: Vec<f32>,
-    /// Cells in the state that pays most, for each step.
+    /// Number of cells in the state that pays most, for each step.
     pub fire_cells: Vec<f32>,
     reward: f64,
     n_visited: u64,
     n_hits: u64,
-    /// Distinct cells of each robot, all together.
+    /// Number of distinct cells of each robot, summed over robots.
     n_visited_each: u64,
     n_fire: u64,
     pub planning: Duration,
-    /// Where the hidden states are published.
+    /// Sum of Brier scores; `None` if hidden states are not published.
     brier: Option<f64>,
     score: Score,
 }
@@ -84,7 +84,7 @@ impl WorldRun {
         self.tally.score += score.unwrap_or_default();
     }
 
-    /// Takes a picture of a step; `None` if the hidden states are not published.
+    /// Returns a snapshot of a step; `None` if hidden states are not published.
     pub fn snapshot(
         &self,
         rollout: &Rollout,

@@ -1,10 +1,10 @@
-//! What the errors of connections mean to an agent.
+//! Classes of connection errors to which an agent reacts differently.
 
 use emberwatch_protocol::channels::ChannelError;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;
 
-/// Whether a server is away, or the way to it is busy, and it may come.
+/// Returns whether the server is absent or its lock is held, so that waiting may help.
 pub fn is_away(error: &ConnectionError) -> bool {
     match error {
         ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
@@ -16,12 +16,12 @@ pub fn is_away(error: &ConnectionError) -> bool {
     }
 }
 
-/// Whether something failed because a server is away that may come back.
+/// Like [`is_away`], for any error.
 pub fn is_outage(error: &anyhow::Error) -> bool {
     error.downcast_ref().is_some_and(is_away)
 }
 
-/// Status, detail and message, if something failed because a server refused.
+/// Returns status, detail and message of a server's refusal; `None` for other errors.
 pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
     match error.downcast_ref()? {
         ConnectionError::Refused {
@@ -33,7 +33,7 @@ pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
     }
 }
 
-/// Whether something failed because a world moved on before a path for it came.
+/// Returns whether the server refused a path because its world had already stepped.
 pub fn is_late(error: &anyhow::Error) -> bool {
     refusal(error).is_some_and(|(status, ..)| status == Status::Late)
 }

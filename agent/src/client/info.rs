@@ -1,4 +1,4 @@
-//! Connections of this program, and what a server tells on one without a lease.
+//! Connections of this program, and requests that need no lease.
 
 use crate::client::errors::is_away;
 use emberwatch_protocol::Connection;
@@ -8,7 +8,7 @@ use emberwatch_protocol::connection::{ConnectionError, unexpected};
 use emberwatch_protocol::control::{Reply, Request};
 use std::time::{Duration, Instant};
 
-/// How long to wait between attempts to reach a server that is away.
+/// Time between two attempts to reach an absent server.
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
@@ -16,22 +16,21 @@ pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
     Connection::open(instance, name, STEP_TIMEOUT)
 }
 
-/// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
-/// one: not once `is_over`.
+/// Waits up to `limit` until an instance has a server, and logs the wait once. Returns false if `is_over` came first.
 pub fn wait_for_server(
     instance: &Instance,
     limit: Duration,
     is_over: impl Fn() -> bool,
 ) -> Result<bool, ConnectionError> {
-    let (start, mut is_told) = (Instant::now(), false);
+    let (start, mut is_logged) = (Instant::now(), false);
     while !is_over() {
         match connect(instance) {
             Ok(_) => return Ok(true),
             Err(error) if is_away(&error) && start.elapsed() < limit => {
-                if !is_told {
-                    tracing::info!("{error}; waiting for it, {limit:?} at most");
+                if !is_logged {
+                    tracing::info!("{error}; waiting up to {limit:?}");
                 }
-                is_told = true;
+                is_logged = true;
             }
             Err(error) => return Err(error),
         }
@@ -41,7 +40,7 @@ pub fn wait_for_server(
     Ok(false)
 }
 
-/// Whether a belief of a kind was left for a robot's agent about its world as it stands; needs no lease.
+/// Returns whether a belief of this kind was left for a robot's next agent, about the present step. Needs no lease.
 pub fn is_belief_left(
     instance: &Instance,
     robot: u32,

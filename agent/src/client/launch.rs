@@ -1,4 +1,4 @@
-//! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
+//! Servers and dashboards as child processes: found, started, waited for, and always stopped.
 
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_protocol::channels::Instance;
@@ -13,35 +13,35 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// How long a server may take to answer its first hello.
+/// How long a server or dashboard may take until it first answers.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// How long it may take to stop before it is killed.
+/// How long a program may take to stop before it is killed.
 const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// A running server of ours; dropping it stops it.
+/// A server that this process started. Dropping it stops the server.
 pub struct OwnServer {
     instance: Instance,
     program: OwnProgram,
 }
 
-/// A running dashboard of ours; dropping it stops it.
+/// A dashboard that this process started. Dropping it stops the dashboard.
 pub struct OwnDashboard {
     url: String,
     _program: OwnProgram,
 }
 
-/// A child process; dropping it stops it.
+/// A child process. Dropping it stops the process.
 struct OwnProgram(Child);
 
 impl OwnServer {
-    /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
-    /// it answers. It ends with this process, however that ends.
+    /// Starts `emberwatch-server` with the given arguments on a private instance, and waits until it answers. The
+    /// server ends with this process, even if this process is killed.
     pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self> {
-        // A process of this number may have one in another container that shares /dev/shm.
+        // The process id alone is not unique: a process in another container may share /dev/shm.
         let random = RandomState::new().hash_one(0);
         let instance = Instance::new(&format!("private-{}-{random:016x}", std::process::id()))?;
-        let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
+        let mut command = private(program.unwrap_or_else(|| neighbour("emberwatch-server")));
         command
             .args(["--instance", instance.name()])
             .args(arguments);
@@ -76,17 +76,17 @@ impl OwnServer {
                 Err(_) => std::thread::sleep(Duration::from_millis(10)),
             }
             if let Ok(Some(status)) = self.program.0.try_wait() {
-                bail!("the server ended with {status} before it served");
+                bail!("the server ended with {status} before it was ready");
             }
         }
     }
 }
 
 impl OwnDashboard {
-    /// Starts `emberwatch-dashboard` for an instance; browsers reach its page at `address`. It ends with this
-    /// process, however that ends.
+    /// Starts `emberwatch-dashboard` for an instance, with its page at `address`. The dashboard ends with this process,
+    /// even if this process is killed.
     pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self> {
-        let mut command = private(beside_this("emberwatch-dashboard"));
+        let mut command = private(neighbour("emberwatch-dashboard"));
         let address = address.to_string();
         command
             .args([
@@ -101,8 +101,8 @@ impl OwnDashboard {
         let url = program.first_line(START_TIMEOUT);
         match url.trim() {
             "" => match program.0.try_wait() {
-                Ok(Some(status)) => bail!("the dashboard ended with {status} before it served"),
-                _ => bail!("the dashboard: nothing to say for {START_TIMEOUT:?}"),
+                Ok(Some(status)) => bail!("the dashboard ended with {status} before it was ready"),
+                _ => bail!("the dashboard did not print its address within {START_TIMEOUT:?}"),
             },
             url => Ok(Self {
                 url: url.into(),
@@ -123,25 +123,25 @@ impl OwnProgram {
         Ok(Self(child.with_context(|| format!("start {program}"))?))
     }
 
-    /// The first line that it writes to its standard output; empty if it ends or takes too long.
+    /// Returns the first line of the program's standard output, or an empty string if it ends or takes too long.
     fn first_line(&mut self, timeout: Duration) -> String {
-        let (tell, told) = std::sync::mpsc::channel();
+        let (sender, receiver) = std::sync::mpsc::channel();
         if let Some(out) = self.0.stdout.take() {
-            // Without the thread there is no line.
+            // If the thread cannot start, the line stays empty.
             let _ = spawn("first line", move || {
                 let mut line = String::new();
                 let _ = BufReader::new(out).read_line(&mut line);
-                let _ = tell.send(line);
+                let _ = sender.send(line);
             });
         }
-        told.recv_timeout(timeout).unwrap_or_default()
+        receiver.recv_timeout(timeout).unwrap_or_default()
     }
 }
 
 impl Drop for OwnProgram {
     fn drop(&mut self) {
         if let Some(pid) = rustix::process::Pid::from_raw(self.0.id() as i32) {
-            // A program that has ended already is what we want.
+            // The program may have ended already.
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
         }
         let deadline = Instant::now() + STOP_TIMEOUT;
@@ -156,12 +156,12 @@ impl Drop for OwnProgram {
     }
 }
 
-/// A program that ends with this one, and is quiet unless asked.
+/// Returns the command of a program that ends with this process, and logs only warnings unless RUST_LOG is set.
 fn private(program: PathBuf) -> Command {
     let mut command = Command::new(program);
     command
         .args(["--exit-with", &std::process::id().to_string()])
-        // A terminal's Ctrl-C is for this program, which still needs the other then.
+        // Keeps a terminal's Ctrl-C from the program, which this process still needs while it stops.
         .process_group(0);
     if std::env::var_os("RUST_LOG").is_none() {
         command.env("RUST_LOG", "warn");
@@ -169,11 +169,12 @@ fn private(program: PathBuf) -> Command {
     command
 }
 
-fn beside_this(name: &str) -> PathBuf {
-    let beside = std::env::current_exe()
+/// Returns the path of a program in this program's folder, or the bare name, to be found on PATH.
+fn neighbour(name: &str) -> PathBuf {
+    let neighbour = std::env::current_exe()
         .ok()
         .and_then(|path| Some(path.parent()?.join(name)));
-    beside
+    neighbour
         .filter(|path| path.exists())
         .unwrap_or_else(|| name.into())
 }

@@ -8,7 +8,7 @@ use emberwatch_protocol::connection::{ConnectionError, unexpected};
 use emberwatch_protocol::control::{LeftPart, MAX_BELIEF_PART, Reply, Request};
 use emberwatch_protocol::message::WorldResult;
 
-/// Leaves a belief about a robot's world, as it stands after a result, for the robot's next agent.
+/// Leaves a belief with the server for a robot's next agent. `at` is the result of the last step.
 pub fn leave_belief(
     client: &mut Client,
     robot: u32,
@@ -32,7 +32,7 @@ pub fn leave_belief(
     Ok(())
 }
 
-/// The belief that was left for a robot's agent about its world as it stands, if it is of a kind.
+/// Returns the belief left for a robot's next agent about the world's present step, if it is of this kind.
 pub fn left_belief(
     client: &mut Client,
     robot: u32,
@@ -51,13 +51,13 @@ pub fn left_belief(
                 bytes.extend_from_slice(&part);
                 let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
                 if *first.get_or_insert_with(|| info.clone()) != info {
-                    return Ok(None); // Another one was left meanwhile.
+                    return Ok(None); // Another belief was left in the meantime.
                 }
                 if is_last || is_whole {
                     return Ok(is_whole.then_some(bytes));
                 }
             }
-            // Of another kind, none, or a server that knows no beliefs.
+            // A belief of another kind, no belief, or a server without this request.
             Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
             Ok(other) => return Err(unexpected("belief", &other)),
             Err(error) => return Err(error),

@@ -1,4 +1,4 @@
-//! The hidden states of a batch of worlds, for evaluation: never for anything that learns.
+//! The hidden states of a batch of worlds, for evaluation and oracles, never for learning.
 
 use anyhow::{Context, Result, bail};
 use emberwatch_protocol::channels::Instance;
@@ -8,10 +8,10 @@ use emberwatch_protocol::{Grid, Shape};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// How long the hidden state may take to follow its step.
+/// How long the hidden states may take to arrive after their step.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reads `truth` in step with a client that acts.
+/// A reader of the channel `truth`, in step with a client that acts.
 pub struct TruthFeed {
     observer: Observer<TruthHeader>,
     shape: Shape,
@@ -25,9 +25,9 @@ impl TruthFeed {
         })
     }
 
-    /// The states of consecutive worlds at a step of the episodes with these seeds.
+    /// Returns the states of consecutive worlds at a step of the episodes with these seeds.
     ///
-    /// Samples of other worlds, steps and episodes are passed over, so read each step once, in order.
+    /// Skips samples of other worlds, steps and episodes, so each step must be read once, in order.
     pub fn states(&self, worlds: Range<u32>, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let mut states: Vec<Option<Grid<u8>>> = vec![None; worlds.len()];
         let deadline = Instant::now() + TIMEOUT;

@@ -1,11 +1,11 @@
-//! What an agent shows to observers.
+//! The view of an agent that is published to observers.
 
 use emberwatch_learning::rollout::Rollout;
 use emberwatch_protocol::feed::View;
 use std::ops::Range;
 use std::time::Duration;
 
-/// What an agent believes after a step; `planning`: time that its plan took.
+/// Returns an agent's belief and intent after a step. `planning` is the duration of its planning.
 pub fn view(rollout: &Rollout, world: u32, robots: Range<u32>, planning: Duration) -> View<'_> {
     View {
         world,

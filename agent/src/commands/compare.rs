@@ -1,4 +1,4 @@
-//! `compare`: the benchmark.
+//! `compare`: runs policies on the same worlds, and reports their results.
 
 use super::shared::{asks_for_help, lock_csv, make_folder, write};
 use super::worlds::WorldFlags;
@@ -30,53 +30,53 @@ use indicatif::{ProgressBar, ProgressStyle};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-/// Stands for the policies of [`policy::options_table`].
+/// The name that stands for all policies of [`policy::options_table`].
 const OPTIONS: &str = "options";
 
-/// The policy of teams, unless others are named.
-const OF_TEAMS: &str = "beam_exploit";
+/// The default policy where teams are compared.
+const TEAM_POLICY: &str = "beam_exploit";
 
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
-    /// The policies, separated by commas: names, or BELIEF/PLANNER/GOAL; `help` lists all parts; `options`: each option on
-    /// the belief of the decisions that were learned, the rule and the learned choice [default: the ladder; of teams:
-    /// beam_exploit]
+    /// Policies, separated by commas, as names or as BELIEF/PLANNER/GOAL; `help` lists names and parts; `options`
+    /// stands for each option, the rule and the learned choice, on the belief of learned decisions [default: a ladder
+    /// of policies from random to clairvoyant; with teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// The policy that others are paired against [default: shooting_exploit; of options: that which exploits; of
-    /// teams: the first policy; of recorded worlds without --model: coverage]
+    /// Policy with which the others are compared, paired by world [default: shooting_exploit; with options: the option
+    /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
-    /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
+    /// Robots per world, separated by commas; each number is run separately [default: 1, or the running server's]
     #[arg(long, conflicts_with = "task", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
     robots: Vec<u32>,
-    /// How the robots of a world act together, separated by commas
+    /// How the robots of a world act together: kinds of team, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
-    /// What `train` learned: adds to the ladder what acts on it; may be given once for each learner
+    /// Checkpoint of `train`, which adds learned policies to the ladder; may be given once per learner
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
-    /// Where networks compute: cpu, cuda or metal
+    /// Device for networks: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
-    /// Write one line per policy and world to this file
+    /// Write a CSV file with one row per policy and world
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// Rows that others measured on the same worlds, such as `emberwatch.benchmark` in Python; may be
-    /// given for each
+    /// Add the rows of a CSV file measured elsewhere on the same worlds, such as by `emberwatch.benchmark` in Python;
+    /// may be given several times
     #[arg(long, value_name = "FILE")]
     add: Vec<PathBuf>,
     /// Draw ladder.svg, rewards.svg, teams.svg and snapshot.svg into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
-    /// Show it in a browser while it runs, at this address
+    /// Show the running comparison in a browser, at this address
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8600")]
     watch: Option<SocketAddr>,
-    /// Write rewards step by step for TensorBoard into this directory, a run of each policy
+    /// Write the reward of each step for TensorBoard into this directory, with one run per policy
     #[arg(long, value_name = "DIR")]
     tensorboard: Option<PathBuf>,
-    /// Begin beliefs of a known model with each world's hidden state, instead of --prior
+    /// Start known-model beliefs from each world's hidden state, instead of --prior
     #[arg(long, conflicts_with = "prior")]
     first_state_known: bool,
     /// Steps for which a cell counts as seen after a visit, in the figures of merit
@@ -89,7 +89,7 @@ pub struct CompareCommand {
 }
 
 impl CompareCommand {
-    /// Runs the comparison and writes what it gave.
+    /// Runs the comparison and writes its results.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -136,10 +136,10 @@ impl CompareCommand {
             report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
             report.add(axis_label(arena.model()), results);
         }
-        self.tell(&report, added, &config, csv)
+        self.write_results(&report, added, &config, csv)
     }
 
-    fn tell(
+    fn write_results(
         &self,
         report: &Report,
         added: Vec<PolicyRun>,
@@ -147,7 +147,7 @@ impl CompareCommand {
         csv: Option<RunsFile>,
     ) -> Result<()> {
         let fits = check_fire(&added, &report.runs);
-        // What was measured is kept in any case.
+        // The rows of this comparison are written even if the added rows do not fit.
         let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
         write(&render_table(&all, &report.baseline))?;
@@ -179,7 +179,7 @@ impl CompareCommand {
         Ok(added)
     }
 
-    /// Checks the rows of `--add` before a comparison runs; rows of another number of robots belong to another one.
+    /// Checks the rows of `--add` before a comparison runs, except rows for another number of robots in `--robots`.
     fn check_added(
         &self,
         added: &[PolicyRun],
@@ -202,14 +202,14 @@ impl CompareCommand {
         check_added(&added, &policies, &worlds).context("--add")
     }
 
-    /// Locks the CSV file and makes the folders of the files to come.
+    /// Locks the CSV file and creates the folders for figures and events.
     fn make_places(&self) -> Result<Option<RunsFile>> {
         let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
         folders.into_iter().flatten().try_for_each(make_folder)?;
         lock_csv(self.csv.as_deref())
     }
 
-    /// The policies on an arena's worlds; of the ladder those that need no model, if there is none.
+    /// Returns the policies to run in an arena. If it lacks a model, the ladder keeps only policies that need none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
         let mut policies = self.policies(arena.model(), learned)?;
         if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
@@ -218,7 +218,7 @@ impl CompareCommand {
         Ok(policies)
     }
 
-    /// Refuses what no server can fly before one is waited for.
+    /// Refuses policies that no server can run, before waiting for a server.
     fn check_names(&self) -> Result<()> {
         let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
         policies.try_for_each(|name| policy::check_name(name))?;
@@ -237,7 +237,7 @@ impl CompareCommand {
             }
         };
         let policies = match self.policies.as_slice() {
-            [] if self.has_teams() => vec![named(&OF_TEAMS.to_owned())?],
+            [] if self.has_teams() => vec![named(&TEAM_POLICY.to_owned())?],
             [] => ladder(model, learned),
             names => {
                 let policies = names.iter().map(with_options);
@@ -260,14 +260,14 @@ impl CompareCommand {
         Ok(policies)
     }
 
-    /// Whether there is more to compare than policies of a robot alone in its world.
+    /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self) -> bool {
         let of_task = self.worlds.task().map(|task| task.robots);
         let mut robots = self.robots.iter().copied().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    /// The name of the one that was asked for; else of one of the policies, if these are of teams or of options.
+    /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
     fn baseline(&self, model: &Model, lacks_model: bool, policies: &[Policy]) -> Result<String> {
         if let Some(name) = &self.baseline {
             return Ok(Policy::named(name, model).context("--baseline")?.name);
@@ -278,12 +278,12 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| self.has_teams())
         };
-        let usual = if lacks_model {
+        let default = if lacks_model {
             "coverage"
         } else {
             "shooting_exploit"
         };
-        Ok(found.map_or(usual, |policy| &policy.name).to_owned())
+        Ok(found.map_or(default, |policy| &policy.name).to_owned())
     }
 
     fn needs_scouts(&self) -> bool {
@@ -298,11 +298,11 @@ impl CompareCommand {
     }
 }
 
-/// What came out, for all numbers of robots.
+/// The results for all numbers of robots.
 #[derive(Default)]
 struct Report {
     runs: Vec<PolicyRun>,
-    /// The same for all numbers of robots.
+    /// Burning cells per step. They do not depend on the number of robots.
     fire_cells: Vec<f32>,
     axis_label: String,
     baseline: String,
@@ -332,15 +332,16 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     replace_file(&path, settings.as_bytes(), Readers::Any)
 }
 
-/// Each option, the rule and the learned choice, on the belief of the decisions that were learned.
+/// Returns each option, the rule and the learned choice, on the belief of the learned decisions.
 fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
     let decisions = learned.get::<LearnedDecisions>();
     let decisions =
-        decisions.context("--policies options: expected --checkpoint FILE of decisions")?;
+        decisions.context("--policies options: expected --checkpoint FILE of learned decisions")?;
     Ok(policy::options_table(decisions.belief, model))
 }
 
-/// The ladder, with the policies on what was learned beside those on the known model, the autoencoder's below them.
+/// Returns the ladder with learned policies inserted: the autoencoder's after the policies without a belief, all others
+/// after the known-model policies.
 fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     let of_learned = policy::of_learned(learned, model).into_iter();
     let (network, others): (Vec<_>, Vec<_>) =
@@ -355,7 +356,7 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     ladder
 }
 
-/// Runs a comparison with a bar that shows how far it is.
+/// Runs a comparison with a progress bar.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
     let n_steps = comparison.n_contestants() as u64 * n_seeds * comparison.steps;
@@ -373,18 +374,18 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
     results
 }
 
-/// Draws a step of one robot's world; of several robots none is drawn.
+/// Draws a snapshot of a world with one robot. Worlds with several robots have none.
 fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<()> {
     if arena.n_robots() > 1 {
         return Ok(());
     }
     let Some(snapshot) = &results.snapshot else {
-        tracing::warn!("no snapshot: it needs published hidden states");
+        tracing::warn!("no snapshot: it needs hidden states, from a server with --publish-truth");
         return Ok(());
     };
     let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {
         tracing::warn!(
-            "no snapshot: it needs one world more than the seeds and a server with --coverage client"
+            "no snapshot: it needs a server with --coverage client and one more world than seeds"
         );
         return Ok(());
     };

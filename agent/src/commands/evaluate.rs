@@ -1,4 +1,4 @@
-//! `evaluate`: what a checkpoint is worth beside the known model, with its parameters fixed.
+//! `evaluate`: compares a checkpoint, with its parameters fixed, with the known model.
 
 use super::compare::run_comparison;
 use super::shared::{lock_csv, write};
@@ -21,10 +21,10 @@ use emberwatch_learning::policy::{self, Policy};
 use emberwatch_network::DeviceKind;
 use std::path::PathBuf;
 
-/// What rewards are paired against.
+/// The policy with which rewards are compared, paired by world.
 const BASELINE: &str = "beam_exploit";
 
-/// What is compared besides policies on what was learned.
+/// The policies that learned policies are compared with.
 const POLICIES: [&str; 4] = [
     "random_walk",
     "coverage",
@@ -32,22 +32,22 @@ const POLICIES: [&str; 4] = [
     "beam_exploit",
 ];
 
-/// Who chooses the paths on which predictions are scored.
+/// The policies on whose paths predictions are scored.
 const GUIDES: [&str; 2] = ["random_walk", "beam_exploit"];
 
-/// Score a checkpoint beside the known model.
+/// Compare a checkpoint's predictions and policies with the known model's.
 #[derive(Args)]
 pub struct EvaluateCommand {
-    /// What `train` learned; may be given once for each kind of learner
+    /// Checkpoint of `train`; may be given once per learner
     #[arg(long, value_name = "FILE", required = true)]
     checkpoint: Vec<PathBuf>,
-    /// Where networks compute: cpu, cuda or metal
+    /// Device for networks: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
-    /// Only score predictions, not policies
+    /// Score only predictions, not policies
     #[arg(long)]
     predictions_only: bool,
-    /// Write one line per policy and world to this file
+    /// Write a CSV file with one row per policy and world
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
     #[command(flatten)]
@@ -65,7 +65,7 @@ impl EvaluateCommand {
         let n_robots = self.worlds.task().map_or(1, |task| task.robots);
         ensure!(
             n_robots == 1,
-            "--task: expected one robot a world, got {n_robots}"
+            "--task: expected a task with one robot per world, got {n_robots}"
         );
         let mut worlds = self.worlds.open(false, Some(1), |_| Ok(()))?;
         let arena = &mut worlds.arena;
@@ -119,7 +119,7 @@ impl EvaluateCommand {
     }
 }
 
-/// Policies on the beliefs whose predictions are scored: of the known model, and those that were learned.
+/// Returns one policy for each belief whose predictions are scored: known-model beliefs and learned beliefs.
 fn examined(learned: &Learned) -> Vec<Policy> {
     let is_learned = |kind: &&BeliefKind| matches!(kind.learned(learned), Ok(Some(_)));
     let kinds = BELIEFS.iter().copied().filter(is_learned);
@@ -127,7 +127,7 @@ fn examined(learned: &Learned) -> Vec<Policy> {
     all.map(Policy::exploiting).collect()
 }
 
-/// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
+/// Renders the log-likelihood per visited cell, ± one standard error over worlds. Differences are paired by world.
 fn predictions(guide: &str, policies: &[Policy], scores: &[Scores], n_matrices: usize) -> String {
     let column = |of: &dyn Fn(&Scores) -> Score| -> Vec<f64> {
         scores.iter().map(|scores| of(scores).mean()).collect()

@@ -1,4 +1,4 @@
-//! `leaderboard`: an entry from the results of `suite`, and the page of all entries.
+//! `leaderboard`: adds an entry from the results of `suite`, and rebuilds the page of all entries.
 
 use super::shared::write;
 use crate::benchmark::report::leaderboard::{
@@ -12,40 +12,40 @@ use emberwatch_learning::file::{Readers, replace_file};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Where the page begins that is made: what stands before is kept.
+/// Mark in the page: the text above it is kept, the text below it is generated.
 const MADE: &str = "<!-- made by `emberwatch-agent leaderboard` -->";
 
-/// Add an entry to a leaderboard, and make its page and figure.
+/// Add an entry to the leaderboard and rebuild its page and figure.
 #[derive(Args)]
 pub struct LeaderboardCommand {
-    /// The folder of entries, a CSV file each
+    /// Folder of entries, one CSV file each
     #[arg(long, value_name = "FOLDER", default_value = "docs/leaderboard")]
     entries: PathBuf,
-    /// The page, of which all below its mark is replaced; a figure of its name, .svg, is put beside it
+    /// Page to rebuild: the text below its mark is replaced; the figure is written next to it, as .svg
     #[arg(long, value_name = "FILE", default_value = "docs/leaderboard.md")]
     page: PathBuf,
-    /// Add a policy: the folder that `suite --out`, or `emberwatch.benchmark.suite` in Python, wrote
+    /// Add a policy from this folder of results, written by `suite --out` or `emberwatch.benchmark.suite` in Python
     #[arg(long, value_name = "FOLDER", requires_all = ["policy", "by", "code", "commit"])]
     add: Option<PathBuf>,
-    /// The policy to add
+    /// Name of the policy to add
     #[arg(long, requires = "add")]
     policy: Option<String>,
-    /// Who made it
+    /// Author of the policy
     #[arg(long, requires = "add")]
     by: Option<String>,
-    /// Where its code is
+    /// Where to find its code, such as an https:// address
     #[arg(long, requires = "add")]
     code: Option<String>,
-    /// The commit of that code
+    /// Commit of that code: 7 to 40 hexadecimal digits
     #[arg(long, requires = "add")]
     commit: Option<String>,
-    /// Processor seconds of training, of all tasks together [default: those in the rows of `suite`]
+    /// Processor seconds of training, summed over all tasks [default: from the rows of `suite`]
     #[arg(long, value_name = "SECONDS", requires = "add")]
     training_seconds: Option<f64>,
 }
 
 impl LeaderboardCommand {
-    /// Adds the entry, if there is one, and makes the page.
+    /// Adds the entry of `--add`, if given, and rebuilds the page.
     pub fn run(&self) -> Result<()> {
         if let Some(folder) = &self.add {
             self.add(folder)?;
@@ -57,7 +57,7 @@ impl LeaderboardCommand {
             std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
         let (kept, _) = page.split_once(MADE).with_context(|| {
             format!(
-                "{}: expected a line {MADE}, below which the page is made",
+                "{}: expected a line {MADE} (the text below it is generated), got none",
                 self.page.display()
             )
         })?;
@@ -109,7 +109,7 @@ impl LeaderboardCommand {
         let same = others.find(|other| file_stem(other) == file_stem(&entry.about.policy));
         ensure!(
             same.is_none(),
-            "--policy {}: expected a name whose file is not that of {}",
+            "--policy {}: its file name is taken by the entry of {}: choose another name",
             entry.about.policy,
             same.unwrap_or(&entry.about.policy)
         );
@@ -118,7 +118,7 @@ impl LeaderboardCommand {
         entry.write(&path)
     }
 
-    /// The flag, or the sum over tasks of what their rows say.
+    /// Returns the flag's value, or the sum over the tasks of the value in their rows.
     fn training_seconds(&self, tasks: &[TaskRuns]) -> Result<f64> {
         if let Some(seconds) = self.training_seconds {
             return Ok(seconds);
@@ -127,7 +127,7 @@ impl LeaderboardCommand {
             let seconds = task.runs[0].training_seconds;
             seconds.with_context(|| {
                 format!(
-                    "expected --training-seconds, as the rows of task {} do not say them",
+                    "--training-seconds: expected a number, as the rows of task {} have none",
                     task.task
                 )
             })
@@ -136,7 +136,7 @@ impl LeaderboardCommand {
     }
 }
 
-/// A policy's runs in a task's file.
+/// Reads a policy's runs from a task's file.
 fn task(path: &Path, policy: &str) -> Result<TaskRuns> {
     let name = path.file_stem().unwrap_or_default().display().to_string();
     let mut runs = read_runs(path)?;

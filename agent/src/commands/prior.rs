@@ -1,4 +1,4 @@
-//! `prior`: a filter's first belief as a file, for filters in other languages.
+//! `prior`: writes a filter's first belief to a file, for filters in other languages.
 
 use super::shared::model_named;
 use anyhow::{Result, ensure};
@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 /// Write a filter's first belief to a file.
 #[derive(Args)]
 pub struct PriorCommand {
-    #[arg(long, value_name = "NAME|FILE", help = format!("The model: {} or a model file", listed(Model::built_in_names())))]
+    #[arg(long, value_name = "NAME|FILE", help = format!("Model: {}, or a model file", listed(Model::built_in_names())))]
     model: String,
     /// Grid height in cells
     #[arg(long)]
@@ -23,16 +23,16 @@ pub struct PriorCommand {
     /// Grid width in cells
     #[arg(long)]
     width: usize,
-    /// The server's burn-in: steps simulated from the initial distribution
+    /// Burn-in of the server: steps simulated from the initial distribution
     #[arg(long, value_parser = clap::value_parser!(u64).range(0..=1 << 40))]
     burn_in: u64,
-    /// Worlds simulated
+    /// Number of worlds to simulate
     #[arg(long, default_value_t = Prior::N_WORLDS as u64, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     worlds: u64,
-    /// Seed of these worlds: `--agent-seed` of an agent with the same belief
+    /// Seed of these worlds; agents with the same --agent-seed have the same first belief
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Where to: NumPy's .npy, 32-bit floats of shape [states, height, width]
+    /// Output file: NumPy .npy, 32-bit floats of shape [states, height, width]
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
 }
@@ -56,19 +56,19 @@ impl PriorCommand {
     }
 }
 
-/// Checks that the file can be written: better to fail before a long simulation than after.
+/// Checks that the file can be written, so that errors come before a long simulation.
 fn check_place(path: &Path) -> Result<()> {
     let place = path.display();
-    // What is neither a file nor missing, such as a device, must not be replaced by one.
+    // Only a regular file may be replaced, never a device.
     let free = path.metadata().map_or(true, |found| found.is_file());
     ensure!(
         free && path.file_name().is_some(),
-        "--out: expected a file, got {place}"
+        "--out: expected the path of a regular file, got {place}"
     );
     let folder = folder_of(path);
     ensure!(
         folder.is_dir() && access(folder, Access::WRITE_OK).is_ok(),
-        "--out: expected a file in a folder that can be written to, got {place}"
+        "--out: expected a file in a writable folder, got {place}"
     );
     Ok(())
 }

@@ -1,7 +1,7 @@
-//! `run`: act on one world of a running server.
+//! `run`: acts on one world of a running server.
 
 use super::shared::{WaitFlag, model_named, model_of, parse_range};
-use crate::acting::mission::{Company, Mission};
+use crate::acting::mission::{Cooperation, Mission};
 use crate::acting::run::run;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result};
@@ -22,49 +22,49 @@ use std::time::Duration;
 /// Act on one world of a running server.
 #[derive(Args)]
 pub struct RunCommand {
-    /// The server's instance name
+    /// Instance name of the server
     #[arg(long, default_value = "default")]
     instance: String,
     #[command(flatten)]
     wait: WaitFlag,
     #[arg(long, value_name = "NAME|FILE", value_parser = Task::named, help = format!(
-        "Refuse a server whose worlds are not this task: {} or a task file", listed(Task::built_in_names())))]
+        "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
     task: Option<Task>,
-    /// The world to act on
+    /// Number of the world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
-    /// The robot of that world to fly
+    /// Number of the robot to fly in that world
     #[arg(long, default_value_t = 0, conflicts_with = "robots")]
     robot: u32,
-    /// Several robots of that world to fly: needs --team
+    /// Numbers of several robots to fly in that world; needs --team
     #[arg(long, value_name = "FIRST..END", value_parser = parse_range::<u32>, requires = "team")]
     robots: Option<Range<u32>>,
-    /// Plan for all robots of the world that fly, on what all see; agents with the same policy and settings make the
-    /// same plan, of which each flies its own part
+    /// Plan for all flying robots of the world, on the observations of all, and fly this agent's part; agents with the
+    /// same policy and settings compute the same plan
     #[arg(long)]
     team: bool,
-    /// See what all robots of the world see, but plan without regard to the others
+    /// Use the observations of all robots of the world, but plan as if there were no other robots
     #[arg(long, conflicts_with = "team")]
     share: bool,
-    /// The policy, by its name or as BELIEF/PLANNER/GOAL; the parts are listed by --help
+    /// Policy, as a name or as BELIEF/PLANNER/GOAL; --help lists names and parts
     #[arg(long, default_value = "beam_exploit")]
     policy: String,
-    /// Steps to act for; 0: until stopped
+    /// Number of steps to act; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
-    /// Steps a second at most, for people who watch; without it: as many as possible
+    /// Maximum steps per second, to watch the robots [default: no limit]
     #[arg(long, value_name = "STEPS", value_parser = parse_rate)]
     steps_per_second: Option<f64>,
-    /// Take the robot from its holder
+    /// Take the robots over from the client that holds them
     #[arg(long)]
     takeover: bool,
     #[arg(long, value_name = "NAME|FILE", help = format!(
-        "The model, where the server does not reveal it: {} or a model file", listed(Model::built_in_names())))]
+        "Model, if the server does not reveal it: {}, or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
-    /// What `train` learned, for policies on a learned belief and those that a DQN decides for
+    /// Checkpoint of `train`, for policies with a learned belief or learned decisions
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Where networks compute: cpu, cuda or metal
+    /// Device for networks: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
     #[command(flatten)]
@@ -74,7 +74,7 @@ pub struct RunCommand {
 impl RunCommand {
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
-        // What no server can fly needs none to be refused.
+        // Refuse a policy that no server can run before waiting for one.
         match &model {
             Some(model) => Policy::named(&self.policy, model).map(drop),
             None => policy::check_name(&self.policy),
@@ -87,10 +87,10 @@ impl RunCommand {
                 .robots
                 .clone()
                 .unwrap_or(self.robot..self.robot.saturating_add(1)),
-            company: match (self.team, self.share) {
-                (true, _) => Company::Team,
-                (_, true) => Company::Shared,
-                _ => Company::Alone,
+            cooperation: match (self.team, self.share) {
+                (true, _) => Cooperation::Team,
+                (_, true) => Cooperation::Shared,
+                _ => Cooperation::Alone,
             },
             policy: self.policy.clone(),
             steps: self.steps,
@@ -121,12 +121,12 @@ fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
     Ok((task, model.transpose()?))
 }
 
-/// A rate at which observers see that the agent lives, and at which it is stopped within a second.
+/// Parses a rate of at least 1: observers would take a slower agent for dead, and it would take longer to stop.
 fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().unwrap_or(f64::NAN);
     if rate.is_finite() && rate >= 1.0 {
         Ok(rate)
     } else {
-        Err(format!("expected steps a second, 1 or more, got {text:?}"))
+        Err(format!("expected 1 or more steps per second, got {text:?}"))
     }
 }

@@ -1,4 +1,4 @@
-//! What several subcommands need: a server that may come, models by name, files and output.
+//! Helpers of several subcommands: waiting for a server, models by name, output files.
 
 use crate::benchmark::report::RunsFile;
 use crate::client::info::wait_for_server;
@@ -15,33 +15,35 @@ use std::path::Path;
 use std::str::FromStr;
 use std::time::Duration;
 
-/// How long to wait for a server.
+/// The flag `--wait`.
 #[derive(Debug, Args)]
 pub struct WaitFlag {
-    /// Seconds to wait until the instance has a server; 0: not at all
+    /// Maximum seconds to wait for the instance's server; 0: do not wait
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
     wait: Duration,
 }
 
 impl WaitFlag {
-    /// Waits for the instance's server; returns whether to go on: not once `is_over`.
+    /// Waits for the instance's server. Returns false if `is_over` came first.
     pub fn for_server(&self, instance: &Instance, is_over: impl Fn() -> bool) -> Result<bool> {
         Ok(wait_for_server(instance, self.wait, is_over)?)
     }
 }
 
-/// Whether `--policies help` asks what policies there are.
+/// Returns whether `--policies help` asks for the list of policies.
 pub fn asks_for_help(policies: &[String]) -> bool {
     policies.iter().any(|name| name == "help")
 }
 
 pub fn parse_seconds(text: &str) -> Result<Duration, String> {
-    let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
+    let seconds: f64 = text
+        .parse()
+        .map_err(|_| "expected a number of seconds, such as 60")?;
     let limit = Duration::try_from_secs_f64(seconds);
-    limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
+    limit.map_err(|error| format!("expected a number of seconds, such as 60: {error}"))
 }
 
-/// Consecutive numbers, at least one.
+/// Parses `FIRST..END`: at least one number, END excluded.
 pub fn parse_range<T: FromStr + PartialOrd>(text: &str) -> Result<Range<T>, String> {
     let parsed = text
         .split_once("..")
@@ -54,7 +56,7 @@ pub fn parse_range<T: FromStr + PartialOrd>(text: &str) -> Result<Range<T>, Stri
     }
 }
 
-/// A built-in model, or that of a file.
+/// Returns a built-in model, or reads a model file.
 pub fn model_named(name: &str) -> Result<Model> {
     if let Some(model) = Model::built_in(name) {
         return Ok(model);
@@ -62,18 +64,18 @@ pub fn model_named(name: &str) -> Result<Model> {
     let path = Path::new(name);
     ensure!(
         path.exists(),
-        "model file {name}: No such file: expected one, or {}",
+        "model file {name}: No such file: expected a model file, or one of {}",
         listed(Model::built_in_names())
     );
     read_model(path)
 }
 
-/// The model of a task that has one, with the task's sensor.
+/// Returns the model of a task with simulated worlds, with the task's sensor.
 pub fn model_of(task: &Task) -> Result<Model> {
     with_sensor(model_named(&task.model)?, task.radius())
 }
 
-/// A model whose robots see so many rows and columns beyond their path; `None`: as it says.
+/// Returns a model whose robots see `radius` rows and columns beyond their path; `None` keeps the model's radius.
 pub fn with_sensor(model: Model, radius: Option<usize>) -> Result<Model> {
     Ok(match radius {
         Some(radius) => model.with_radius(radius)?,
@@ -85,22 +87,22 @@ pub fn read_model(path: &Path) -> Result<Model> {
     Model::read(path).with_context(|| format!("model file {}", path.display()))
 }
 
-/// Makes the folder of a file to come.
+/// Creates the folder of an output file.
 pub fn make_folder_of(path: &Path) -> Result<()> {
     let parent = path.parent().filter(|parent| *parent != Path::new(""));
     parent.map_or(Ok(()), make_folder)
 }
 
-/// Makes a folder of files to come, and checks that it can be written to.
+/// Creates a folder for output files, and checks that it is writable.
 pub fn make_folder(path: &Path) -> Result<()> {
-    let expected = "expected a folder that can be written to, or a path where one can be made";
+    let expected = "expected a writable folder, or a path where one can be created";
     std::fs::create_dir_all(path)
         .map_err(Into::into)
         .and_then(|()| check_replaceable(&path.join("file")))
         .with_context(|| format!("create {}: {expected}", path.display()))
 }
 
-/// Locks the file of `--csv` until it is written, and makes its folder: better to fail before hours of work than after.
+/// Creates the folder of the `--csv` file and locks the file until it is written, so that errors come before the work.
 pub fn lock_csv(path: Option<&Path>) -> Result<Option<RunsFile>> {
     let lock = |path: &Path| {
         make_folder_of(path).with_context(|| path.display().to_string())?;

@@ -1,4 +1,4 @@
-//! `suite`: policies on the test worlds of all tasks, and one score.
+//! `suite`: runs policies on the test worlds of tasks, and gives each policy one score.
 
 use super::compare::run_comparison;
 use super::shared::{asks_for_help, make_folder, write};
@@ -27,40 +27,39 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// How long to wait for another process that writes results.
+/// How long to wait while another process writes results.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Run policies on the test worlds of tasks, and give each one score.
+/// Run policies on the test worlds of tasks, with one score per policy.
 #[derive(Args)]
 pub struct SuiteCommand {
     #[arg(long, value_delimiter = ',', help = format!(
-        "Names or files of tasks, separated by commas [default: {}]", listed(Task::built_in_names())))]
+        "Tasks, separated by commas, as names or task files [default: {}]", listed(Task::built_in_names())))]
     tasks: Vec<String>,
-    /// The policies, separated by commas; `help` lists their parts; `random_walk` and `oracle_ahead`, which are scores 0 and
-    /// 1, are always run
+    /// Policies, separated by commas (`help` lists them); random_walk (score 0) and oracle_ahead (score 1) always run
     #[arg(
         long,
         value_delimiter = ',',
         default_value = "coverage,beam_exploit,learned_beam,learned_policy"
     )]
     policies: Vec<String>,
-    /// For learned policies: a folder with what --train, or `train --task NAME --out FOLDER/NAME`, learned of each task
+    /// Folder of checkpoints for learned policies, written by --train or by `train --task NAME --out FOLDER/NAME`
     #[arg(long, value_name = "FOLDER")]
     checkpoints: Option<PathBuf>,
-    /// First train what the policies need and --checkpoints lacks; continues trainings that were stopped
+    /// First train what the policies need and --checkpoints lacks; resumes interrupted trainings
     #[arg(long, requires = "checkpoints")]
     train: bool,
     /// World steps of each training, summed over its worlds [default: from the settings]
     #[arg(long, value_name = "STEPS", requires = "train", value_parser = clap::value_parser!(u64).range(1..))]
     train_steps: Option<u64>,
-    /// A folder for results, a CSV file a task; rows that it has are kept, unless the checkpoint, the settings or
-    /// the task's worlds have changed
+    /// Folder for results, with one CSV file per task; its rows are kept unless the checkpoint, the settings or the
+    /// task's worlds have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
-    /// Worlds of each task, the first of its test seeds [default: all]
+    /// Number of worlds per task, from the first test seed on [default: all]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     worlds: Option<u64>,
-    /// The server's program, if it is not beside this one
+    /// Path of emberwatch-server [default: in the folder of this program, or on PATH]
     #[arg(long, value_name = "PROGRAM")]
     server: Option<PathBuf>,
     #[command(flatten)]
@@ -68,7 +67,7 @@ pub struct SuiteCommand {
 }
 
 impl SuiteCommand {
-    /// Runs what is missing, and tells all scores.
+    /// Runs what is missing, and writes the scores of all policies.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -81,7 +80,7 @@ impl SuiteCommand {
             .filter_map(|name| policy::belief_of(name));
         ensure!(
             beliefs.all(|belief| belief.input != Input::NextStates),
-            "--policies: expected none that is told the next states, as these act only in `compare`"
+            "--policies: clairvoyant policies, which see the next hidden states, run only in `compare`: remove them"
         );
         let config = self.settings.effective()?;
         let folder = self.checkpoints.as_deref();
@@ -122,7 +121,7 @@ impl SuiteCommand {
         Ok(tasks.collect::<Result<_, _>>()?)
     }
 
-    /// What is to be done on a task; all names and files are checked before anything runs.
+    /// Returns the plan for a task. Checks names and worlds, so that errors come before any run.
     fn plan(&self, task: Task, config: &AgentConfig) -> Result<Plan> {
         let seeds = self.seeds(&task);
         let (arena, _server) = self.open(&task, &seeds, 1)?;
@@ -130,12 +129,13 @@ impl SuiteCommand {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
         ensure!(
             task.max_steps <= longest,
-            "max_steps: expected at most {longest}, as the shortest episode has, got {}",
+            "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
             task.max_steps
         );
         let fingerprint = info.worlds_fingerprint.clone();
-        let fingerprint = fingerprint
-            .context("expected a server that identifies its worlds: use the one of this release")?;
+        let fingerprint = fingerprint.context(
+            "server: expected worlds_fingerprint, got none: use the server of this release",
+        )?;
         let worlds = CommonWorlds {
             fingerprint: Some(fingerprint),
             seeds: seeds.clone().collect(),
@@ -170,7 +170,7 @@ impl SuiteCommand {
         })
     }
 
-    /// All policies of the command, each once.
+    /// Returns all policies of the command, each once.
     fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
         let names = [FLOOR, CEILING].into_iter();
         let mut policies: Vec<Policy> = Vec::new();
@@ -183,8 +183,8 @@ impl SuiteCommand {
         Ok(policies)
     }
 
-    /// Trains for the policies of a task, then runs those whose runs are missing or outdated, one by one; returns all runs
-    /// that count. Policies that cannot run are left out, with a warning.
+    /// Trains what the policies of a task need, then runs each policy whose runs are missing or outdated. Returns all
+    /// valid runs. Leaves out policies that cannot run, with a warning.
     fn carry_out(&self, plan: &Plan, trainings: Option<&Trainings<'_>>) -> Result<TaskRuns> {
         let mut ready = Vec::new();
         for policy in &plan.policies {
@@ -232,7 +232,7 @@ impl SuiteCommand {
                 .map_or(all.end, |n| all.end.min(all.start.saturating_add(n)))
     }
 
-    /// A server with a task's worlds, which stops when it is dropped.
+    /// Starts a server with a task's worlds, and opens them. Dropping the server stops it.
     fn open(&self, task: &Task, seeds: &Range<u64>, n_worlds: u32) -> Result<(Arena, OwnServer)> {
         let worlds = n_worlds.min(MAX_BATCH).to_string();
         let seed = seeds.start.to_string();
@@ -256,12 +256,12 @@ impl SuiteCommand {
 fn check_stop(trainings: Option<&Trainings<'_>>) -> Result<()> {
     ensure!(
         !trainings.is_some_and(Trainings::is_stopped),
-        "stopped: the same command continues"
+        "stopped by a signal: run the same command to continue"
     );
     Ok(())
 }
 
-/// What is to be done on a task.
+/// The policies, worlds and files of one task of a suite.
 struct Plan {
     task: Task,
     policies: Vec<Policy>,
@@ -270,7 +270,7 @@ struct Plan {
     file: PathBuf,
     worlds: CommonWorlds,
     model: Model,
-    /// Without policies and what they learned.
+    /// Settings of the comparison, without policies and checkpoints.
     comparison: Comparison,
 }
 
@@ -283,7 +283,7 @@ impl Plan {
         self.lock()?.read()
     }
 
-    /// What a policy acts on, which is learned first where it may be.
+    /// Reads a policy's checkpoints. With `trainings`, first trains what is missing.
     fn prepare(&self, policy: &Policy, trainings: Option<&Trainings<'_>>) -> Result<Lesson> {
         ensure!(
             !(self.task.is_recorded() && policy.belief.knows_model),
@@ -310,7 +310,7 @@ impl Plan {
         trainings::find(self.checkpoints.as_deref(), &self.task, policy, &self.form)
     }
 
-    /// Whether a policy's rows need not be run again; says which are.
+    /// Returns whether a policy's rows are still valid, and logs the result.
     fn keeps(&self, policy: &Policy, kept: &[PolicyRun]) -> bool {
         let (task, name) = (&self.task.name, &policy.name);
         let n_rows = kept.iter().filter(|run| run.policy == *name).count();
@@ -325,7 +325,7 @@ impl Plan {
         true
     }
 
-    /// Reads all runs that count; warns of the policies whose runs do not.
+    /// Reads all valid runs. Leaves out policies whose runs are invalid, with a warning.
     fn valid_runs(&self) -> Result<Vec<PolicyRun>> {
         let mut runs = self.read()?;
         let policies: BTreeSet<String> = runs.iter().map(|run| run.policy.clone()).collect();
@@ -340,7 +340,8 @@ impl Plan {
         Ok(runs)
     }
 
-    /// Checks that a policy's runs are of the task's worlds, and those of a built-in policy of what it is now.
+    /// Checks that a policy's runs are of the task's worlds. For a built-in policy, also checks that its settings and
+    /// checkpoint have not changed.
     fn check(&self, policy: &str, runs: &[PolicyRun]) -> Result<()> {
         let seeds = &self.comparison.seeds;
         let is_own = |run: &&PolicyRun| run.policy == policy && seeds.contains(&run.world_seed);
@@ -366,7 +367,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Replaces the rows of the policy that was run; rows that others have written meanwhile stay.
+    /// Replaces one policy's rows in the file. Keeps rows that other processes have written in the meantime.
     fn replace(&self, runs: Vec<PolicyRun>) -> Result<()> {
         let file = self.lock()?;
         let mut all = file.read()?;

@@ -24,79 +24,78 @@ use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-/// Worlds of a training, unless its learner follows one alone.
+/// Default number of training worlds. A learner that follows a single world uses 1.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// Names of the frames that a filter learns from.
+/// Values of `--coverage`: whether frames show every cell, the name, and the help.
 const COVERAGES: [(bool, &str, &str); 2] = [
     (false, "path", "The cells in sight of the path"),
     (
         true,
         "full",
-        "Every cell, where the server's coverage is `client` or `full`",
+        "Every cell, if the server's coverage is `client` or `full`",
     ),
 ];
 
 /// Learn a model while acting on a server's worlds.
 #[derive(Args)]
 pub struct TrainCommand {
-    /// Act on this running server; without it, one is started and stopped
+    /// Train on this running server; without it, the command starts a server and stops it at the end
     #[arg(long)]
     instance: Option<String>,
     #[command(flatten)]
     wait: WaitFlag,
-    /// The first world to act on
+    /// Number of the first world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
-    /// Number of worlds to act on at once [default: 16, or the autoencoder's 1]
+    /// Number of worlds to act on at once [default: 16; with --learner autoencoder: 1]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MAX_WORLDS as i64))]
     worlds: Option<u32>,
-    /// What to learn [default: filter; of preset paper: autoencoder]
+    /// What to learn [default: filter; with --preset paper: autoencoder]
     #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
     learner: Option<String>,
-    /// What the kernels of a filter see [default: neighbours]
+    /// What a filter's kernels depend on [default: neighbours]
     #[arg(long, value_parser = one_of(&KernelKind::ALL))]
     kernels: Option<KernelKind>,
-    /// World steps to act for, of all worlds together; 0: until stopped [default: 0; of neural and decisions: what
-    /// is left of those of the settings]
+    /// World steps to act, summed over all worlds; 0: until stopped [default: 0; with --learner neural or decisions:
+    /// the remaining steps of the settings]
     #[arg(long)]
     steps: Option<u64>,
-    /// Whose belief decisions are learned on [default: learned_filter, or the checkpoint's to go on from]
+    /// Estimator whose belief decisions are learned on [default: learned_filter; with --resume: the checkpoint's]
     #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
     estimator: Option<&'static BeliefKind>,
-    /// That belief, of an earlier training; without it, one is learned first. With --learner neural: a filter, whose
-    /// belief the network then corrects
+    /// Checkpoint of the --estimator from an earlier training; without it, the estimator is trained first. With
+    /// --learner neural: a filter whose belief the network corrects
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Seconds to act for, with a belief that is learned first
+    /// Maximum seconds to act, including the training of an estimator
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors, metrics.csv and training.svg; a belief that is learned first has a folder in it
+    /// Folder for checkpoint.safetensors, metrics.csv and training.svg, with a subfolder for an estimator trained first
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
+    /// Resume from the folder's checkpoint, bit for bit if the worlds are where the checkpoint left them
     #[arg(long)]
     resume: bool,
-    /// Cells that the frames show to a filter that is learned [default: from the settings, or the
-    /// checkpoint with --resume]
+    /// Cells that frames show to a filter in training [default: from the settings; with --resume: the checkpoint's]
     #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
     full_frames: Option<bool>,
-    /// Act on the checkpoint's parameters without learning
+    /// Act with the checkpoint's parameters, without learning
     #[arg(long, requires = "resume")]
     freeze: bool,
-    /// Where an autoencoder or a neural belief computes: cpu, cuda or metal
+    /// Device for an autoencoder or a neural belief: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
-    /// Take the worlds from their holder
+    /// Take the worlds over from the client that holds them
     #[arg(long)]
     takeover: bool,
-    /// The server's program, if it is not beside this one
+    /// Path of emberwatch-server [default: in the folder of this program, or on PATH]
     #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
     server: Option<PathBuf>,
-    /// First seed of the worlds of the server that is started
+    /// Seed of the started server's first world
     #[arg(long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
-    /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
+    /// Burn-in of the started server, in steps [default: 25000; with --preset paper: 0]
     #[arg(long, conflicts_with_all = ["instance", "states", "task"])]
     burn_in: Option<u64>,
     #[command(flatten)]
@@ -143,7 +142,7 @@ impl TrainCommand {
         if let Some(full_frames) = self.full_frames {
             ensure!(
                 *kind == FILTER,
-                "--coverage applies only with --learner filter, got {}",
+                "--coverage applies only with --learner filter, got --learner {}",
                 kind.name
             );
             config.full_frames = full_frames;
@@ -152,7 +151,8 @@ impl TrainCommand {
             .worlds
             .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
         let last = self.world.checked_add(n_worlds);
-        let last = last.context("--world: expected a world that a server may have")?;
+        let last =
+            last.context("--world: expected a world that a server can have, got a larger number")?;
         let steps = (kind.steps)(&config);
         let device = self.device.open()?;
         let learned = self.learned(kind, &config, &device)?;
@@ -171,7 +171,7 @@ impl TrainCommand {
         })
     }
 
-    /// The belief that was given for decisions, or for a network to correct; refuses what would be ignored.
+    /// Reads the belief that decisions act on, or that a network corrects. Refuses flags that would be ignored.
     fn learned(
         &self,
         kind: &LearnerKind,
@@ -181,11 +181,13 @@ impl TrainCommand {
         let (is_neural, decides) = (*kind == learners::neural::NEURAL, decides(kind));
         ensure!(
             self.estimator.is_none() || decides,
-            "--estimator: expected none, or --learner decisions"
+            "--estimator applies only with --learner decisions, got --learner {}",
+            kind.name
         );
         ensure!(
             self.checkpoint.is_none() || decides || is_neural,
-            "--checkpoint: expected none, or --learner decisions or neural"
+            "--checkpoint applies only with --learner decisions or neural, got --learner {}",
+            kind.name
         );
         let belief = if is_neural {
             &LEARNED
@@ -199,14 +201,14 @@ impl TrainCommand {
             && by.is_some_and(|by| by.learner == FILTER.name);
         ensure!(
             self.kernels.is_none() || *kind == FILTER || begins_filter,
-            "--kernels: expected a filter that is learned: --learner filter, or --learner decisions on one, without \
-             --checkpoint or --resume"
+            "--kernels applies only where a filter is trained: with --learner filter, or with --learner decisions \
+             on a learned filter, without --checkpoint and --resume"
         );
         let learned = learners::read(self.checkpoint.as_deref(), device)?;
         if let Some(path) = &self.checkpoint {
             ensure!(
                 matches!(belief.learned(&learned), Ok(Some(_))),
-                "--checkpoint {}: expected what {} acts on, got another",
+                "--checkpoint {}: expected a checkpoint for the estimator {}, got one of another kind",
                 path.display(),
                 belief.label
             );
@@ -214,20 +216,20 @@ impl TrainCommand {
         Ok(learned)
     }
 
-    /// What to go on from, if that is asked for; `None` also if it is a belief, before decisions on it.
-    /// Decisions go on with the estimator that they began with.
+    /// Returns the checkpoint to resume, and adopts what it determines in the settings. Returns `None` without
+    /// `--resume`, and if an interrupted training of decisions had only trained the belief.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
         let kind = training.learner()?;
         if decides(kind)
             && self.resume
-            && let Some(belief) = training.go_on_with_belief()?
+            && let Some(belief) = training.adopt_belief()?
         {
             ensure!(
                 !self.freeze,
-                "--freeze: expected a checkpoint of decisions in {}, got one of their belief alone",
+                "--freeze: expected a checkpoint of decisions in {}, got only one of their belief",
                 self.out.display()
             );
-            self.go_on_with(belief, training)?;
+            self.adopt_estimator(belief, training)?;
             return Ok(None);
         }
         let contents = training.check()?;
@@ -243,32 +245,38 @@ impl TrainCommand {
             let (expected, got) = (training.config.full_frames, self.full_frames);
             ensure!(
                 got.is_none_or(|got| got == expected),
-                "--coverage: expected the checkpoint's, {}",
-                COVERAGES[usize::from(expected)].1
+                "--coverage: expected {} as in the checkpoint, got {}",
+                COVERAGES[usize::from(expected)].1,
+                COVERAGES[usize::from(!expected)].1
             );
             if decides(kind) {
                 let belief = contents.state::<SavedDecisions>()?.kind()?;
-                self.go_on_with(belief, training)?;
+                self.adopt_estimator(belief, training)?;
             }
-            self.go_on_for((kind.done)(contents)?, training)?;
+            self.limit_steps((kind.done)(contents)?, training)?;
         }
         Ok(contents)
     }
 
-    /// Goes on for the steps that are left of those of the settings, unless a flag says otherwise.
-    fn go_on_for(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
+    /// Limits a resumed training to the remaining steps of the settings, unless `--steps` is given.
+    fn limit_steps(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
         let all = (training.learner()?.steps)(&training.config);
         if self.steps.is_none() && !self.freeze && all > 0 {
             training.steps = all.saturating_sub(done);
             ensure!(
                 training.steps > 0,
-                "--steps: expected a number, as the {all} of the settings are done"
+                "--steps: expected a number of steps, as all {all} steps of the settings are done"
             );
         }
         Ok(())
     }
 
-    fn go_on_with(&self, expected: &'static BeliefKind, training: &mut TrainingSpec) -> Result<()> {
+    /// Sets the estimator of the checkpoint. Refuses an `--estimator` that differs.
+    fn adopt_estimator(
+        &self,
+        expected: &'static BeliefKind,
+        training: &mut TrainingSpec,
+    ) -> Result<()> {
         let got = self.estimator.unwrap_or(expected);
         ensure!(
             got == expected,
@@ -284,13 +292,13 @@ impl TrainCommand {
     fn check_no_checkpoint(&self) -> Result<()> {
         ensure!(
             self.checkpoint.is_none(),
-            "--checkpoint: expected none beside --resume, which goes on with the belief of {}",
+            "--checkpoint cannot be combined with --resume, which continues with the belief in {}",
             self.out.display()
         );
         Ok(())
     }
 
-    /// The server, and itself if it was started: dropped, it stops.
+    /// Returns the instance to train on, and its server if it was started here. Dropping the server stops it.
     fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
@@ -303,7 +311,7 @@ impl TrainCommand {
         self.grid.check()?;
         ensure!(
             self.world == 0,
-            "--world: expected 0 on a server of its own, got {}",
+            "--world: expected 0 on a server that the command starts, got {}",
             self.world
         );
         let burn_in = self.burn_in.unwrap_or(match self.settings.preset {
@@ -313,7 +321,7 @@ impl TrainCommand {
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
         let episode_steps = (training.learner()?.episode_steps)(&training.config);
-        // A task has its own.
+        // A task sets the episode length itself.
         let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
         let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
         arguments.extend(episode.into_iter().flatten());
@@ -322,13 +330,13 @@ impl TrainCommand {
     }
 }
 
-/// A server with some worlds for a training; dropped, it stops.
+/// Starts a server for a training. Dropping it stops the server.
 pub(super) fn start_server(
     program: Option<PathBuf>,
     mut arguments: Vec<String>,
     training: &TrainingSpec,
 ) -> Result<OwnServer> {
-    // What learns a model does not look at it, and could not.
+    // A learner of a model must not see the true one.
     let reveals = decides(training.learner()?) && training.belief()?.knows_model;
     let reveals = reveals.to_string();
     let rest = ["--reveal-model", &reveals, "--coverage", "client"];
@@ -340,26 +348,26 @@ fn decides(kind: &LearnerKind) -> bool {
     *kind == learners::decisions::DECISIONS
 }
 
-/// Whether decisions are to be learned on a belief that is yet to be learned.
+/// Returns whether a training of decisions must first train their belief.
 fn needs_belief(training: &TrainingSpec) -> Result<bool> {
     Ok(decides(training.learner()?) && training.belief()?.learned(&training.learned).is_err())
 }
 
-/// Learns the belief that decisions are to be learned on, unless that is done.
+/// Trains the belief that decisions act on, unless its training is complete.
 fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
-    let Some(belief) = training.of_belief()? else {
+    let Some(belief) = training.belief_training()? else {
         return Ok(());
     };
     make_folder(&belief.out)?;
     let n_steps = learn(instance, &belief, belief.check()?, stop)?;
     ensure!(
         n_steps >= belief.steps || stop.load(Relaxed),
-        "--time-limit: the belief is not learned yet: continue with --resume"
+        "--time-limit: the time ended before the belief was learned: continue with --resume"
     );
     Ok(())
 }
 
-/// Trains, says what that gave, and returns the world steps that were acted.
+/// Trains, logs a summary, draws the metrics, and returns the number of world steps.
 pub(super) fn learn(
     instance: &Instance,
     training: &TrainingSpec,

@@ -1,4 +1,4 @@
-//! The trainings of a suite's policies: finds their checkpoints, and runs missing trainings.
+//! Trainings for the policies of a suite: finds their checkpoints, and runs missing trainings.
 //!
 //! `FOLDER/TASK` has a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
 //! `decisions-BELIEF` for decisions on a belief. A policy that lacks its folder uses the checkpoint that `train --out
@@ -27,16 +27,16 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 #[derive(Debug, Default)]
 pub struct Lesson {
     pub learned: Learned,
-    /// Processor seconds of all its trainings; `None` if one of them has no record of them.
+    /// Processor seconds of all its trainings; `None` if one training has no record.
     pub seconds: Option<f64>,
-    /// Whether `suite --train` leaves it alone: the policy needs no checkpoint, or the user ran `train`.
+    /// Whether `suite --train` keeps it as it is: the policy needs no checkpoint, or the user ran `train`.
     pub is_final: bool,
     /// The learner of the last training and its world steps.
     steps: Option<(&'static LearnerKind, u64)>,
 }
 
 impl Lesson {
-    /// Describes the last training if it is shorter than the settings say.
+    /// Describes the last training if it has fewer world steps than the settings specify.
     pub fn unfinished(&self, config: &AgentConfig) -> Option<String> {
         let (kind, done) = self.steps.filter(|_| !self.is_final)?;
         let all = steps_of_settings(kind, config);
@@ -80,7 +80,7 @@ pub fn find(
     Ok(lesson)
 }
 
-/// A policy's trainings, the belief first: the learner's name and the folder.
+/// Returns a policy's trainings, the belief first, each as the learner's name and the folder.
 fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static str, PathBuf)> {
     let belief = policy.belief.learned_by.as_ref();
     let belief = belief.map(|by| (by.learner, folder.join(by.learner)));
@@ -91,7 +91,7 @@ fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static s
     belief.into_iter().chain(decisions)
 }
 
-/// Reads the checkpoint of the last training, which holds the belief of those before. Counts the seconds of all.
+/// Reads the checkpoint of the last training, which includes the belief of the first. Adds up the seconds of all.
 fn read(folders: &[PathBuf]) -> Result<Lesson> {
     let seconds = folders.iter().map(|folder| seconds::read(folder));
     let seconds = seconds.collect::<Result<Vec<_>>>()?;
@@ -109,7 +109,7 @@ fn read(folders: &[PathBuf]) -> Result<Lesson> {
     })
 }
 
-/// Refuses decisions that were learned on another belief than the one next to them.
+/// Refuses decisions that were not learned on the belief in the neighbouring folder.
 fn check_decisions(own: &[PathBuf]) -> Result<()> {
     let places: Vec<PathBuf> = own.iter().map(|folder| folder.join(CHECKPOINT)).collect();
     if let [belief, decisions] = places.as_slice()
@@ -125,7 +125,7 @@ fn check_decisions(own: &[PathBuf]) -> Result<()> {
     Ok(())
 }
 
-/// Refuses to train a belief further, if decisions were learned on it as it is.
+/// Refuses to train a belief further if decisions were learned on its present state.
 fn check_dependents(belief: &Path, learner: &str) -> Result<()> {
     for kind in BELIEFS {
         let decisions = format!("{}-{}", DECISIONS.name, kind.label);
@@ -136,7 +136,7 @@ fn check_dependents(belief: &Path, learner: &str) -> Result<()> {
             .is_some_and(|by| by.learner == learner);
         ensure!(
             !(is_dependent && decisions.join(CHECKPOINT).exists()),
-            "{} was learned on {} as it is: remove it to train the belief further",
+            "{} was learned on the present belief in {}: remove it to train the belief further",
             decisions.display(),
             belief.display()
         );
@@ -144,7 +144,7 @@ fn check_dependents(belief: &Path, learner: &str) -> Result<()> {
     Ok(())
 }
 
-/// The world steps of a training by the settings.
+/// Returns the number of world steps that the settings specify for a training.
 fn steps_of_settings(kind: &LearnerKind, config: &AgentConfig) -> u64 {
     match (kind.steps)(config) {
         0 if *kind == FILTER => config.decisions.filter_steps,
@@ -178,12 +178,12 @@ impl<'a> Trainings<'a> {
         })
     }
 
-    /// Whether a signal has asked to stop.
+    /// Returns whether a signal has asked to stop.
     pub fn is_stopped(&self) -> bool {
         self.stop.load(Relaxed)
     }
 
-    /// Starts or resumes a policy's trainings. Complete ones stay as they are.
+    /// Starts or resumes a policy's trainings. Does not change complete trainings.
     ///
     /// # Errors
     /// If a learner cannot learn in the task's worlds, or decisions were learned on another belief.
@@ -209,7 +209,7 @@ impl<'a> Trainings<'a> {
         let steps = self.steps.unwrap_or(steps_of_settings(kind, config));
         ensure!(
             steps > 0,
-            "expected --train-steps, as the {} has no default length",
+            "--train-steps: expected a number of steps, as the {} has no default length",
             kind.name
         );
         Ok(TrainingSpec {

@@ -1,4 +1,4 @@
-//! The worlds that policies meet: a running server's, or a private one's.
+//! Flags that choose the worlds: on a running server, or on a private server that the command starts.
 
 use super::shared::{WaitFlag, model_named, model_of, parse_range, with_sensor};
 use crate::benchmark::arena::{Arena, MAX_BATCH};
@@ -23,77 +23,77 @@ const BENCHMARK_STEPS: u64 = 1500;
 
 const BENCHMARK_SEEDS: Range<u64> = 0..8;
 
-/// Flags that say which worlds.
+/// Flags that choose the worlds of a comparison.
 #[derive(Debug, Args)]
 pub struct WorldFlags {
-    /// Use the worlds of this running server; without it, one is started and stopped
+    /// Use the worlds of this running server; without it, the command starts a server and stops it at the end
     #[arg(long)]
     instance: Option<String>,
     #[command(flatten)]
     wait: WaitFlag,
-    /// World seeds, first..end [default: 0..8, or those to test the task on]
+    /// World seeds, FIRST..END [default: 0..8, or the task's test seeds]
     #[arg(long, value_parser = parse_seeds)]
     seeds: Option<Range<u64>>,
-    /// Scored steps of each world [default: those of the task, or 1500, or as many as the shortest episode has]
+    /// Scored steps per world [default: the task's episode length, or 1500, or the shortest episode's length if less]
     #[arg(long, value_parser = value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     /// Steps simulated before the first scored one [default: 25000, or the running server's]
     #[arg(long, conflicts_with_all = ["states", "task"])]
     burn_in: Option<u64>,
-    /// The server's program, if it is not beside this one
+    /// Path of emberwatch-server [default: in the folder of this program, or on PATH]
     #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
     server: Option<PathBuf>,
     #[command(flatten)]
     grid: GridFlags,
 }
 
-/// Flags of a server that is started.
+/// Flags for the worlds of a started server.
 #[derive(Debug, Args)]
 pub struct GridFlags {
     #[arg(long, value_name = "NAME|FILE", value_parser = Task::named,
         conflicts_with_all = ["instance", "model", "height", "width", "moves", "states"],
-        help = format!("The task whose worlds the server that is started has: {} or a task file",
+        help = format!("Task of the started server: {}, or a task file",
             listed(Task::built_in_names())))]
     pub task: Option<Task>,
     #[arg(long, value_name = "NAME|FILE", conflicts_with = "instance",
-        help = format!("The model, for the server that is started: {} or a model file; with --states, the model of beliefs \
+        help = format!("Model of the started server: {}, or a model file; with --states: the model of beliefs \
             [default: {DEFAULT_MODEL}; with --states: none]", listed(Model::built_in_names())))]
     model: Option<String>,
     #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64), conflicts_with_all = ["instance", "task"],
-        help = format!("Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS}, for the \
-            server that is started [default: as the model says]"))]
+        help = format!("Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS}, on the \
+            started server [default: the model's]"))]
     sensor_radius: Option<u8>,
-    /// Grid height in cells, for the server that is started
+    /// Grid height of the started server, in cells
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     height: usize,
-    /// Grid width in cells, for the server that is started
+    /// Grid width of the started server, in cells
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     width: usize,
-    /// Moves in a path, for the server that is started
+    /// Moves per path on the started server
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
     #[arg(long, value_name = "NAME|FILE|FOLDER", conflicts_with_all = ["instance", "height", "width"],
-        help = format!("Recorded states for the started server, instead of simulated ones: {} or a .npz or .npy \
+        help = format!("Recorded states for the started server, instead of simulated states: {}, or a .npz or .npy \
             file or folder", listed(state_names())))]
     states: Option<String>,
-    /// World seeds choose among the symmetries of the grid, too
+    /// Let the world's seed also choose a symmetry of the grid: a rotation or reflection of the recorded states
     #[arg(long, requires = "states")]
     states_symmetries: bool,
-    /// Episodes begin at a recorded step of 0 to this
+    /// Start each episode at a recorded step from 0 to STEPS, drawn by the world's seed
     #[arg(long, value_name = "STEPS", requires = "states", default_value_t = 0)]
     states_offset: u64,
 }
 
-/// Worlds, and the server that was started for them: dropped, it stops.
+/// An arena, and the server that was started for it, which stops when it is dropped.
 pub struct Worlds {
     pub arena: Arena,
     _own: Option<OwnServer>,
 }
 
 impl WorldFlags {
-    /// Attaches to the server or starts one. `check` refuses what cannot be right before that.
+    /// Attaches to the running server, or starts one after `check` has accepted the model.
     ///
-    /// `n_robots`: robots of each world; `None`: one, or the running server's.
+    /// `n_robots`: robots per world; `None`: one on a started server, any number on a running one.
     pub fn open(
         &self,
         needs_scouts: bool,
@@ -135,15 +135,15 @@ impl WorldFlags {
         Ok(Worlds { arena, _own: own })
     }
 
-    /// Scored steps, as many as were asked for or as the benchmark has, if episodes are as long.
+    /// Returns the number of scored steps. Fails if the shortest episode has fewer.
     pub fn steps(&self, info: &ServerInfo) -> Result<u64> {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
         let of_task = self.task().map(|task| task.max_steps);
-        let usual = of_task.unwrap_or(BENCHMARK_STEPS.min(longest));
-        let steps = self.steps.unwrap_or(usual);
+        let default = of_task.unwrap_or(BENCHMARK_STEPS.min(longest));
+        let steps = self.steps.unwrap_or(default);
         ensure!(
             steps <= longest,
-            "--steps: expected at most {longest}, as the shortest episode has, got {steps}"
+            "--steps: expected at most {longest}, the length of the shortest episode, got {steps}"
         );
         Ok(steps)
     }
@@ -174,8 +174,8 @@ impl WorldFlags {
     }
 }
 
-/// The flags of a server with so many robots a world. Robots with one start and one belief would fly one path for good,
-/// so several start at random cells.
+/// Returns the server's flags for `n_robots` robots per world. Several robots start at random cells: with the same
+/// start and the same belief, all would fly the same path forever.
 fn robot_arguments(n_robots: u32) -> Vec<String> {
     let robots = ["--robots".to_owned(), n_robots.to_string()];
     let start = ["--start", "random"].iter().filter(|_| n_robots > 1);
@@ -186,7 +186,7 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// Checks that the model fits the grid. For recorded states, returns the model given for beliefs.
+    /// Checks that the model fits the grid, and returns it. Recorded states have only the model given for beliefs.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),
@@ -201,7 +201,7 @@ impl GridFlags {
         Ok(Some(model))
     }
 
-    /// The model given for beliefs on recorded states, with the server's sensor.
+    /// Returns the model given for beliefs on recorded states, with the server's sensor.
     pub fn model_of_states(&self) -> Result<Option<Model>> {
         let model = self.model.as_deref().filter(|_| self.states.is_some());
         let model = model.map(|model| with_sensor(model_named(model)?, self.radius()));
@@ -216,7 +216,7 @@ impl GridFlags {
         self.sensor_radius.map(usize::from)
     }
 
-    /// The flags of a server with these worlds.
+    /// Returns the flags of a server with this number of worlds, first seed and burn-in.
     pub fn arguments(&self, worlds: u32, seed: u64, burn_in: u64) -> Vec<String> {
         let settings = [
             ("--worlds", worlds.to_string()),

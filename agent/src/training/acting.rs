@@ -1,4 +1,4 @@
-//! A learner that acts and is watched: its beliefs go to observers.
+//! A learner that acts, and whose beliefs are published to observers.
 
 use crate::client::view::view;
 use anyhow::Result;
@@ -9,7 +9,7 @@ use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// A learner that acts, and is watched.
+/// A learner that acts, and whose beliefs are published to observers.
 pub struct Acting<'a> {
     learner: &'a mut dyn Learner,
     kind: &'static LearnerKind,
@@ -17,7 +17,7 @@ pub struct Acting<'a> {
     robots: Range<u32>,
     /// Robots of each world.
     team: u32,
-    /// Time that the last plans took.
+    /// Duration of the last planning.
     pub planning: Duration,
 }
 
@@ -38,7 +38,7 @@ impl<'a> Acting<'a> {
         }
     }
 
-    /// Shows the posteriors of the robots whose turn it is.
+    /// Publishes the posteriors of the robots that are due.
     fn show(&mut self) {
         let planning = self.planning / self.robots.len().max(1) as u32;
         for index in self.feed.due(self.robots.len()) {

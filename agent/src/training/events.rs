@@ -1,4 +1,4 @@
-//! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
+//! TensorBoard events of a training: the columns of `metrics.csv`, and an image of the belief at intervals.
 
 use crate::training::metrics::{Tick, averages};
 use crate::training::tensorboard::{EventFile, Value};
@@ -8,7 +8,7 @@ use emberwatch_figures::{Heat, heat};
 use emberwatch_learning::learners::{Learner, ModelUpdate};
 use std::path::Path;
 
-/// Steps of all worlds from one picture to the next.
+/// Number of steps from one image of the belief to the next.
 const TICKS_PER_PICTURE: u64 = 100;
 
 pub struct Events {
@@ -17,13 +17,13 @@ pub struct Events {
 }
 
 impl Events {
-    /// Begins a file; what the folder's files tell of later world steps counts no more.
+    /// Creates a file. TensorBoard then ignores events after `world_steps` in older files of the folder.
     pub fn begin(folder: &Path, world_steps: u64) -> Result<Self> {
         let file = EventFile::begin(folder, world_steps + 1)?;
         Ok(Self { file, n_ticks: 0 })
     }
 
-    /// Adds a step: one number a column, as TensorBoard shows one value a step.
+    /// Adds a step with one number per column, as TensorBoard shows one value per step.
     pub fn add(
         &mut self,
         tick: &Tick,

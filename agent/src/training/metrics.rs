@@ -1,4 +1,4 @@
-//! Metrics of a training as CSV: one row per update, and one per step without any.
+//! Metrics of a training as CSV: one row per update, and one per step without updates.
 
 use anyhow::{Context, Result, ensure};
 use csv::StringRecord;
@@ -8,10 +8,10 @@ use emberwatch_learning::rollout::StepRecord;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-/// The file's name in the folder of a training.
+/// Name of the metrics file in the folder of a training.
 pub const METRICS: &str = "metrics.csv";
 
-/// The name of that of a run without learning.
+/// Name of the metrics file of a run without learning.
 pub const FROZEN: &str = "frozen.csv";
 
 const HEADER: [&str; 6] = [
@@ -23,21 +23,21 @@ const HEADER: [&str; 6] = [
     "rate",
 ];
 
-/// What a step of all robots reports.
+/// Totals of one step of all robots.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Tick {
-    /// World steps so far, of all robots together.
+    /// World steps so far, summed over all robots.
     pub world_steps: u64,
-    /// Robots that flew, each in a world as far as it is told.
+    /// Number of robots that flew. Each counts as a separate world.
     pub n_worlds: u64,
-    /// Sum of their rewards.
+    /// Sum of the robots' rewards.
     pub reward: f64,
-    /// How well their frames were predicted before anything was learned from them.
+    /// Score of the robots' frames under the predictions made before learning from them.
     pub score: Score,
 }
 
 impl Tick {
-    /// Of what each robot reports, after so many world steps.
+    /// Sums the records of all robots, after `world_steps` world steps.
     pub fn of(records: &[StepRecord], world_steps: u64) -> Self {
         let mut tick = Self {
             world_steps,
@@ -58,26 +58,26 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Begins a file. `more`: columns of the learner's own.
+    /// Creates the file. `more` names the learner's additional columns.
     pub fn begin(path: &Path, more: &[&str]) -> Result<Self> {
         Self::write(path, more, &[]).with_context(|| of_file(path))
     }
 
-    /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
-    /// from, and rows that a kill cut off; begins it if it is not there. Refuses one with other columns.
-    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self> {
-        let go_on = || {
+    /// Reopens the file, or creates it if it is missing. Drops rows newer than the checkpoint, which was written at
+    /// `world_steps`, and a last row cut short by a kill. Refuses a file with other columns.
+    pub fn reopen(path: &Path, more: &[&str], world_steps: u64) -> Result<Self> {
+        let reopen = || {
             let rows = kept_rows(path, more, world_steps)?;
-            let beside = path.with_extension("csv.new");
-            let written = Self::write(&beside, more, &rows)?;
-            std::fs::rename(&beside, path)?;
+            let temporary = path.with_extension("csv.new");
+            let written = Self::write(&temporary, more, &rows)?;
+            std::fs::rename(&temporary, path)?;
             anyhow::Ok(Self {
                 path: path.to_owned(),
                 ..written
             })
         };
         if path.exists() {
-            go_on().with_context(|| of_file(path))
+            reopen().with_context(|| of_file(path))
         } else {
             Self::begin(path, more)
         }
@@ -113,7 +113,7 @@ fn reader(path: &Path) -> csv::Result<csv::Reader<File>> {
     csv::ReaderBuilder::new().flexible(true).from_path(path)
 }
 
-/// The whole rows of a file up to a world step.
+/// Reads the complete rows of a file up to a world step.
 fn kept_rows(path: &Path, more: &[&str], world_steps: u64) -> Result<Vec<StringRecord>> {
     let mut reader = reader(path)?;
     let got = reader.headers()?;
@@ -135,13 +135,13 @@ fn kept_rows(path: &Path, more: &[&str], world_steps: u64) -> Result<Vec<StringR
 
 fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
     let counts = [update.number, tick.world_steps].map(|count| count.to_string());
-    // The shortest form that reads back as the same number.
+    // The shortest text that parses to the same number.
     let text = |number: f64| format!("{number:?}");
     let numbers = numbers(tick, update).map(|number| number.map_or(String::new(), text));
     counts.into_iter().chain(numbers).collect()
 }
 
-/// What stands behind the two counts of a row.
+/// Returns the numbers of a row, which follow its two counts.
 fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Option<f64>> + 'a {
     let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
     let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
@@ -149,8 +149,8 @@ fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Opt
     numbers.into_iter().chain(update.more.iter().copied())
 }
 
-/// A step's numbers by column, means over the rows of its updates; without `world_steps`, and without columns that
-/// have no number. `more`: columns of the learner's own.
+/// Returns a step's numbers by column, averaged over its updates. Omits `world_steps`, and columns without a number.
+/// `more` names the learner's additional columns.
 pub fn averages(
     tick: &Tick,
     updates: &[ModelUpdate],
@@ -168,7 +168,7 @@ pub fn averages(
     counted.into_iter().chain(names.filter_map(mean)).collect()
 }
 
-/// The rows of a file, as numbers.
+/// The rows of a metrics file as numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rows {
     names: Vec<String>,
@@ -176,7 +176,7 @@ pub struct Rows {
 }
 
 impl Rows {
-    /// Reads the file of a folder. What is no number is as if it were not there.
+    /// Reads the metrics file of a folder. Fields that are not numbers become `None`.
     pub fn read(folder: &Path) -> Result<Self> {
         let path = folder.join(METRICS);
         let read = || {
@@ -198,7 +198,7 @@ impl Rows {
         self.rows.len()
     }
 
-    /// A column, one entry per row; nothing but `None` where there is no such column.
+    /// Returns a column with one entry per row. All entries of an unknown column are `None`.
     pub fn column(&self, name: &str) -> Vec<Option<f64>> {
         let at = self.names.iter().position(|known| known == name);
         let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());

@@ -1,17 +1,17 @@
-//! Processor seconds of a training, in a file of its folder.
+//! Processor seconds of a training, kept in a file in its folder.
 
 use anyhow::{Context, Result};
 use emberwatch_learning::file::{Readers, replace_file};
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};
 
-/// The file's name in the folder of a training.
+/// Name of the file in the folder of a training.
 const SECONDS: &str = "processor_seconds.txt";
 
 /// Counts the processor seconds of a training, including earlier runs that it resumes.
 pub struct Stopwatch {
     path: PathBuf,
-    /// Seconds of earlier runs; `None` if a resumed run has no record.
+    /// Seconds of earlier runs; `None` if they have no record.
     before: Option<f64>,
     start: f64,
 }
@@ -26,7 +26,7 @@ impl Stopwatch {
         })
     }
 
-    /// Writes the seconds so far, unless an earlier run has no record.
+    /// Writes the seconds so far, unless earlier runs have no record.
     pub fn write(&self) -> Result<()> {
         let Some(before) = self.before else {
             return Ok(());
@@ -36,10 +36,10 @@ impl Stopwatch {
     }
 }
 
-/// Processor seconds of the training in a folder; `None` if it kept none.
+/// Reads the processor seconds of the training in a folder; `None` if it recorded none.
 ///
 /// # Errors
-/// If the file holds anything but such a number.
+/// If the file holds anything but a finite number of at least 0.
 pub fn read(folder: &Path) -> Result<Option<f64>> {
     let path = folder.join(SECONDS);
     if !path.exists() {
@@ -48,7 +48,12 @@ pub fn read(folder: &Path) -> Result<Option<f64>> {
     let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     let seconds = text.trim().parse().ok();
     let seconds = seconds.filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0);
-    let wrong = || format!("{}: expected seconds, got {text:?}", path.display());
+    let wrong = || {
+        format!(
+            "{}: expected a number of seconds, got {text:?}",
+            path.display()
+        )
+    };
     seconds.map(Some).with_context(wrong)
 }
 

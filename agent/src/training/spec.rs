@@ -1,4 +1,4 @@
-//! What to train on, and why that ended early.
+//! The specification of a training, and the error of a training that ended early.
 
 use anyhow::{Context, Result, anyhow, ensure};
 use emberwatch_learning::beliefs::BeliefKind;
@@ -15,35 +15,35 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// The checkpoint's name in the folder of a training.
+/// Name of the checkpoint in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
 #[derive(Debug, Clone)]
 pub struct TrainingSpec {
-    /// The worlds, with all their robots.
+    /// Worlds to train on, with all their robots.
     pub worlds: Range<u32>,
     pub takeover: bool,
-    /// World steps to act for, of all worlds together; 0: until stopped.
+    /// World steps to act, summed over all worlds; 0: until stopped.
     pub steps: u64,
-    /// When to end, with a filter that is learned first too; `None`: until stopped.
+    /// Latest end, including the training of a belief; `None`: no limit.
     pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
     pub freeze: bool,
     pub device: Device,
     pub config: AgentConfig,
-    /// What was learned before, for decisions on it.
+    /// Beliefs from earlier trainings, for decisions on them.
     pub learned: Learned,
 }
 
 impl TrainingSpec {
-    /// Checks folder and number of worlds, before a server is held or started for them; returns the
-    /// contents of the checkpoint to go on from.
+    /// Checks the folder and the number of worlds, before a server is started or its robots are acquired. Returns the
+    /// contents of the checkpoint to resume.
     pub fn check(&self) -> Result<Option<Contents>> {
         let place = self.out.join(CHECKPOINT);
         ensure!(
             self.resume || !place.exists(),
-            "--out {}: expected --resume or a folder without a checkpoint, got one with it",
+            "--out {}: expected a folder without a checkpoint, got one with it: add --resume, or choose another",
             self.out.display()
         );
         let (kind, n_worlds) = (self.learner()?, self.worlds.len());
@@ -65,26 +65,26 @@ impl TrainingSpec {
         Ok(Some(contents))
     }
 
-    /// Whether a checkpoint was trained with settings other than these.
+    /// Returns whether a checkpoint was trained with other settings.
     pub fn has_other_settings(&self, contents: &Contents) -> bool {
         contents
             .settings()
             .map_or(true, |settings| settings != self.config)
     }
 
-    /// What the settings say that learns.
+    /// Returns the learner that the settings name.
     pub fn learner(&self) -> Result<&'static LearnerKind> {
         learners::named(&self.config.learner).map_err(anyhow::Error::msg)
     }
 
-    /// The belief that decisions are learned on.
+    /// Returns the belief that decisions are learned on.
     pub fn belief(&self) -> Result<&'static BeliefKind> {
         belief_of(&self.config.decisions.estimator)
     }
 
-    /// The training of the belief that decisions are learned on, in a folder within this one's; `None` if there is nothing
-    /// more to learn of it.
-    pub fn of_belief(&self) -> Result<Option<Self>> {
+    /// Returns the training of the belief that decisions are learned on, in a subfolder. Returns `None` if that
+    /// training is complete, or if the belief needs none.
+    pub fn belief_training(&self) -> Result<Option<Self>> {
         let Some(by) = &self.belief()?.learned_by else {
             return Ok(None);
         };
@@ -102,9 +102,9 @@ impl TrainingSpec {
         Ok((belief.steps > 0).then_some(belief))
     }
 
-    /// Whose belief decisions are to be learned on, if their training was left while that was learned; settings that its
-    /// checkpoint decides become those.
-    pub fn go_on_with_belief(&mut self) -> Result<Option<&'static BeliefKind>> {
+    /// Returns the belief that was being trained when a training of decisions was interrupted. Adopts the settings that
+    /// the belief's checkpoint determines.
+    pub fn adopt_belief(&mut self) -> Result<Option<&'static BeliefKind>> {
         let place = self.belief_folder().join(CHECKPOINT);
         if self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
@@ -122,12 +122,12 @@ impl TrainingSpec {
         Ok(Some(belief))
     }
 
-    /// Where [`Self::of_belief`] leaves its checkpoint.
+    /// Returns the folder of [`Self::belief_training`].
     pub fn belief_folder(&self) -> PathBuf {
         self.out.join("belief")
     }
 
-    /// The numbers of the robots on a server.
+    /// Returns the numbers of the worlds' robots on a server.
     pub(super) fn robots(&self, info: &ServerInfo) -> Result<Range<u32>> {
         let team = info.n_robots;
         let kind = self.learner()?;
@@ -144,17 +144,17 @@ impl TrainingSpec {
         );
         let number = |world: u32| world.checked_mul(team);
         let ends = number(self.worlds.start).zip(number(self.worlds.end));
-        let (first, end) = ends.context("--world: expected a world that the server has")?;
+        let (first, end) = ends.context("--world: expected a world of the server")?;
         Ok(first..end)
     }
 
-    /// The error for a learner that cannot go on; what it learned is saved when training ends.
+    /// Returns the error for a learner that cannot continue. Its state is saved when the training ends.
     pub(super) fn stopped(&self, problem: anyhow::Error, learner: &dyn Learner) -> anyhow::Error {
         if problem.is::<ConnectionError>() {
             return problem;
         }
         anyhow!(
-            "after {} world steps: {problem:#}; what was learned before is in {}",
+            "after {} world steps: {problem:#}; the training so far is saved in {}",
             learner.world_steps(),
             self.out.join(CHECKPOINT).display()
         )

@@ -1,9 +1,9 @@
-//! TensorBoard event files: numbers and pictures over steps, read by TensorBoard while they grow.
+//! TensorBoard event files: numbers and images over steps, which TensorBoard reads while they grow.
 //!
-//! A file is a row of TensorFlow's records: a length, the bytes, and a checksum behind each of the two. The
-//! bytes are protocol buffers of the types `Event` and `Summary`, of which few fields are needed, so they
-//! are written here: the crate that does it (`tensorboard-rs`) brings protobuf 2 and image 0.23, long out of
-//! support. Steps of one file should rise: TensorBoard drops what comes again.
+//! A file is a sequence of TensorFlow records: a length, the bytes, and a checksum after each of the two. The bytes
+//! are protocol buffers of the types `Event` and `Summary`. Only a few of their fields are needed, so this module
+//! encodes them itself: the crate `tensorboard-rs` depends on protobuf 2 and image 0.23, which are long out of
+//! support. Steps must increase within a file: TensorBoard drops repeated steps.
 
 use anyhow::{Context, Result};
 use crc::{CRC_32_ISCSI, Crc};
@@ -16,10 +16,10 @@ const CASTAGNOLI: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 const FILE_VERSION: &str = "brain.Event:2";
 
-/// `SessionLog.START`: what was written for this step and later ones, in older files too, goes.
+/// `SessionLog.START`: TensorBoard discards earlier events of this and later steps, in older files too.
 const SESSION_START: u64 = 1;
 
-/// Colour space of a PNG as `Summary.Image` numbers it: RGB.
+/// Number of the colour space RGB in `Summary.Image`.
 const RGB: u64 = 3;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,8 +39,8 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Begins a file in a folder, which is made where it is not there. What other files of the folder hold
-    /// for `next_step` and later steps counts no more.
+    /// Creates a file in a folder, and the folder if it is missing. TensorBoard then ignores events from `next_step` on
+    /// in older files of the folder.
     pub fn begin(folder: &Path, next_step: u64) -> Result<Self> {
         let created = std::fs::create_dir_all(folder).and_then(|()| create(folder));
         let (path, file) = created.with_context(|| of_file(folder))?;
@@ -53,7 +53,7 @@ impl EventFile {
         Ok(events)
     }
 
-    /// Adds what is told of a step, by name.
+    /// Adds values of a step, each with its name.
     pub fn add<'a>(
         &mut self,
         step: u64,
@@ -79,7 +79,7 @@ fn of_file(path: &Path) -> String {
     format!("TensorBoard events {}", path.display())
 }
 
-/// A new file whose name sorts behind those of the files before it.
+/// Creates a file whose name sorts after the names of earlier files.
 fn create(folder: &Path) -> std::io::Result<(PathBuf, File)> {
     let seconds = since_1970().as_secs();
     let mut number = 0;
@@ -104,7 +104,7 @@ fn record(bytes: &[u8]) -> Vec<u8> {
     [&length, &of_length[..], bytes, &of_bytes].concat()
 }
 
-/// A checksum of bytes that may hold checksums themselves.
+/// Returns TensorFlow's masked CRC-32C, meant for bytes that may contain checksums themselves.
 fn masked_checksum(bytes: &[u8]) -> u32 {
     let checksum = CASTAGNOLI.checksum(bytes);
     checksum.rotate_right(15).wrapping_add(0xa282_ead8)
@@ -122,7 +122,7 @@ fn named(name: &str, value: Value<'_>) -> Message {
     }
 }
 
-/// The beginning of an `Event` of now.
+/// Starts an `Event` at the present time.
 fn event(step: u64) -> Message {
     event_at(since_1970().as_secs_f64(), step)
 }
@@ -135,7 +135,7 @@ fn event_at(seconds: f64, step: u64) -> Message {
     }
 }
 
-/// A protocol buffer, field by field.
+/// A protocol buffer, built field by field.
 #[derive(Debug, Default)]
 struct Message(Vec<u8>);
 
@@ -165,12 +165,12 @@ impl Message {
         self.key(field, 2).variable(length).raw(bytes)
     }
 
-    /// A field's number, below 16 here, and how its value is written.
+    /// Appends a field's number, below 16 here, and its wire type.
     fn key(self, field: u8, kind: u8) -> Self {
         self.raw(&[field << 3 | kind])
     }
 
-    /// Seven bits a byte, the lowest first; the eighth says whether more come.
+    /// Appends an integer of variable length: seven bits per byte, lowest first. The eighth bit means that more follow.
     fn variable(mut self, mut value: u64) -> Self {
         while value > 0x7f {
             self.0.push(value as u8 | 0x80);

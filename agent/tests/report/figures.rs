@@ -1,4 +1,4 @@
-//! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
+//! The worst cases of figures. The files stay in `target/tmp/report`, so that people can look at them.
 
 use super::synthetic::{ladder, noise, run, teams};
 use emberwatch_agent::benchmark::report::figures::FIRE_CELLS_PER_STEP as LABEL;
@@ -17,7 +17,7 @@ fn target(name: &str) -> PathBuf {
     directory.join(format!("{name}.svg"))
 }
 
-/// Draws a page as a small SVG file, whose texts are texts.
+/// Draws a page, and checks that it is a small SVG file of this height which contains the texts.
 fn check(name: &str, height: u32, texts: &[&str], draw: impl Fn(&Path) -> anyhow::Result<()>) {
     let path = target(name);
     draw(&path).expect("drawn");
@@ -50,7 +50,7 @@ fn pages_have_their_size_and_labels() {
         draw_teams(path, &teams(3), LABEL)
     });
     draw_ladder(&target("teams_ladder"), &teams(3), LABEL).expect("drawn");
-    // Robots of one number make no curve.
+    // If all runs have the same number of robots, there is no curve to draw.
     let never = target("teams_never");
     draw_teams(&never, &ladder(2, 4), LABEL).expect("nothing to draw");
     assert!(!never.exists());
@@ -77,7 +77,7 @@ fn a_snapshot_calls_the_beliefs_states_by_their_names() {
         learned_target: None,
     };
     let path = target("snapshot");
-    for (learned_target, name) in [(None, "fire"), (Some(2), "what pays most")] {
+    for (learned_target, name) in [(None, "fire"), (Some(2), "state that pays most")] {
         snapshot.learned_target = learned_target;
         draw_snapshot(&path, &model, &snapshot, &truth).expect("drawn");
         let svg = std::fs::read_to_string(&path).expect("a file");

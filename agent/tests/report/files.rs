@@ -95,7 +95,7 @@ fn files_with_a_byte_order_mark_and_of_older_releases_are_read() {
     std::fs::write(&path, format!("\u{feff}{text}")).expect("written");
     let runs = read_runs(&path).expect("rows");
     assert_eq!((runs.len(), &*runs[0].policy), (1, "mine"));
-    // Without fingerprints, then without teams and figures of merit.
+    // An older file without fingerprints, then one without teams and figures of merit either.
     for (n_cut, robots) in [(4, 4), (14, 1)] {
         let cut = |line: &str| line.rsplitn(n_cut, ',').last().map(String::from);
         let old: Vec<String> = text.lines().filter_map(cut).collect();

@@ -1,4 +1,4 @@
-//! Results made up for the tests.
+//! Synthetic results for the tests.
 
 use emberwatch_agent::benchmark::report::PolicyRun;
 
@@ -15,13 +15,13 @@ const LADDER: [(&str, &str, f64); 5] = [
     ),
 ];
 
-/// A number in `-1..1` that depends on nothing but its arguments.
+/// Returns a number in `-1..1` that depends only on the arguments.
 pub fn noise(seed: u64, index: u64) -> f64 {
     let bits = emberwatch_protocol::randomness::split_mix(seed, index) >> 11;
     bits as f64 / (1_u64 << 52) as f64 - 1.0
 }
 
-/// A run whose only interesting number is its mean reward.
+/// Returns a run in which only the given values vary.
 pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> PolicyRun {
     PolicyRun {
         policy: policy.into(),
@@ -43,7 +43,7 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
     }
 }
 
-/// Every policy of the ladder on some worlds.
+/// Returns runs of every policy of the ladder on `n_worlds` worlds.
 pub fn ladder(n_worlds: u64, n_steps: usize) -> Vec<PolicyRun> {
     let mut runs = Vec::new();
     for (policy, estimator, mean) in LADDER {
@@ -60,7 +60,8 @@ pub fn ladder(n_worlds: u64, n_steps: usize) -> Vec<PolicyRun> {
     runs
 }
 
-/// Beam search of 1, 2 and 4 robots, alone and jointly: on world w alone R (w + 1), jointly a half more from R = 2 on.
+/// Returns runs of beam search with R = 1, 2 and 4 robots, alone and jointly. On world w, robots alone earn R (w + 1);
+/// from R = 2 on, robots that plan jointly earn half as much again.
 pub fn teams(n_worlds: u64) -> Vec<PolicyRun> {
     let mut runs = Vec::new();
     for robots in [1_u32, 2, 4] {

@@ -20,7 +20,7 @@ fn three_policies() -> Vec<PolicyRun> {
     runs
 }
 
-/// The cells of the first row of the table that starts with a policy.
+/// Returns the cells of a policy's row, after skipping `skip` earlier rows of that policy.
 fn row(table: &str, policy: &str, skip: usize) -> Vec<String> {
     let is_row = |line: &&str| line.starts_with(&format!("| {policy} "));
     let line = table
@@ -49,7 +49,7 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
     ] {
         assert_eq!(row(&table, policy, 0)[1..].join(" "), expected);
     }
-    // Worlds are split at the median of their fire.
+    // Worlds are split at the median of their burning cells.
     for words in [
         "median of 200.0 burning cells",
         "less fire (1 world)",
@@ -88,7 +88,7 @@ fn teams_are_compared_with_as_many_robots_alone() {
         assert_eq!(row(&table, "beam", skip)[2..10].join(" "), expected);
     }
     assert_eq!(row(&table, "beam", 6)[2..4], ["alone", "1"], "{table}");
-    // One robot is no team: the table has no such columns.
+    // One robot is not a team: the table has no columns for teams.
     assert!(!render_table(&teams(3)[..3], "beam").contains("team"));
 }
 
@@ -104,8 +104,8 @@ fn each_team_has_a_folder_of_events() {
     assert_eq!(names.len(), 6);
 }
 
-/// Three worlds: `beam` sees a half, 0.7 and 0.9 of the fire and misses it in none, `coverage` sees 0.3 of it and
-/// detects it in two.
+/// Returns runs on three worlds. `beam` detects the fire in all three, and sees 0.5, 0.7 and 0.9 of it. `coverage`
+/// detects it in two, and sees 0.3.
 fn with_merit() -> Vec<PolicyRun> {
     let mut runs = three_policies();
     for (run, seen) in runs[3..6].iter_mut().zip([0.5, 0.7, 0.9]) {
@@ -130,8 +130,8 @@ fn figures_of_merit_say_in_how_many_worlds_fire_was_detected() {
     let mut runs = with_merit();
     let table = render_table(&runs, "coverage");
     assert!(table.contains("in the last 25 steps"), "{table}");
-    // 1, 2 and 3 steps: sqrt(2 / 2 / 3) = 0.6. Seen 50, 70, 90 %: sqrt(800 / 2 / 3) = 11.5, also less 30 %.
-    // The world without a detection has no time; without a front there is no distance. Last rows of an old file.
+    // Errors: steps 1, 2, 3: sqrt(2 / 2 / 3) = 0.6. Seen 50, 70, 90 %: sqrt(800 / 2 / 3) = 11.5, also for differences.
+    // A world without a detection has no time, and without a front no distance. The oracle's rows are of an old file.
     for expected in [
         "beam 3 of 3 2.0 ± 0.6 100.0 ± 0.0 70.0 ± 11.5 +40.0 ± 11.5 12.5 ± 0.0 50.0 ± 0.0",
         "coverage 2 of 3 40.0 ± 0.0 300.0 ± 0.0 30.0 ± 0.0 baseline - 50.0 ± 0.0",
@@ -211,7 +211,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
          steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
          grid_seen_share,log_likelihood,worlds_fingerprint,policy_fingerprint,training_seconds\n"
     ));
-    // By policy and world.
+    // Rows are sorted by policy and world.
     runs.sort_by(|a, b| (&a.policy, a.world_seed).cmp(&(&b.policy, b.world_seed)));
     assert_eq!(read_runs(&path).expect("rows"), runs);
 }
@@ -245,9 +245,9 @@ fn scores_of_tasks_lie_between_the_random_walk_and_the_oracle() {
         !first.contains("own") && second.contains("| own"),
         "{table}"
     );
-    // Brier scores.
+    // The second row of `beam` has its Brier scores.
     assert_eq!(row(&table, "beam", 1), ["beam", "0.1250", "0.1250"]);
-    // An oracle no better than the random walk is no scale.
+    // Without an oracle better than the random walk there is no scale.
     let flat = task("flat", &[floor, ("oracle_ahead", [2.0, 0.0]), beam]);
     assert!(flat.scores("beam").is_empty());
     let table = render_suite(&[a, flat]);

@@ -1,4 +1,4 @@
-//! Which runs can be compared, and what entries of the leaderboard may say.
+//! Checks of runs that are to be compared, and of the texts in leaderboard entries.
 
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::PolicyRun;
@@ -8,7 +8,7 @@ use emberwatch_agent::benchmark::report::suite::TaskRuns;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// A value with the entries of a line of TOML.
+/// Returns a copy of a value with the fields that a line of TOML sets.
 fn changed<T: Serialize + DeserializeOwned>(value: &T, line: &str) -> T {
     let mut table = toml::Table::try_from(value).expect("a table");
     table.extend(line.parse::<toml::Table>().expect("TOML"));

@@ -1,4 +1,4 @@
-// The time series: three lines and the strip of objectives above one common axis.
+// The time series: three line charts and the strip of objectives, above one shared axis.
 
 import { drawLine, drawStrip, frameOf, roomFor } from "./plot.js";
 import { make, swatch, write } from "./elements.js";
@@ -13,12 +13,12 @@ const LINES = [
   { id: "log-loss", array: "series_log_loss", now: "log_loss", title: () => "log-loss", unit: () => "nats per cell" },
 ];
 
-/** The charts in `parent`; `seek(serial)` hears of clicks on them. */
+/** Creates the charts in `parent`. A click on a chart calls `seek(serial)`. */
 export function createCharts(parent, { pointer, seek }) {
   const charts = [...LINES.map(lineChart), stripChart()];
   parent.append(...charts.map((chart) => chart.figure));
   const canvases = charts.map((chart) => chart.canvas);
-  // Common to all charts: what is below, and how many CSS pixels are left of it.
+  // Shared by all charts: the axis below them, and the width in CSS pixels to the left of the plots.
   let axis = null;
   let left = 0;
 
@@ -35,7 +35,7 @@ export function createCharts(parent, { pointer, seek }) {
   }
 
   return {
-    /** Bins worth asking for: as many as there are pixels to draw them on. */
+    /** Returns the number of bins to request: one per pixel of width, from 16 to 2000. */
     bins: () => Math.min(Math.max(Math.round(charts[0].canvas.clientWidth || 300), 16), 2000),
     draw(picture, view, palette) {
       axis = picture.series && across(picture.series);
@@ -105,14 +105,14 @@ function stripChart() {
       const colors = names.map((name) => objectiveColor(name, { objectives: names, names: stateNames(picture), palette }));
       writeNames(chart, names, colors);
       const { values } = chart;
-      write(chart.absent, values ? "" : "no agent tells its objective");
+      write(chart.absent, values ? "" : "no objective is published");
       const { axis, hover } = common;
       write(chart.parts.now, text(hover == null || !values ? picture.agent?.objective : names[values[axis.bin(hover)]]));
       writeHover(chart, common);
       if (axis) drawStrip(chart.frame, values ?? [], common, colors);
     },
     describe(chart, picture) {
-      chart.canvas.setAttribute("aria-label", `objective: now ${picture.agent?.objective ?? "not known"}`);
+      chart.canvas.setAttribute("aria-label", `objective: now ${picture.agent?.objective ?? "unknown"}`);
     },
   });
 }
@@ -140,5 +140,5 @@ function absence({ id }, picture) {
   }
   if (!arrays.truth) return "needs the truth and a belief";
   if (!arrays.belief) return "needs a belief";
-  return info.states ? "nothing yet" : "needs to know the model";
+  return info.states ? "nothing yet" : "needs the model";
 }

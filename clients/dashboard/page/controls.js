@@ -1,12 +1,12 @@
-// What can be pressed: pause, scrub, world, theme, and a recording's player; and the keys for them.
+// The controls and their keys: pause, scrub, world, theme, and a recording's player.
 
 import { write } from "./elements.js";
-import { MOST_WORLDS } from "./view.js";
+import { MAX_WORLDS } from "./view.js";
 import { whole } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 
-/** Wires the controls to `act`; `picture()` gives the picture that is shown. */
+/** Connects the controls to `act`. `picture()` returns the shown picture. */
 export function createControls({ view, act }, picture) {
   const scrub = byId("scrub");
   const shownSerial = () => picture()?.shown?.serial ?? null;
@@ -36,7 +36,7 @@ export function createControls({ view, act }, picture) {
   return { draw: (next) => draw(next, view) };
 }
 
-// Keys work wherever the focus is, except where they mean something else.
+// Keys work wherever the focus is, except on elements that use the same keys.
 function pressed(event, { toggle, seek }) {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   const { target, key } = event;
@@ -73,7 +73,7 @@ function drawScrub({ kept, shown }, { at }) {
   scrub.min = kept.first;
   scrub.max = kept.last;
   const serial = shown?.serial ?? kept.last;
-  // Live, the newest belief is shown, which may be a few steps old: that is still the end.
+  // Live, the page shows the newest belief, which may be a few steps old. The slider still stands at the end.
   scrub.value = at == null ? kept.last : serial;
   scrub.style.setProperty("--share", kept.last > kept.first ? (scrub.value - kept.first) / (kept.last - kept.first) : 1);
   scrub.setAttribute("aria-valuetext", `entry ${whole(serial)}, step ${whole(shown?.step)}${at == null ? ", newest" : ""}`);
@@ -81,14 +81,14 @@ function drawScrub({ kept, shown }, { at }) {
   const isGone = at != null && at < kept.first;
   byId("transport").classList.toggle("has-lost-entry", isGone);
   write(byId("kept"), isGone
-    ? `oldest kept: entry ${whole(at)} is no longer`
+    ? `oldest; entry ${whole(at)} is no longer kept`
     : at == null ? `newest of ${whole(kept.last - kept.first + 1)}` : `${whole(kept.last - serial)} behind`);
 }
 
 function drawWorlds({ info }, view) {
   const select = byId("world");
-  // Before a server tells how many there are, the one that is asked for.
-  const [first, count] = info ? [0, Math.min(info.n_worlds, MOST_WORLDS)] : [view.world, 1];
+  // Before a server reports its worlds, only the requested one.
+  const [first, count] = info ? [0, Math.min(info.n_worlds, MAX_WORLDS)] : [view.world, 1];
   if (select.options.length !== count || select.options[0].value !== String(first)) {
     const numbers = Array.from({ length: count }, (_, i) => String(first + i));
     select.replaceChildren(...numbers.map((number) => new Option(number, number)));
@@ -99,7 +99,7 @@ function drawWorlds({ info }, view) {
 function drawPlayer(player) {
   byId("player").hidden = !player;
   if (!player) return;
-  write(byId("play"), player.ended ? "Play again" : player.playing ? "Stop playing" : "Play on");
+  write(byId("play"), player.ended ? "Play again" : player.playing ? "Stop playing" : "Resume");
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(player.speed);
   write(byId("clock"), player.ended ? "ended" : `${player.seconds.toFixed(1)} s`);

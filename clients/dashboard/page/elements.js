@@ -1,8 +1,8 @@
-// Elements made from script.
+// Helpers that create and fill elements.
 
 import { channels } from "./palette.js";
 
-/** An element with a class, data attributes and text. */
+/** Creates an element with a class, data attributes and text. */
 export function make(tag, name = "", dataset = {}, text = "") {
   const made = document.createElement(tag);
   if (name) made.className = name;
@@ -11,19 +11,19 @@ export function make(tag, name = "", dataset = {}, text = "") {
   return made;
 }
 
-/** A small square of a colour. */
+/** Creates a small square of a colour. */
 export function swatch(color) {
   const square = make("i", "swatch");
   square.style.background = `rgb(${channels(color).join(" ")})`;
   return square;
 }
 
-/** Sets an element's text, if it differs: what does not change is not laid out again. */
+/** Sets an element's text only if it differs, because each change causes a new layout. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** A canvas's context, cleared, at the screen's own resolution, in its pixels; null while hidden. */
+/** Returns a cleared canvas's context and size in device pixels; null while the canvas is hidden. */
 export function prepare(canvas) {
   const ratio = devicePixelRatio;
   const [width, height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio].map(Math.round);

@@ -1,4 +1,4 @@
-// What the page says in words: state, note, facts, and what is missing.
+// The page's texts: state, note, facts, and what the page waits for.
 
 import { write } from "./elements.js";
 import { createRobots } from "./robots.js";
@@ -6,15 +6,15 @@ import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from ".
 
 const byId = (id) => document.getElementById(id);
 
-/** Writes a picture's words. */
+/** Creates the writer of a picture's texts. */
 export function createFacts() {
   const announce = byId("announce");
   const robots = createRobots(byId("robots"));
   let said = "";
-  // Whether no picture can be had: that is told until one comes.
+  // Whether pictures fail to arrive or to decode; the page shows this until one succeeds.
   let isTroubled = false;
 
-  // A change of state is said aloud, once.
+  // Announces each change of state once to screen readers.
   function say(sentence) {
     if (sentence === said) return;
     said = sentence;
@@ -45,25 +45,25 @@ export function createFacts() {
       drawEmpty(picture);
     },
     recovered() { isTroubled = false; },
-    /** The dashboard itself went away: what was drawn last stays. */
+    /** Shows that the dashboard itself has gone. The last picture stays. */
     gone() {
       drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");
     },
     failed(error) {
-      const problem = `The dashboard sent what this page cannot read: ${error.message}`;
-      drawTrouble("unreadable", problem, "the dashboard sent what this page cannot read");
+      const problem = `This page cannot read the dashboard's picture: ${error.message}`;
+      drawTrouble("unreadable", problem, "this page cannot read the dashboard's picture");
     },
   };
 }
 
-// Nobody serves a recording: it plays or rests.
+// A recording has no server: it plays, pauses or ends.
 function stateOf({ state, source, player }) {
   if (source !== "recording" || state !== "serving") return state;
   if (player?.ended) return "ended";
   return player?.playing === false ? "paused" : "playing";
 }
 
-// Before the first server the whole page says that one is waited for.
+// Before the first server, the whole page says that it is waiting for one.
 function isToldLarge({ state, source, info }) {
   return state === "waiting" && source === "live" && !info;
 }
@@ -88,7 +88,7 @@ function drawServer({ info, status, lost, instance, source }) {
   drawLost(lost);
 }
 
-// Frames always, as their absence is good news; the rest only if there is any.
+// Always shows lost frames, as zero is good news; shows other losses only if there are any.
 function drawLost(lost) {
   const others = [["truth", lost?.truth], ["beliefs", lost?.agent]].filter(([, count]) => count > 0);
   const words = others.map(([name, count]) => ` · ${name} ${whole(count)}`).join("");
@@ -108,7 +108,7 @@ function drawWorld(picture, world) {
   write(byId("seed"), text(shown?.seed));
   write(byId("episode"), ending(shown));
   write(byId("holder"), holder(world));
-  // Of a team each robot's line tells it.
+  // For a team, each robot's line names its holder.
   byId("holder-fact").hidden = isTeam(shown) && !world?.resetting;
 }
 
@@ -124,7 +124,7 @@ function holder(world) {
 
 function drawAgent(picture, isNewest) {
   const { agent, source } = picture;
-  // Of an earlier step: what this path was for, and its plan, are not known.
+  // If the belief is about an earlier step, the objective and plan of the shown path are unknown.
   const plan = beliefAge(picture) ? null : agent;
   const isSilent = isNewest && source === "live" && agent?.is_live === false;
   write(byId("policy"), text(agent?.policy));
@@ -141,13 +141,13 @@ function flownBy(agent) {
   return count > 1 ? `robots ${first}–${first + count - 1}` : `robot ${first}`;
 }
 
-// Before anything is known there is nothing to lay out: a word on how to begin.
+// Before the first step, the page shows how to start instead of empty panels.
 function drawEmpty(picture) {
   const { instance, source, info, shown, world, player } = picture;
   const isEmpty = !info || !shown;
   byId("empty").hidden = !isEmpty;
   for (const id of ["facts", "stage"]) byId(id).hidden = isEmpty;
-  // A recording can begin with a long time of nothing, which a faster speed shortens.
+  // A recording may begin with a long pause, which the speed control shortens.
   byId("transport").hidden = isEmpty && !player;
   byId("server").hidden = !info;
   if (!isEmpty) return;
@@ -158,7 +158,7 @@ function drawEmpty(picture) {
   write(byId("empty-command"), `emberwatch-server --instance ${instance}`);
 }
 
-/** The page's title: what a tab shows. */
+/** Returns the page's title. */
 export function titleOf(picture) {
   if (!picture?.shown) return "Emberwatch";
   return `k ${whole(picture.shown.step)} · ${picture.info?.model ?? stateNames(picture).join("/")} · Emberwatch`;

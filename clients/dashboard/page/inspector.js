@@ -1,14 +1,14 @@
-// One cell in numbers: the one pointed at, else the one that the first robot is on.
+// One cell in numbers: the pointed-at cell, or by default the cell of the first robot.
 
 import { make, swatch } from "./elements.js";
 import { NEVER, rampColor } from "./palette.js";
 import { cellsOf, hasLand, shapeOf } from "./wire.js";
 import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "./words.js";
 
-// Long enough that a screen reader is not flooded while keys are held.
+// Time after the last key before the cell is announced, so that held keys do not flood a screen reader.
 const QUIET_MILLIS = 400;
 
-/** The inspector's element and its functions. */
+/** Creates the inspector: its element, and functions to draw and announce a cell. */
 export function createInspector(announcer) {
   const root = make("section", "inspector");
   root.setAttribute("aria-label", "one cell in numbers");
@@ -18,7 +18,7 @@ export function createInspector(announcer) {
   let timer = 0;
   let shownKey = "";
 
-  /** `cell` is the one pointed at, or null. */
+  /** Draws `cell`, the pointed-at cell; if null, the first robot's. */
   function draw(picture, cell, palette) {
     const at = cell ?? robotCell(picture);
     if (!at) return;
@@ -32,7 +32,7 @@ export function createInspector(announcer) {
     list.replaceChildren(...rows.map((row) => rowElement(row, palette)));
   }
 
-  /** Says the cell aloud once the keys rest. */
+  /** Announces the cell to screen readers once no key has been pressed for a while. */
   function say(picture, cell) {
     clearTimeout(timer);
     timer = setTimeout(() => {
@@ -104,10 +104,10 @@ function rowElement({ name, value, color, share, ramp, kind }, palette) {
   return row;
 }
 
-// The style sheet draws it: a list of terms may hold nothing but terms and answers.
+// The style sheet draws the bar, because a `dl` may contain only terms and descriptions.
 function addBar(row, share, ramp, theme) {
   row.className = "has-bar";
   row.style.setProperty("--share", `${share * 100}%`);
-  // From a third of the ramp upwards, as its beginning would not be seen on the background.
+  // Starts at a third of the ramp, whose beginning would be invisible on the background.
   row.style.setProperty("--bar", `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`);
 }

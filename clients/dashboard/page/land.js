@@ -1,28 +1,28 @@
-// What lies on the grid whatever happens there, over cells, in device pixels: lines around zones of land unless there
-// are many, hatches over no-fly cells; and the line around what was seen. Each line is dark beside light, so that one of
-// the two is seen on any cell.
+// Draws, in device pixels over the cells, the fixed features of the grid: lines around zones unless there are many, and
+// hatches over no-fly cells. Also draws the line around the observed cells. Each line is dark next to light, so that
+// one of the two is visible on any cell.
 
 import { NEVER } from "./palette.js";
 import { cellsOf, hasLand, shapeOf } from "./wire.js";
 
-/** Most zones with lines around them and names in the legend. */
-export const MOST_ZONES = 8;
+/** Maximum number of zones with lines around them and names in the legend. */
+export const MAX_ZONES = 8;
 
-// Cells below so many device pixels would be hidden by lines.
-const LEAST_LINE_CELL = 3;
-// From line to line of a hatch, CSS pixels: so that each cell has a line, and most of its colour is seen.
-const HATCH = { least: 4, most: 9 };
+// Minimum size of a cell, in CSS pixels, that lines would not hide.
+const MIN_LINE_CELL = 3;
+// Distance of a hatch's lines in CSS pixels. Each cell has a line, and most of its colour stays visible.
+const HATCH = { min: 4, max: 9 };
 const DARK = "#141414";
 const LIGHT = "#ffffff";
-// Widths and dashes of the light line and the dark one on top of it, CSS pixels.
+// Widths of the light line and of the dark line on top of it, and the dark line's dashes, in CSS pixels.
 const SOLID = { light: 2.4, dark: 1.2, dash: [] };
 const THIN = { light: 2, dark: 1, dash: [] };
 const DOTTED = { light: 1, dark: 1, dash: [2, 2] };
 
-// All panels are alike, from picture to picture.
+// The layer is kept, because it is the same for all panels and rarely changes.
 let kept = { key: "", layer: null };
 
-/** Draws it on a panel's marks. */
+/** Draws the zones' lines and the no-fly hatches on a panel's marks. */
 export function drawLand(frame, picture) {
   const { arrays: { zones, no_fly: noFly }, info } = picture;
   if (!hasLand(picture)) return;
@@ -32,10 +32,10 @@ export function drawLand(frame, picture) {
   frame.context.drawImage(kept.layer, 0, 0);
 }
 
-/** Draws the line around what robots saw, if that is more than their path. */
+/** Draws the line around the observed cells, if robots see beyond their paths. */
 export function drawFootprint(frame, picture) {
   const { arrays, info } = picture;
-  if (!info.radius || frame.cell.x < LEAST_LINE_CELL * frame.ratio) return;
+  if (!info.radius || frame.cell.x < MIN_LINE_CELL * frame.ratio) return;
   outline(frame, picture, (at) => arrays.frame[at] !== NEVER, SOLID);
 }
 
@@ -43,13 +43,13 @@ function layerOf(frame, picture) {
   const { arrays: { zones, no_fly: noFly }, info } = picture;
   const layer = new OffscreenCanvas(frame.width, frame.height);
   const onLayer = { ...frame, context: layer.getContext("2d") };
-  const hasLines = zones && info.zones.length <= MOST_ZONES && frame.cell.x >= LEAST_LINE_CELL * frame.ratio;
+  const hasLines = zones && info.zones.length <= MAX_ZONES && frame.cell.x >= MIN_LINE_CELL * frame.ratio;
   if (hasLines) outline(onLayer, picture, (at) => zones[at], DOTTED);
   if (noFly) hatch(onLayer, picture, noFly);
   return layer;
 }
 
-// Between neighbours that differ.
+// Draws a line between neighbouring cells for which `of` differs.
 function outline({ context, ratio, cell }, picture, of, line) {
   const { height, width } = shapeOf(picture);
   context.beginPath();
@@ -77,7 +77,7 @@ function hatch({ context, ratio, width, height, cell }, picture, noFly) {
   }
   context.clip();
   context.beginPath();
-  const step = Math.min(Math.max(1.4 * Math.min(cell.x, cell.y), HATCH.least * ratio), HATCH.most * ratio);
+  const step = Math.min(Math.max(1.4 * Math.min(cell.x, cell.y), HATCH.min * ratio), HATCH.max * ratio);
   for (let x = 0; x < width + height; x += step) {
     context.moveTo(x, 0);
     context.lineTo(x - height, height);

@@ -1,36 +1,33 @@
-// How large panels are: as large as fits, in whole screen pixels per cell where that costs little.
-//
-// Where there is room, the beliefs and the entropy share one row, below the row of what is observed
-// with the inspector at its end ("regular"); else panels follow each other and the inspector comes last.
+// The size of the panels: as large as fits, with whole screen pixels per cell where that costs little. In the "regular"
+// layout, the truth, the observations and the inspector form the first row; the beliefs and the entropy form the
+// second. Otherwise the panels follow each other, and the inspector comes last.
 
-// A whole number of pixels per cell is crisper; beyond this loss of size it is not worth it.
+// A whole number of pixels per cell is crisper, if the panel keeps at least this share of its size.
 const WORTHWHILE = 0.8;
-// A regular layout reads best: another must be larger by this to be preferred.
+// A regular layout reads best: another layout must be larger by this factor to be chosen.
 const REGULAR_MERIT = 1.15;
-// Sizes in rem, as in the style sheet: the inspector's title, a line of it, its columns of lines with the gap
-// between them, the least width of a panel's column, which its caption needs, and the note that stands for beliefs.
+// Sizes in rem, as in the style sheet: the inspector's title, one of its lines, its columns of lines and the gap
+// between them, the minimum width of a panel's column (for the caption), and the note in place of beliefs.
 const TITLE = 1.7;
 const LINE = 1.72;
 const LANE = 9;
 const LANE_GAP = 1.2;
 const CAPTION_WIDTH = 8;
 const NOTE = 5;
-// Smaller panels show nothing: they scroll instead.
-const LEAST = 4;
-// Panels before the inspector in a regular layout.
+// Minimum panel width in rem: below it, the panels keep a readable size, and scroll.
+const MIN_WIDTH = 4;
+// Number of panels before the inspector in a regular layout.
 const OBSERVED = 3;
 
 /**
- * The best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
- *
- * `places` counts panels, the inspector's lines, and the columns of a regular layout, and tells whether a note stands for
- * the beliefs (`isBare`). In an area of
- * height Infinity the page scrolls and `forced` columns are taken.
+ * Returns the best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
+ * `places` counts the panels, the inspector's lines and the columns of a regular layout. `isBare` means that a note
+ * replaces the beliefs. In an area of height Infinity, the page scrolls, and the layout has `forced` columns.
  */
 export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
-  const least = CAPTION_WIDTH * rem + gap;
-  const most = Math.max(2, Math.floor((area.width + gap) / least));
-  const choices = area.height === Infinity ? [forced] : range(2, Math.min(places.panels + 1, most));
+  const minimum = CAPTION_WIDTH * rem + gap;
+  const maximum = Math.max(2, Math.floor((area.width + gap) / minimum));
+  const choices = area.height === Infinity ? [forced] : range(2, Math.min(places.panels + 1, maximum));
   let best = null;
   for (const columns of choices) {
     const placed = place(columns, places);
@@ -48,8 +45,8 @@ function place(columns, { panels, regular, isBare }) {
   return { columns, isRegular, hasNote: isBare, span: columns - over, rows: Math.floor(panels / columns) + 1 };
 }
 
-// The row that the inspector is in may have to be higher than the panels: then they give way. In a regular layout the
-// note fills the beliefs' row, else it has one of its own.
+// The inspector's row may need to be higher than the panels, which then shrink. In a regular layout, the note fills the
+// beliefs' row; otherwise it has its own row.
 function sizeFor({ area, shape, placed, gap, caption, ratio, rem, lines }) {
   const height = area.height - (placed.rows - 1) * gap - (placed.hasNote ? NOTE * rem + gap : 0);
   const free = { x: (area.width - (placed.columns - 1) * gap) / placed.columns, y: height / placed.rows - caption };
@@ -74,12 +71,12 @@ function range(from, to) {
   return Array.from({ length: to - from + 1 }, (_, i) => from + i);
 }
 
-/** Keeps `panels` fitted within `stage`. */
+/** Keeps `panels` fitted to `stage`. */
 export function createLayout({ stage, field, panels }, places) {
   let sizes = "";
 
   function layOut(shape) {
-    // Legends take more lines beside fewer columns: they are counted at their highest.
+    // Legends need more lines next to fewer columns, so the layout uses their greatest height.
     stage.style.removeProperty("--field-width");
     let others = -1;
     for (let used = usedByOthers(); used > others; used = usedByOthers()) {
@@ -101,14 +98,14 @@ export function createLayout({ stage, field, panels }, places) {
       area: { width, height }, shape, places: places(), forced, gap, caption, ratio: devicePixelRatio, rem,
     });
     let best = fitted(height, number("--columns"));
-    const isCramped = best.width < LEAST * rem;
+    const isCramped = best.width < MIN_WIDTH * rem;
     if (isCramped) best = fitted(Infinity, number("--columns"));
     field.classList.toggle("is-cramped", isCramped);
     const share = (width + gap) / best.columns - gap;
     apply(best, gap, isStacked ? share : Math.max(best.width, CAPTION_WIDTH * rem));
   }
 
-  // What legends leave is for panels.
+  // Returns the height of everything but the panels.
   function usedByOthers() {
     const rowGap = parseFloat(getComputedStyle(field).rowGap);
     const others = [...field.children].filter((child) => child !== panels && child.offsetHeight > 1);
@@ -129,7 +126,7 @@ export function createLayout({ stage, field, panels }, places) {
   const sizeOf = () => [stage.clientWidth, stage.clientHeight, devicePixelRatio].join();
 
   return {
-    /** Fits panels of this shape, if they, legends (`isChanged`) or what there is room for have changed. */
+    /** Fits panels of this shape, if the panels or legends (`isChanged`) or the stage's size have changed. */
     draw(shape, isChanged) {
       if (stage.clientWidth === 0 || (!isChanged && sizeOf() === sizes)) return;
       layOut(shape);

@@ -1,14 +1,14 @@
-// What colours and marks mean.
+// The legends, which explain colours and marks.
 
 import { make, swatch } from "./elements.js";
-import { MOST_ZONES } from "./land.js";
+import { MAX_ZONES } from "./land.js";
 import { rampStops } from "./palette.js";
 import { beliefNames, observationNames, stateNames } from "./words.js";
 
-// More names than this would leave no room for what they explain.
-const MOST_NAMES = 16;
+// Maximum number of names: more would leave no space for the panels.
+const MAX_NAMES = 16;
 
-/** The legends above and below the panels; drawn again only when they change. */
+/** Creates the legends above and below the panels, which are redrawn only when they change. */
 export function createLegend(list, ramps) {
   let drawn = "";
   return {
@@ -39,8 +39,8 @@ function values(states, observations, palette) {
 }
 
 function named(names, colors) {
-  const items = names.slice(0, MOST_NAMES).map((name, i) => value(name, colors[i]));
-  return names.length > MOST_NAMES ? [...items, word(`and ${names.length - MOST_NAMES} more`)] : items;
+  const items = names.slice(0, MAX_NAMES).map((name, i) => value(name, colors[i]));
+  return names.length > MAX_NAMES ? [...items, word(`and ${names.length - MAX_NAMES} more`)] : items;
 }
 
 function value(name, color) {
@@ -59,7 +59,7 @@ function marks(palette, zones, hasNoFly) {
 
 function unobserved({ unseen, unseenZones }, zones) {
   if (!zones) return [value("not observed", unseen)];
-  if (zones.length > MOST_ZONES) return [word(`not observed: ${zones.length} zones`)];
+  if (zones.length > MAX_ZONES) return [word(`not observed: ${zones.length} zones`)];
   return [word("not observed"), ...named(zones, unseenZones)];
 }
 
@@ -70,8 +70,8 @@ function mark(name) {
 }
 
 function entropyTicks(states) {
-  const most = Math.log(states);
-  return [0, 0.25, 0.5, 0.75, 1].map((share) => (share === 0 ? "0" : (share * most).toFixed(2)));
+  const max = Math.log(states);
+  return [0, 0.25, 0.5, 0.75, 1].map((share) => (share === 0 ? "0" : (share * max).toFixed(2)));
 }
 
 function ramp(name, theme, title, ticks) {

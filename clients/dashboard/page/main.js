@@ -1,5 +1,5 @@
-// Wires the page: pictures come in, are drawn, and the next is asked for. Reading order: wire.js,
-// socket.js, view.js, then what draws: panels.js, charts.js, facts.js, controls.js.
+// Connects the parts of the page: a picture arrives, is drawn, and the next one is requested. Reading order: wire.js,
+// socket.js, view.js, then the drawing: panels.js, charts.js, facts.js, controls.js.
 
 import { createCharts } from "./charts.js";
 import { createControls } from "./controls.js";
@@ -14,7 +14,7 @@ import { connect } from "./socket.js";
 import { askOf, createView, themeOf } from "./view.js";
 import { shapeOf } from "./wire.js";
 
-// Descriptions and title change at a pace that can be followed.
+// Interval between updates of descriptions and title, so that people can follow them.
 const DESCRIBE_MILLIS = 2000;
 
 const byId = (id) => document.getElementById(id);
@@ -36,7 +36,7 @@ const controls = createControls({ view, act }, () => picture);
 const layout = createLayout(
   { stage: byId("stage"), field: document.querySelector(".field"), panels: byId("panels") }, panels.places);
 
-// For reading back what is on the screen, and how it was coloured.
+// Tests read the drawn picture and its colours here.
 window.emberwatch = { picture: null, drawn: 0, colours };
 
 const link = connect({
@@ -50,16 +50,16 @@ const link = connect({
 function show(next) {
   picture = next;
   facts.recovered();
-  // A server that began again counts from the start again: nothing is left of the entry looked at.
+  // A restarted server counts entries from the start, so the entry looked at no longer exists.
   if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
-  // So does a link to a world that this server has not.
+  // A link may name a world that this server lacks.
   if (next.info && view.world >= next.info.n_worlds) act.world(0);
   draw();
   window.emberwatch.picture = picture;
   window.emberwatch.drawn += 1;
 }
 
-// Every picture may fail alike: the page tells it as long as it lasts, the console once.
+// Every picture may fail in the same way: the page shows the error while it lasts, the console logs it once.
 function failed(error) {
   facts.failed(error);
   if (!hasFailed) console.error(error);
@@ -90,8 +90,7 @@ function describe(isDue) {
   document.title = titleOf(picture);
 }
 
-// What lies under the pointer and what has changed its size are drawn at once, at most once a frame, without a
-// new picture.
+// Redraws the current picture, at most once per frame, when the pointer moves or sizes change.
 function redraw() {
   if (isRedrawDue || !picture) return;
   isRedrawDue = true;
@@ -104,6 +103,6 @@ function byKey(cell) {
 }
 
 addEventListener("resize", redraw);
-// Whatever grows or shrinks moves others: either of these two tells.
+// Any element that changes its size changes the size of one of these two.
 const sizes = new ResizeObserver(redraw);
 for (const element of [document.body, byId("stage")]) sizes.observe(element);

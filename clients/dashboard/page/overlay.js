@@ -1,6 +1,6 @@
-// Marks over a grid, in device pixels: paths, where they began, the robots, and the pointed-at cell.
-// Marks are dark with a light counterpart, so that they stand out from every colour of every theme. In a team the
-// light one has the robot's colour.
+// Marks over a grid, in device pixels: paths, their starts, the robots, and the pointed-at cell. Each mark has a dark
+// and a light part, so that it stands out from every colour of every theme. In a team, the light part has the robot's
+// colour.
 
 import { prepare } from "./elements.js";
 import { drawFootprint, drawLand } from "./land.js";
@@ -11,7 +11,7 @@ import { isTeam } from "./words.js";
 const DARK = "#141414";
 const LIGHT = "#ffffff";
 
-/** Draws them; `hasPaths` only where the paths belong. */
+/** Draws the marks of one panel, with paths and robots if `hasPaths`. */
 export function drawMarks(canvas, picture, { cell, hasPaths }) {
   const drawn = prepare(canvas);
   if (!drawn) return;
@@ -26,7 +26,7 @@ export function drawMarks(canvas, picture, { cell, hasPaths }) {
   if (cell) drawCross(frame, cell);
 }
 
-// All paths below all starts below all robots, the first robot on top.
+// Draws all paths below all starts, and all starts below all robots, with the first robot on top.
 function drawRobots(frame, shown) {
   const look = (at) => (isTeam(shown) ? { color: robotColor(at), label: String(at) } : {});
   const robots = shown.robots.map((robot, at) => ({ ...robot, ...look(at) })).reverse();
@@ -37,7 +37,7 @@ function middle({ cell }, [row, col]) {
   return [(col + 0.5) * cell.x, (row + 0.5) * cell.y];
 }
 
-/** The middle of a cell, as far inside as a mark of that size needs. */
+/** Returns the middle of a cell, moved inwards so that a mark of this radius fits on the grid. */
 function inside(frame, place, radius) {
   const [x, y] = middle(frame, place);
   const fit = (at, size) => Math.min(Math.max(at, radius), size - radius);
@@ -51,7 +51,7 @@ function drawPath(frame, { path, color }) {
   context.lineJoin = "round";
   context.lineCap = "round";
   const width = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
-  // Over cells of a pixel or two there is more background than cells around the line.
+  // Where cells are one or two pixels wide, the line is seen mostly against the background.
   const dark = cell.x < 2 * ratio ? ink : DARK;
   stroke(context, color ? width + ratio : width, dark);
   if (color) stroke(context, width, color);
@@ -74,7 +74,7 @@ function drawStart(frame, { path: [place], color }) {
   context.strokeRect(x - side / 2, y - side / 2, side, side);
 }
 
-// Hollow if it stayed: hovered or, with a dashed ring, late.
+// A robot that stayed is hollow: a full ring if it hovered, a dashed ring if it was late.
 function drawRobot(frame, { cell: place, state, color = LIGHT, label }) {
   const { context, ratio, cell } = frame;
   const radius = Math.max(cell.x * 0.85, (label ? 8 : 5) * ratio);
@@ -107,7 +107,7 @@ function disc(context, x, y, radius, color) {
   context.fill();
 }
 
-// A light line beside each dark one: one of the two is seen on any cell.
+// A light line next to each dark one, so that one of the two is visible on any cell.
 function drawCross({ context, ratio, width, height, cell }, { row, col }) {
   const left = Math.round(col * cell.x);
   const top = Math.round(row * cell.y);

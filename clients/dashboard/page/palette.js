@@ -1,19 +1,19 @@
-// Colours of states, of what was seen, of beliefs and of objectives, and the tables that turn
-// array values into pixels. Lightness carries the order, so that all of it reads in grey too.
+// Colours of states, observations, beliefs and objectives, and the tables that convert array values to pixels.
+// Lightness carries the order, so that everything can be read in grey too.
 
-// For models that keep their colours to themselves: the wildfire's three, then further ones that stay
-// apart under the common colour blindnesses (Okabe and Ito 2008, with a brown for their orange).
+// Colours for hidden models: the wildfire's three, then colours that remain distinct under the common colour
+// blindnesses (Okabe and Ito 2008, with a brown instead of their orange).
 const COLORS = ["#3b6ea5", "#e3b23c", "#c8371b", "#009e73", "#cc79a7", "#56b4e9", "#8c510a", "#f0e442"];
 
-// Greys for what was not observed, the preferred one first.
+// Greys for cells that were not observed, the preferred one first.
 const UNSEEN = {
   light: ["#e2e2e2", "#b8b8b8", "#808080", "#484848"],
   dark: ["#2b2f36", "#14171b", "#5a616c", "#a0a6b0"],
 };
-// Squared distance at which two colours are told apart at a glance: 60 of 255 in each channel.
+// Squared distance at which two colours can be distinguished at a glance: 60 of 255 in each channel.
 const APART = 3 * 60 * 60;
 
-// Nine stops from 0 to 1, evenly spaced; OKLab lightness changes by the same amount between any two.
+// Nine stops, evenly spaced from 0 to 1. OKLab lightness changes by the same amount from stop to stop.
 const RAMPS = {
   belief: {
     light: ["#f9f8e1", "#c6e4be", "#87d0ab", "#4cb6a6", "#039aa0", "#057a91", "#005c80", "#003e6f", "#0d2156"],
@@ -25,36 +25,37 @@ const RAMPS = {
   },
 };
 
-// Of a team's paths and robots: all are light, so that dark edges and numbers are seen on them.
+// Colours of a team's paths and robots. All are light, so that dark edges and numbers are visible on them.
 const ROBOTS = ["#5ee6c8", "#ff9ad5", "#b9f04a", "#8fd0ff", "#ffa64d", "#c9a8ff", "#f5f09a", "#d9c2a0"];
 
-// Before an agent has planned its first path.
+// The objective before an agent has planned its first path.
 const IDLE = { name: "nothing yet", color: "#8b93a0" };
 
-// Beyond those lists each next hue is this far on, in degrees (the golden angle), so that neighbours differ;
-// lightness takes turns.
+// Colours beyond these lists are generated. Hues are this many degrees apart (the golden angle), so that neighbours
+// differ; lightness alternates.
 const HUE_STEP = 137.508;
 const LIGHTNESSES = [0.42, 0.66, 0.3];
 const SATURATION = 0.55;
 
-// For objectives that name no state; apart from the wildfire's colours.
+// Colours of objectives that name no state; they differ from the wildfire's colours.
 const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
 
-/** What stands for "never" in grids of bytes. */
+/** The byte that means "not observed" in grids. */
 export const NEVER = 255;
 
-// The share of its colour that an observation keeps however old it is, and the age in steps at
-// which the rest has halved: old cells stay readable, the last few steps stand out.
+// Old observations fade: each keeps this share of its colour, and the rest halves in this number of steps. So old cells
+// stay readable, and the last few steps stand out.
 const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
-// The share of its zone's colour in a cell that was not observed: states and observations, in full colours, stay apart.
+// The share of the zone's colour in a cell that was not observed. It stays distinct from the full colours of states and
+// observations.
 const ZONE_SHARE = 0.4;
 
 /**
- * The colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by any byte,
- * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by
- * `value * 256 + age`, `rampTable(name)` by value 0..255. Of what was not observed `unseenZones` and `zoneTable` by zone.
+ * Returns the colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by any byte,
+ * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by `value * 256 + age`,
+ * `rampTable(name)` by value 0..255. For cells not observed: `unseenZones` and `zoneTable` by zone.
  */
 export function paletteOf(picture, theme) {
   const { state_colours: states, observation_colours: observations, n_named: named, zone_colours: zones } = picture.info ?? {};
@@ -64,7 +65,7 @@ export function paletteOf(picture, theme) {
 function make({ states: ownStates, observations: ownObservations, named, zones, theme }) {
   const states = colorsOf(ownStates);
   const colors = colorsOf(ownObservations);
-  // Those of a sensor's outer rings have the colours of the first.
+  // Observations of a sensor's outer rings have the colours of the first ring.
   const observations = colors.map((color, at) => colors[at % (named || colors.length)]);
   const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
   const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at]);
@@ -83,7 +84,7 @@ function make({ states: ownStates, observations: ownObservations, named, zones, 
   };
 }
 
-/** The colour of an objective: that of the state whose name it is, else one of its own. */
+/** Returns the colour of an objective: the colour of the state of this name, or one of its own. */
 export function objectiveColor(name, { objectives, names, palette }) {
   if (name === IDLE.name) return IDLE.color;
   const state = names.indexOf(name);
@@ -93,17 +94,17 @@ export function objectiveColor(name, { objectives, names, palette }) {
   return OBJECTIVES[at] ?? generated(at);
 }
 
-/** The colour of a team's robot. */
+/** Returns the colour of a team's robot. */
 export function robotColor(at) {
   return ROBOTS[at % ROBOTS.length];
 }
 
-/** "#rrggbb" as [red, green, blue]. */
+/** Converts "#rrggbb" to [red, green, blue]. */
 export function channels(color) {
   return [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16));
 }
 
-/** The colour of `value` of 0..1 on a ramp, as [red, green, blue]. */
+/** Returns the colour of `value`, from 0 to 1, on a ramp, as [red, green, blue]. */
 export function rampColor(name, theme, value) {
   const stops = RAMPS[name][theme];
   const at = Math.min(Math.max(value, 0), 1) * (stops.length - 1);
@@ -111,12 +112,12 @@ export function rampColor(name, theme, value) {
   return blend(channels(stops[below]), channels(stops[below + 1]), at - below);
 }
 
-/** The stops of a ramp, for legends. */
+/** Returns the stops of a ramp, for legends. */
 export function rampStops(name, theme) {
   return RAMPS[name][theme];
 }
 
-// One for each byte: the model's own colours first; what they lack comes from here.
+// Returns a colour for each byte: the model's own colours first, then the colours of this file.
 function colorsOf(own) {
   return Array.from({ length: 256 }, (_, at) => own?.[at] ?? COLORS[at] ?? generated(at));
 }
@@ -135,7 +136,7 @@ function hexadecimal(channel) {
   return channel.toString(16).padStart(2, "0");
 }
 
-/** The first grey that is well apart from all colours, else the one furthest from them. */
+/** Returns the first grey that is distinct from all colours, or else the most distant grey. */
 function unlike(colors, greys) {
   const nearest = (grey) => Math.min(...colors.map((color) => distance(color, grey)));
   return greys.find((grey) => nearest(grey) >= APART)
@@ -151,7 +152,7 @@ function mixed(unseen, zone) {
   return blend(channels(unseen), channels(zone), ZONE_SHARE);
 }
 
-// An observation made `age` steps ago.
+// Returns the colour of an observation made `age` steps ago.
 function faded(color, unseen, age) {
   return blend(unseen, color, OLDEST_SHARE + (1 - OLDEST_SHARE) * 2 ** (-age / HALF_AGE));
 }
@@ -160,7 +161,7 @@ function blend(from, to, share) {
   return from.map((channel, i) => Math.round(channel + (to[i] - channel) * share));
 }
 
-// Pixels as canvas image data keeps them on little-endian machines, which all browsers run on.
+// Builds a table of pixels as in canvas image data on little-endian machines, on which all browsers run.
 function table(length, color) {
   const pixels = new Uint32Array(length);
   for (let i = 0; i < length; i += 1) {

@@ -1,4 +1,4 @@
-// The grids: one canvas with a pixel per cell for each, a second one above it for marks.
+// The panels of grids. Each has a canvas with one pixel per cell, and above it a canvas for marks.
 
 import { make, write } from "./elements.js";
 import { drawMarks } from "./overlay.js";
@@ -13,15 +13,15 @@ const OBSERVED = [
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
-/** The panels in `parent`, and the inspector among them; `byKey(cell)` hears of cells that keys go to, or null. */
+/** Creates the panels and the inspector in `parent`. `byKey(cell)` is called when keys select a cell, or null. */
 export function createPanels(parent, { pointer, byKey, inspector }) {
   let built = { key: "", world: null, beliefs: [], panels: [], landLines: 0 };
-  // The cell that keys went to; once the pointer moves over a panel, it counts again.
+  // The cell selected by keys, until the pointer moves over a panel.
   let keyed = null;
   const hold = (cell) => { keyed = cell; byKey(cell); };
   const release = () => { keyed = null; };
 
-  /** Builds panels again when their number, names or shape change. Tells whether it did. */
+  /** Rebuilds the panels when their number, names or shape change. Returns whether it did. */
   function build(picture) {
     const beliefs = namesOf(picture);
     const landLines = hasLand(picture) ? 1 : 0;
@@ -39,7 +39,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
     return true;
   }
 
-  // Agents show a belief now and then, so entries without one lie between those with: panels stay.
+  // Agents publish a belief only for some entries, so the panels stay for entries without one.
   function namesOf(picture) {
     const names = beliefNames(picture);
     if (names.length > 0 || picture.objectives.length === 0) return names;
@@ -48,14 +48,14 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
 
   return {
     build,
-    /** For the layout: panels, lines of the inspector, whether a note stands for beliefs, columns that hold those in one row. */
+    /** For the layout: panels, inspector lines, whether a note replaces beliefs, columns if they are in one row. */
     places: () => ({
       panels: built.panels.length,
       lines: OBSERVED.length + built.landLines + (built.beliefs.length && built.beliefs.length + 1),
       isBare: built.beliefs.length === 0,
       regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
     }),
-    /** The cell that keys or the pointer are on, { row, col }; null: none. */
+    /** Returns the cell selected by keys or the pointer, { row, col }; null if none is. */
     cell(picture) {
       const pointed = keyed ? null : pointer.on(built.panels.map((panel) => panel.grid));
       return pointed ? cellAt(pointed, shapeOf(picture)) : keyed;
@@ -138,9 +138,9 @@ function valuesOf({ kind, state }, picture) {
 
 function absence({ kind }, picture) {
   if (kind === "truth" && picture.source === "recording") return ["This recording holds no hidden states."];
-  if (kind === "truth" && !picture.info.publish_truth) return ["The server keeps it to itself. To see it, start the server with ", "--publish-truth"];
-  if (kind === "belief" || kind === "entropy") return ["No belief was shown at this step or shortly before."];
-  return ["Not known for this step."];
+  if (kind === "truth" && !picture.info.publish_truth) return ["The server does not publish it. To see it, start the server with ", "--publish-truth"];
+  if (kind === "belief" || kind === "entropy") return ["No belief published at this step or shortly before."];
+  return ["Unknown for this step."];
 }
 
 function noBelief({ source }) {
@@ -150,7 +150,7 @@ function noBelief({ source }) {
 }
 
 function describe(panel, picture) {
-  const sentence = valuesOf(panel, picture) ? panelSentence(panel, picture) : `${panel.title}: not known`;
+  const sentence = valuesOf(panel, picture) ? panelSentence(panel, picture) : `${panel.title}: unknown`;
   panel.cells.setAttribute("aria-label", sentence);
 }
 

@@ -1,24 +1,27 @@
-// Draws a chart's canvas: grid, line or strip, cursor. Colours come from the style sheet.
+// Draws a chart's canvas: grid, line or strip, and cursors. Colours come from the style sheet.
 
 import { prepare } from "./elements.js";
 import { NEVER } from "./palette.js";
 import { extent, tickText, ticks } from "./scale.js";
 
-// Sizes in the canvas's font size. Room left of the plots for the ticks' text, and what is kept free beside a text.
+// Sizes relative to the canvas's font size: minimum width of the ticks' texts left of a plot, and space next to a text.
 const LEFT = 3.1;
 const SPACE = 0.5;
-// Agents are sampled now and then: what lies between two samples is drawn unless it is so many times as
-// long as is usual between them.
+// Agents publish only some steps. A line bridges the gap between two samples, unless the gap is this many times the
+// usual one.
 const LONG = 4;
-// Half of a tick's text stands out above and below its line.
+// Half of a tick's text, which extends above and below its line.
 const MARGIN = 0.6;
-// Least distance of two ticks, upwards and across, so that their texts stay apart.
+// Minimum distance between two ticks, vertically and horizontally, so that their texts stay apart.
 const TICK = 2.7;
 const STEP_TICK = 5.8;
 // Height of the text below the strip.
 const STEPS = 1.7;
 
-/** A chart's canvas, cleared, with ticks upwards for `values`, if there are any, at least so much apart; null while hidden. */
+/**
+ * Clears a chart's canvas. Returns its context and sizes, and vertical ticks for `values` at least `apart` apart, if
+ * there are values. Returns null while the canvas is hidden.
+ */
 export function frameOf(canvas, values, apart = 0) {
   const drawn = prepare(canvas);
   if (!drawn) return null;
@@ -32,7 +35,7 @@ export function frameOf(canvas, values, apart = 0) {
   return values ? { ...frame, rows: rowsOf(frame, values, apart) } : frame;
 }
 
-/** Room left of the plots of charts with a common axis below, in CSS pixels; `word` is what that axis counts. */
+/** Returns the width, in CSS pixels, to keep left of plots with a shared axis below; `word` names the axis. */
 export function roomFor(frames, word) {
   return Math.max(0, ...frames.filter(Boolean).map(({ context, em, rows }) => {
     const width = (text) => context.measureText(text).width;
@@ -42,7 +45,7 @@ export function roomFor(frames, word) {
   }));
 }
 
-/** A line chart of values of each bin. */
+/** Draws a line chart with one value per bin. */
 export function drawLine(frame, values, { axis, left, hover, looked }) {
   if (!frame) return;
   const plot = { ...frame, left };
@@ -52,13 +55,13 @@ export function drawLine(frame, values, { axis, left, hover, looked }) {
   drawColumns(plot, axis);
   const runs = runsOf(values, (value) => !Number.isNaN(value), axis.bridge).map((run) =>
     run.map((bin) => [x(plot, axis.binShare(bin)), y(values[bin])]));
-  // An area stands for an amount, so only where the axis begins at zero.
+  // A filled area represents an amount, so it is drawn only if the axis begins at zero.
   if (rows[0].value === 0) drawArea(plot, runs);
   drawRuns(plot, runs);
   for (const serial of [looked, hover]) drawCursor(plot, axis, serial, values, y);
 }
 
-/** The strip of objectives with the axis of steps below. */
+/** Draws the strip of objectives, with the axis of steps below. */
 export function drawStrip(frame, values, { axis, left, hover, looked }, colors) {
   if (!frame) return;
   const plot = { ...frame, left };
@@ -74,7 +77,7 @@ export function drawStrip(frame, values, { axis, left, hover, looked }, colors) 
   for (const serial of [looked, hover]) drawCursor({ ...plot, height }, axis, serial);
 }
 
-// Ticks upwards that cover the values.
+// Returns vertical ticks that cover the values.
 function rowsOf({ height, em }, values, apart) {
   const { low, high } = extent(values);
   const base = low > 0.6 * high ? low : Math.min(0, low);
@@ -138,7 +141,7 @@ function drawSteps(frame, axis) {
   }
 }
 
-/** The bins with a value in runs that a line joins: long gaps part them. */
+/** Returns the bins with values, grouped into runs that a line joins. Long gaps separate runs. */
 function runsOf(values, isKnown, bridge) {
   const known = [...values.keys()].filter((bin) => isKnown(values[bin]));
   const gap = Math.max(bridge, LONG * usualGap(known));
@@ -150,13 +153,13 @@ function runsOf(values, isKnown, bridge) {
   return runs;
 }
 
-// The median.
+// Returns the median gap.
 function usualGap(known) {
   const gaps = known.slice(1).map((bin, i) => bin - known[i]).sort((a, b) => a - b);
   return gaps[gaps.length >> 1] ?? 1;
 }
 
-/** Blocks of one objective: each lasts until the run's next sample of another. */
+/** Returns blocks of one objective. Each lasts until the run's next sample of another objective. */
 function blocksOf(values, bridge) {
   const blocks = [];
   for (const run of runsOf(values, (value) => value !== NEVER, bridge)) {

@@ -1,12 +1,12 @@
-// Where the pointer is. It may rest while what lies under it changes, so every drawing asks what is there now.
+// The pointer's position. The elements under a resting pointer may change, so every drawing looks them up again.
 
-/** Follows the pointer; `changed()` is called when something else may lie under it. */
+/** Follows the pointer. Calls `changed()` when another element may lie under it. */
 export function createPointer(changed) {
   let at = null;
 
   function follow(event) {
     if (!event.isPrimary) return;
-    // It leaves when it goes out of the window, and as soon as a finger is lifted or scrolls.
+    // The pointer leaves when it exits the window, or when a finger is lifted or scrolls.
     at = event.type === "pointerleave" ? null : { clientX: event.clientX, clientY: event.clientY };
     changed();
   }
@@ -17,7 +17,7 @@ export function createPointer(changed) {
   addEventListener("scroll", () => at && changed(), { capture: true, passive: true });
 
   return {
-    /** Which of `elements` it is on, and where: { element, clientX, clientY }; null if on none that is seen there. */
+    /** Returns the visible one of `elements` under the pointer: { element, clientX, clientY }, or null. */
     on(elements) {
       const top = at && document.elementFromPoint(at.clientX, at.clientY);
       const element = top && elements.find((candidate) => candidate.contains(top));

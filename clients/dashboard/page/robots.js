@@ -1,4 +1,4 @@
-// The robots of a team: their colours, and a line in words for each.
+// The robots of a team: one line of text for each, with its colour.
 
 import { make, write } from "./elements.js";
 import { robotColor } from "./palette.js";
@@ -6,7 +6,7 @@ import { isTeam, short } from "./words.js";
 
 const DID = { flew: "flew", hovered: "hovered", late: "late", new: "not flown yet" };
 
-/** Keeps the list `root`; it is hidden for a robot alone, of which the facts tell. */
+/** Maintains the list `root`. Hides it for a single robot, which the facts describe. */
 export function createRobots(root) {
   let rows = [];
 
@@ -21,7 +21,7 @@ export function createRobots(root) {
   }
 
   return {
-    /** `holders` are the processes that hold the robots now, if they are known. */
+    /** Draws the lines. `holders` are the processes that hold the robots, if known. */
     draw({ info, shown }, holders) {
       root.hidden = !info || !isTeam(shown);
       if (root.hidden) return;

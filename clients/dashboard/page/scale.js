@@ -1,6 +1,6 @@
-// Axes: where ticks go, and where serials lie across a chart.
+// Axes: positions of ticks, and positions of serials across a chart.
 
-/** Ticks at 1, 2 or 5 times a power of ten that cover `low..high`, about `count` of them. */
+/** Returns about `count` ticks that cover `low..high`, spaced by 1, 2 or 5 times a power of ten. */
 export function ticks(low, high, count) {
   const step = niceStep((high - low) / count);
   const first = Math.floor(low / step + 1e-9);
@@ -10,13 +10,13 @@ export function ticks(low, high, count) {
   return { at, step };
 }
 
-/** A tick as text, with the digits that its step needs. */
+/** Returns a tick's text, with the digits that the step between ticks needs. */
 export function tickText(value, step) {
   if (Math.abs(value) >= 10000 && step >= 1000) return `${Math.round(value / 100) / 10}k`;
   return value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
 }
 
-/** Least and most of the numbers that are not NaN; null if there are none. */
+/** Returns the minimum and maximum of the numbers that are not NaN; null if there are none. */
 export function extent(values) {
   let [low, high] = [Infinity, -Infinity];
   for (const value of values) {
@@ -26,11 +26,11 @@ export function extent(values) {
   return low > high ? null : { low, high };
 }
 
-/** How the serials of a series lie across a chart, and which step each is. */
+/** Returns functions that map a series' serials to positions across a chart, and to steps. */
 export function across(series) {
   const { first, last, bins } = series;
   const count = last - first + 1;
-  // Steps and serials go together, unless episodes ended or frames were lost in between.
+  // Steps and serials differ by a constant, unless episodes ended or frames were lost in between.
   const isPlain = series.last_step - series.first_step === last - first;
   return {
     first,
@@ -41,9 +41,9 @@ export function across(series) {
     share: (serial) => (serial - first + 0.5) / count,
     at: (share) => Math.min(Math.max(Math.floor(first + share * count), first), last),
     bin: (serial) => Math.floor(((serial - first) * bins) / count),
-    /** Where a bin lies: with fewer entries than bins, where its entry does. */
+    /** Returns a bin's position: with fewer entries than bins, the position of its entry. */
     binShare: (bin) => (count < bins ? Math.ceil((bin * count) / bins) + 0.5 : ((bin + 0.5) * count) / bins) / count,
-    // With fewer entries than bins there are bins that no entry falls into: no gaps.
+    // With fewer entries than bins, some bins are empty without being gaps.
     bridge: Math.ceil(bins / count),
   };
 }

@@ -1,20 +1,19 @@
-// The connection to the dashboard. The page pulls: it asks, gets exactly one picture, draws it in the
-// browser's own time, and asks again. So a slow or hidden page gets fewer pictures and nothing queues.
+// The connection to the dashboard. The page pulls: it sends a request, receives exactly one picture, draws it when the
+// browser is ready, and sends the next request. So a slow or hidden page receives fewer pictures, and none are queued.
 
 import { decode } from "./wire.js";
 
 const RETRY_MILLIS = 1000;
-// The dashboard answers within half a second; a connection that is silent for longer is dead.
+// The dashboard answers within half a second, so a connection that is silent for this long is dead.
 const SILENCE_MILLIS = 6000;
-// Beside the ask that waits for news, one more may be under way: so that scrubbing need not wait.
-const MOST_ASKS = 2;
+// One request waits for changes; a second one may be under way, so that scrubbing need not wait.
+const MAX_REQUESTS = 2;
 
 /**
  * Keeps a connection up for as long as the page lives.
- *
- * `ask()` gives the next ask; `show(picture)` draws one; `superseded(picture)` tells whether a picture
- * that a newer ask has overtaken is not worth drawing; `up(isUp)` hears of connections made and lost;
- * `failed(error)` of pictures that cannot be read.
+ * `ask()` returns the next request. `show(picture)` draws a picture. `superseded(picture)` returns whether to skip a
+ * picture for which a newer request is under way. `up(isUp)` is called when the connection is made or lost, and
+ * `failed(error)` when a picture cannot be read.
  */
 export function connect({ ask, show, superseded, up, failed }) {
   let socket = null;
@@ -52,7 +51,7 @@ export function connect({ ask, show, superseded, up, failed }) {
     const picture = attempt(() => decode(buffer));
     const from = socket;
     requestAnimationFrame(() => {
-      // It has closed meanwhile: that is told, and no picture of it takes the place of that.
+      // If the socket has closed meanwhile, its picture must not replace the page's notice.
       if (from.readyState !== WebSocket.OPEN) return;
       const isOvertaken = asked > 0;
       if (picture && !(isOvertaken && superseded(picture))) attempt(() => show(picture));
@@ -69,10 +68,10 @@ export function connect({ ask, show, superseded, up, failed }) {
     }
   }
 
-  /** Asks again at once, as what is wanted has changed. */
+  /** Sends a request at once, because the wanted picture has changed. */
   function hurry() {
     if (socket?.readyState !== WebSocket.OPEN) return;
-    if (asked < MOST_ASKS) send();
+    if (asked < MAX_REQUESTS) send();
     else isStale = true;
   }
 

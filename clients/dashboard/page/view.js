@@ -1,22 +1,22 @@
-// What the visitor wants to see: world, entry, theme. The address's hash keeps world and theme, so that a
-// link or a reload brings them back.
+// The visitor's choices: world, entry, theme. The address's hash stores world and theme, so that a link or a reload
+// restores them.
 
 const THEMES = ["auto", "light", "dark"];
-// Worlds that an address may name while nobody knows how many there are, and that can be selected at all.
-export const MOST_WORLDS = 4096;
+// Maximum number of selectable worlds, and of worlds that an address may name before their number is known.
+export const MAX_WORLDS = 4096;
 const darkness = matchMedia("(prefers-color-scheme: dark)");
 
 /**
- * The view, with `asks()` called when another picture is wanted and `changed()` when only looks change.
- * `worlds()` gives how many there are, if that is known.
+ * Creates the view. It calls `asks()` when it needs another picture, and `changed()` when only the appearance changes.
+ * `worlds()` returns the number of worlds, if known.
  */
 export function createView({ asks, changed, worlds }) {
-  const read = () => readHash(Math.min(worlds() ?? MOST_WORLDS, MOST_WORLDS));
+  const read = () => readHash(Math.min(worlds() ?? MAX_WORLDS, MAX_WORLDS));
   const view = {
     ...read(),
-    /** Serial of the entry to look at; null: the newest. */
+    /** Serial of the entry to look at; null for the newest. */
     at: null,
-    /** For the next ask only: a recording's speed, and whether it plays. */
+    /** For the next request only: a recording's speed, and whether it plays. */
     player: { speed: null, playing: null },
   };
 
@@ -37,13 +37,13 @@ export function createView({ asks, changed, worlds }) {
   return { view, act };
 }
 
-/** The theme in effect, "light" or "dark". */
+/** Returns the theme in effect, "light" or "dark". */
 export function themeOf(view) {
   if (view.theme !== "auto") return view.theme;
   return darkness.matches ? "dark" : "light";
 }
 
-/** The next ask; wishes about a recording are told once. */
+/** Returns the next request. Changes to a recording's player are sent only once. */
 export function askOf(view, bins) {
   const { speed, playing } = view.player;
   view.player = { speed: null, playing: null };
@@ -64,7 +64,7 @@ function writeHash({ world, theme }) {
   history.replaceState(null, "", `#world=${world}&theme=${theme}`);
 }
 
-// Style sheets know "auto" as no attribute at all.
+// In the style sheet, "auto" is the absence of the attribute.
 function applyTheme({ theme }) {
   if (theme === "auto") delete document.documentElement.dataset.theme;
   else document.documentElement.dataset.theme = theme;

@@ -1,11 +1,11 @@
-// A picture's bytes: their length-prefixed JSON, and the arrays behind it as typed arrays that share
-// the message's memory.
+// Decodes a picture's bytes: length-prefixed JSON, followed by arrays, which become typed arrays that share the
+// message's memory.
 
 const TYPES = { u8: Uint8Array, f32: Float32Array };
-// Arrays begin at multiples of this, so that typed arrays can lie on the buffer.
+// Arrays begin at multiples of this, so that typed arrays can share the buffer.
 const ALIGNMENT = 8;
 
-/** Decodes a message; `arrays` becomes an object of typed arrays by name. Throws if it is damaged. */
+/** Decodes a message. `arrays` becomes an object of typed arrays by name. Throws if the message is damaged. */
 export function decode(buffer) {
   const { text, end } = header(buffer);
   const picture = JSON.parse(text);
@@ -25,21 +25,21 @@ export function decode(buffer) {
 }
 
 /**
- * Height and width of the grids in a picture, or null before any is known: those of the entry shown,
- * as the server may be a new one with another grid.
+ * Returns the height and width of the grids in a picture, or null before they are known. The shown entry's shape
+ * takes precedence, as the server may be a new one with another grid.
  */
 export function shapeOf(picture) {
   const of = picture?.shown?.height ? picture.shown : picture?.info;
   return of ? { height: of.height, width: of.width } : null;
 }
 
-/** How many cells its grids have; null before any is known. */
+/** Returns the number of cells of a picture's grids; null before it is known. */
 export function cellsOf(picture) {
   const shape = shapeOf(picture);
   return shape && shape.height * shape.width;
 }
 
-/** Whether it tells of zones or no-fly cells. */
+/** Returns whether a picture has zones or no-fly cells. */
 export function hasLand({ arrays }) {
   return Boolean(arrays.zones ?? arrays.no_fly);
 }
@@ -54,7 +54,7 @@ function header(buffer) {
   return { text: new TextDecoder().decode(new Uint8Array(buffer, 4, length)), end };
 }
 
-// A grid of another size would be painted askew, so it is refused instead.
+// Refuses a grid of another size, which would be drawn askew.
 function checkGrids(picture, arrays) {
   const cells = cellsOf(picture);
   if (!cells) return;

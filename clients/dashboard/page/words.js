@@ -1,16 +1,16 @@
-// Numbers and names as people read them, and the sentences that stand in for pictures.
+// Formats numbers and names for people, and describes pictures in sentences.
 
 import { cellsOf } from "./wire.js";
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const UNKNOWN = "–";
 
-/** A whole number with thousands apart; a dash if it is unknown. */
+/** Formats a whole number with separators of thousands; a dash if it is unknown. */
 export function whole(value) {
   return value == null || Number.isNaN(value) ? UNKNOWN : WHOLE.format(value);
 }
 
-/** A number with so many digits as are worth reading: 1,234; 31.4; 0.412. */
+/** Formats a number with only the digits worth reading: 1,234; 31.4; 0.412. */
 export function short(value) {
   if (value == null || Number.isNaN(value)) return UNKNOWN;
   const size = Math.abs(value);
@@ -18,22 +18,22 @@ export function short(value) {
   return value.toFixed(size >= 10 ? 1 : size >= 1 ? 2 : 3);
 }
 
-/** Text, or a dash if there is none. */
+/** Returns text, or a dash if there is none. */
 export function text(value) {
   return value == null || value === "" ? UNKNOWN : String(value);
 }
 
-/** Names of the hidden states; numbers of a hidden model. */
+/** Returns the names of the hidden states, or numbered names for a hidden model. */
 export function stateNames(picture) {
   return picture.info?.states ?? picture.agent?.states ?? numbered("state", 3);
 }
 
-/** Names of what can be observed. */
+/** Returns the names of the observations. */
 export function observationNames(picture) {
   return picture.info?.observations ?? [];
 }
 
-/** Names of the states that the belief is about: a learned filter has its own. Empty without belief. */
+/** Returns the names of the belief's states, which a learned filter may define itself. Empty without a belief. */
 export function beliefNames(picture) {
   const { belief } = picture.arrays;
   if (!belief || !picture.info) return [];
@@ -42,29 +42,29 @@ export function beliefNames(picture) {
   return names?.length === count ? names : numbered("state", count);
 }
 
-/** Whether a world has several robots. */
+/** Returns whether a world has several robots. */
 export function isTeam(shown) {
   return shown?.robots.length > 1;
 }
 
-/** The name of the state that pays. */
+/** Returns the name of the state that pays most. */
 export function targetName(picture) {
   const target = picture.info?.target_state;
   return target == null ? "target" : stateNames(picture)[target] ?? "target";
 }
 
-/** From which step "seen so far" knows, such as "since k = 12"; empty if from the episode's first. */
+/** Returns the first step that "seen so far" covers, such as "since k = 12"; empty if it covers the episode. */
 export function seenSince({ shown }) {
   return shown?.seen_since > 0 ? `since k = ${whole(shown.seen_since)}` : "";
 }
 
-/** How old the belief is, such as "of 3 steps before"; empty if it is about the step that is shown. */
+/** Returns the belief's age, such as "3 steps old"; empty if it is about the shown step. */
 export function beliefAge({ agent, shown }) {
   const age = agent && shown ? shown.step - agent.step : 0;
-  return age > 0 ? `of ${age === 1 ? "a step" : `${whole(age)} steps`} before` : "";
+  return age > 0 ? `${age === 1 ? "1 step" : `${whole(age)} steps`} old` : "";
 }
 
-/** What a panel shows, in one sentence, for people who do not see it. */
+/** Describes a panel in one sentence, for people who cannot see it. */
 export function panelSentence(panel, picture) {
   const { shown, info } = picture;
   if (!shown || !info) return `${panel.title}: nothing yet`;
@@ -83,17 +83,17 @@ export function panelSentence(panel, picture) {
     case "belief":
       return `belief ${panel.name}: mean probability ${share(picture, panel)} ${believed}`;
     default:
-      return `entropy: mean ${share(picture, panel)} of the most that is possible ${believed}`;
+      return `entropy: mean ${share(picture, panel)} of its maximum ${believed}`;
   }
 }
 
-/** What a chart shows, in one sentence. */
+/** Describes a chart in one sentence. */
 export function chartSentence(title, unit, values, current) {
   const known = [...values].filter((value) => !Number.isNaN(value));
   if (known.length === 0) return `${title}: nothing yet`;
   const mean = known.reduce((sum, value) => sum + value, 0) / known.length;
-  return `${title}: now ${short(current)}, mean ${short(mean)}, least ${short(Math.min(...known))}, ` +
-    `most ${short(Math.max(...known))} ${unit}`;
+  return `${title}: now ${short(current)}, mean ${short(mean)}, minimum ${short(Math.min(...known))}, ` +
+    `maximum ${short(Math.max(...known))} ${unit}`;
 }
 
 function places({ robots }) {

@@ -20,11 +20,11 @@ struct Place {
     port: Option<u16>,
 }
 
-/// Checks that a request may have come from the dashboard's page. `names` are host names that browsers may call the
-/// dashboard by.
+/// Checks that a request may have come from the dashboard's page. `names` are host names under which browsers may reach
+/// the dashboard.
 ///
 /// # Errors
-/// In words, for another `Host` or `Origin`.
+/// A sentence about the problem, if the `Host` or `Origin` is not allowed.
 pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
     let text = |name: HeaderName| headers.get(name).map(|it| it.to_str().unwrap_or("?"));
     let host = text(HOST).unwrap_or("");
@@ -35,8 +35,8 @@ pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
     };
     match text(ORIGIN) {
         Some(origin) if !place.has_origin(origin) => Err(format!(
-            "Origin: expected \"http://{host}\" or \"https://{host}\", got {origin:?}; a proxy must pass the browser's \
-             Host on"
+            "Origin: expected \"http://{host}\" or \"https://{host}\", got {origin:?}; a proxy must forward the \
+             browser's Host"
         )),
         _ => Ok(()),
     }
@@ -45,7 +45,7 @@ pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
 /// Parses a host name of `--name`.
 ///
 /// # Errors
-/// In words, for anything else, such as a URL.
+/// A sentence about the problem, if the text is not a host name, for example a URL.
 pub fn host_name(text: &str) -> Result<String, String> {
     let is_part = |byte: u8| byte.is_ascii_alphanumeric() || b".-_".contains(&byte);
     if text.is_empty() || !text.bytes().all(is_part) {
@@ -72,14 +72,14 @@ impl Place {
         })
     }
 
-    /// Whether nobody else can point this host here.
+    /// Returns whether nobody else can point this host at this machine.
     fn is_own(&self, names: &[String]) -> bool {
         let is_own = |name: &String| name.eq_ignore_ascii_case(&self.name);
         self.is_address || self.name == "localhost" || names.iter().any(is_own)
     }
 
-    /// Whether pages of an origin came from this place. A missing port is the default of the origin's scheme: a proxy
-    /// may pass `fire.example`, `fire.example:443` or neither on.
+    /// Returns whether pages of an origin came from this place. A missing port is the default of the origin's scheme: a
+    /// proxy may forward `fire.example`, `fire.example:443` or neither.
     fn has_origin(&self, origin: &str) -> bool {
         let (default_port, rest) = match origin.split_once("://") {
             Some(("http", rest)) => (80, rest),
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
     use axum::http::HeaderValue;
 
-    /// Whether a request is answered where `--name Lab.example` was given.
+    /// Returns whether a request is answered under `--name Lab.example`.
     fn answered(host: &'static str, origin: Option<&'static str>) -> bool {
         let mut headers = HeaderMap::new();
         headers.insert(HOST, HeaderValue::from_static(host));

@@ -1,4 +1,4 @@
-//! The last few thousand steps of each world, joined from what arrives on three channels. Pure.
+//! The last few thousand steps of each world, joined from the samples of three channels. Does no I/O.
 
 use crate::entry::{Belief, Entry, Key, States};
 use emberwatch_protocol::agent_belief::AgentBelief;
@@ -7,27 +7,27 @@ use emberwatch_protocol::observer::Sample;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
-/// Most steps that are kept of a world.
+/// Maximum number of kept steps per world.
 pub const MAX_ENTRIES: usize = 4096;
 
-/// Most bytes that are kept of all worlds: 4,096 steps of three 64 x 64 worlds with all there is to see, or
-/// 800 of a 256 x 256 world.
+/// Maximum number of kept bytes of all worlds. They hold 4,096 steps of three 64 x 64 worlds with hidden states and
+/// beliefs, or 800 steps of a 256 x 256 world.
 const MAX_BYTES: usize = 256 << 20;
 
-/// How many of the last steps late hidden states and beliefs are looked for in.
+/// Number of latest steps that can still receive hidden states and beliefs.
 const MAX_DELAY: usize = 512;
 
-/// How long before a step a belief may have come that is shown beside it.
+/// Maximum age of a belief that is shown with a later step.
 const MAX_BELIEF_AGE: Duration = Duration::from_secs(5);
 
-/// How many hidden states are held for frames that have not come yet: channels are read one after the
-/// other, and a recording may have them in either order.
+/// Maximum number of hidden states held for frames that have not arrived. Channels are read one after the other, and a
+/// recording may store a frame and its hidden states in either order.
 const MAX_EARLY: usize = 64;
 
-/// Most bytes of those.
+/// Maximum number of bytes of held hidden states.
 const MAX_EARLY_BYTES: usize = 32 << 20;
 
-/// What is known of each world.
+/// The kept steps of all worlds.
 #[derive(Debug, Default)]
 pub struct Album {
     worlds: BTreeMap<u32, Strip>,
@@ -35,22 +35,22 @@ pub struct Album {
     early: VecDeque<(u32, Key, Box<[u8]>)>,
 }
 
-/// The kept steps of one world; each has a serial number, in the order of arrival.
+/// The kept steps of one world. Serial numbers count them in the order of arrival.
 #[derive(Debug, Default)]
 pub struct Strip {
     entries: VecDeque<Entry>,
     first_serial: u64,
-    /// First robot of the agent whose beliefs are shown, and the time of the last step with one.
+    /// First robot of the agent whose beliefs are shown, and the arrival time of its last believed step.
     believer: Option<(u32, Instant)>,
 }
 
 impl Album {
-    /// A world's steps.
+    /// Returns a world's steps.
     pub fn strip(&self, world: u32) -> Option<&Strip> {
         self.worlds.get(&world)
     }
 
-    /// Worlds of which something is known.
+    /// Returns the worlds that have steps.
     pub fn worlds(&self) -> impl Iterator<Item = u32> + '_ {
         self.worlds.keys().copied()
     }
@@ -60,7 +60,7 @@ impl Album {
         *self = Self::default();
     }
 
-    /// Adds a frame; what makes no sense, and what was shown already, is left out.
+    /// Adds a frame. Ignores an invalid frame, and a repetition of the last one.
     pub fn add_frame(&mut self, sample: &Sample<FrameHeader>, at: Instant) {
         let Some(mut entry) = Entry::from_sample(sample, at) else {
             return;
@@ -84,7 +84,7 @@ impl Album {
         self.make_room();
     }
 
-    /// Adds hidden states to the step that they belong to, if that is kept.
+    /// Adds hidden states to their step, or holds them until its frame arrives.
     pub fn add_truth(&mut self, sample: &Sample<TruthHeader>) {
         let header = &sample.header;
         let key = Key {
@@ -112,8 +112,8 @@ impl Album {
         }
     }
 
-    /// Adds what an agent believed of a step; `false` if that step is not there, yet or any more. `states` are
-    /// the model's.
+    /// Adds an agent's belief to its step. Returns `false` if the step has not arrived, or is no longer kept. `states`
+    /// are the model's states.
     pub fn add_belief(&mut self, published: &AgentBelief, states: Option<&States>) -> bool {
         let AgentHeader {
             seed,
@@ -134,13 +134,13 @@ impl Album {
         };
         let (_, height, width) = published.belief.dim();
         if (height, width) != entry.shape.dim() {
-            return true; // It makes no sense, now or later.
+            return true; // It has another grid, so it never fits.
         }
-        // Of several agents on a world the one with the first robot is shown, while it tells what it believes.
-        let is_told = |(first, at): (u32, Instant)| {
+        // Of several agents on a world, the page shows the one with the lowest robot, while it publishes beliefs.
+        let has_priority = |(first, at): (u32, Instant)| {
             first < first_robot && entry.at.duration_since(at) < MAX_BELIEF_AGE
         };
-        if believer.is_some_and(is_told) {
+        if believer.is_some_and(has_priority) {
             return true;
         }
         *believer = Some((first_robot, entry.at));
@@ -152,7 +152,7 @@ impl Album {
         true
     }
 
-    /// Forgets the oldest steps of the worlds that have most, until all fit.
+    /// Forgets the oldest steps of the worlds with the most steps, until the kept steps fit in memory.
     fn make_room(&mut self) {
         while self.n_bytes > MAX_BYTES {
             let worlds = self.worlds.values_mut();
@@ -162,7 +162,7 @@ impl Album {
         self.worlds.retain(|_, strip| !strip.entries.is_empty());
     }
 
-    /// Takes the hidden states that came before their frame.
+    /// Removes and returns the hidden states that arrived before their frame.
     fn early_truth(&mut self, world: u32, key: Key) -> Option<Box<[u8]>> {
         let mut places = self.early.iter();
         let place = places.position(|(of, at, _)| (*of, *at) == (world, key))?;
@@ -171,34 +171,34 @@ impl Album {
 }
 
 impl Strip {
-    /// Serial numbers of the first and the last step kept.
+    /// Returns the serial numbers of the first and the last kept step.
     pub fn kept(&self) -> Option<(u64, u64)> {
         let n = self.entries.len() as u64;
         (n > 0).then(|| (self.first_serial, self.first_serial + n - 1))
     }
 
-    /// The step of a serial number, or the nearest that is kept.
+    /// Returns the step with a serial number, or the nearest kept step.
     pub fn nearest(&self, serial: u64) -> Option<(u64, &Entry)> {
         let (first, last) = self.kept()?;
         let serial = serial.clamp(first, last);
         Some((serial, &self.entries[(serial - first) as usize]))
     }
 
-    /// The steps before a serial number and that one, the latest first.
+    /// Returns the steps up to a serial number, latest first.
     pub fn back_from(&self, serial: u64) -> impl Iterator<Item = &Entry> {
         let n = (serial + 1).saturating_sub(self.first_serial) as usize;
         self.entries.iter().take(n).rev()
     }
 
-    /// The steps of one run before a serial number and that one, the latest first: what is older may be of another
-    /// server, or from before a restore.
+    /// Returns the steps of one run up to a serial number, latest first. Older steps may belong to another server, or
+    /// may precede a restore.
     pub fn run_up_to(&self, serial: u64) -> impl Iterator<Item = &Entry> {
         let mut next: Option<&Entry> = None;
         self.back_from(serial)
             .take_while(move |entry| next.replace(entry).is_none_or(|next| entry.precedes(next)))
     }
 
-    /// The latest step with a belief of those, if that came not long before.
+    /// Returns the latest step with a belief in the run up to a serial number, unless the belief is too old.
     pub fn believed(&self, serial: u64) -> Option<&Entry> {
         let (_, now) = self.nearest(serial)?;
         let is_recent = |entry: &&Entry| now.at.duration_since(entry.at) < MAX_BELIEF_AGE;
@@ -206,12 +206,12 @@ impl Strip {
         recent.find(|entry| entry.belief.is_some())
     }
 
-    /// All steps, the oldest first.
+    /// Returns all steps, oldest first.
     pub fn entries(&self) -> impl ExactSizeIterator<Item = &Entry> {
         self.entries.iter()
     }
 
-    /// One of the latest steps, and whose beliefs are shown.
+    /// Returns one of the latest steps, and the agent whose beliefs are shown.
     fn entry(&mut self, key: Key) -> Option<(&mut Entry, &mut Option<(u32, Instant)>)> {
         let mut latest = self.entries.iter_mut().rev().take(MAX_DELAY);
         let entry = latest.find(|entry| entry.key() == key)?;

@@ -1,4 +1,4 @@
-//! One step of a world: what it gave, what its robots did and saw, and what an agent made of it. Pure.
+//! One step of a world: its result, its robots' paths and observations, and an agent's belief. Does no I/O.
 
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
 use emberwatch_protocol::frame::UNOBSERVED;
@@ -15,13 +15,13 @@ pub struct Entry {
     pub shape: Shape,
     pub result: WorldResult,
     pub robots: Vec<Robot>,
-    /// Cells that any robot saw, row by row, and what they showed.
+    /// Cells that any robot saw, row by row, with the observed values.
     pub seen: Vec<(u32, u8)>,
     /// Hidden states, row by row, if they are published.
     pub truth: Option<Box<[u8]>>,
-    /// What an agent made of it, if one shows that.
+    /// An agent's belief about this step, if one was published.
     pub belief: Option<Belief>,
-    /// When it came.
+    /// Time of arrival.
     pub at: Instant,
 }
 
@@ -36,36 +36,36 @@ pub struct Robot {
 /// An agent's belief, as bytes.
 #[derive(Debug)]
 pub struct Belief {
-    /// `round(255 p)`, state by state, each row by row.
+    /// Probabilities p as `round(255 p)`: one grid per state, each row by row.
     pub levels: Box<[u8]>,
-    /// Entropy as a share of `ln S`, `round(255 share)`.
+    /// Entropy of each cell as a share of `ln S`, stored as `round(255 share)`.
     pub entropy: Box<[u8]>,
     pub intent: Intent,
     pub pid: u32,
     /// Number of the first robot that the agent flies.
     pub first_robot: u32,
     pub n_robots: u32,
-    /// How good it is, where that is known.
+    /// How well it matches the hidden states, if these are known.
     pub score: Option<Score>,
 }
 
-/// How a belief compares with the hidden states.
+/// Scores of a belief against the hidden states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Score {
-    /// Minus the mean over cells of the logarithm of the true state's probability, nats.
+    /// Mean over cells of minus the logarithm of the true state's probability, in nats.
     pub log_loss: f64,
     /// Mean over cells of the squared error of the target state's probability.
     pub brier: f64,
 }
 
-/// The model's states, if the server reveals them: names, and which pays most.
+/// The names of the model's states, and the index of the state that pays most.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct States {
     pub names: Vec<String>,
     pub target: usize,
 }
 
-/// A step of an episode of a seed.
+/// The identity of a step: seed, episode and step number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Key {
     pub(crate) seed: u64,
@@ -80,7 +80,7 @@ impl Entry {
         let mut union = vec![UNOBSERVED; shape.n_cells()];
         let mut robots = Vec::new();
         for robot in split_frame_payload(header, &sample.payload).ok()? {
-            // Robots that see the same cell see the same there.
+            // Robots that see the same cell observe the same value there.
             for (cell, &value) in union.iter_mut().zip(robot.frame) {
                 *cell = value.min(*cell);
             }
@@ -106,7 +106,7 @@ impl Entry {
         })
     }
 
-    /// Whether a robot flew, as in each step but a reset or a restore.
+    /// Returns whether any robot flew: no robot flies in a reset or a restore.
     pub fn is_step(&self) -> bool {
         self.robots.iter().any(|robot| !robot.moves.is_empty())
     }
@@ -119,13 +119,13 @@ impl Entry {
         }
     }
 
-    /// Whether it is an earlier step of the same episode, on the same grid.
+    /// Returns whether this is an earlier step of the same episode, on the same grid.
     pub(crate) fn precedes(&self, other: &Self) -> bool {
         let of = |entry: &Self| (entry.result.seed, entry.result.episode, entry.shape);
         of(self) == of(other) && self.result.step < other.result.step
     }
 
-    /// Whether it is the same again, as a server shows it to an observer who has just come.
+    /// Returns whether `next` repeats this entry, as servers repeat the last frame for a new observer.
     pub(crate) fn repeats(&self, next: &Self) -> bool {
         self.result == next.result && self.robots == next.robots
     }
@@ -140,7 +140,7 @@ impl Entry {
 }
 
 impl Robot {
-    /// The cells of its path, the start first.
+    /// Returns the cells of the robot's path, beginning with its start.
     pub fn path(&self, airspace: &Airspace) -> Vec<Cell> {
         let mut cells = vec![self.result.start()];
         for step in &self.moves {
@@ -151,7 +151,7 @@ impl Robot {
 }
 
 impl Belief {
-    /// `truth` is the step's hidden states, `states` are the model's.
+    /// Converts a published belief. Scores it if its states are the model's `states` and `truth` is known.
     pub(crate) fn of(
         published: &AgentBelief,
         truth: Option<&[u8]>,
@@ -183,7 +183,7 @@ fn level(share: f32) -> u8 {
     (share * 255.0).round() as u8
 }
 
-/// Entropy of each cell as a share of the greatest, `ln S`.
+/// Returns the entropy of each cell as a share of its maximum, `ln S`.
 fn entropy(published: &AgentBelief) -> Box<[u8]> {
     let (n_states, height, width) = published.belief.dim();
     let mut sums = vec![0f32; height * width];
@@ -196,7 +196,7 @@ fn entropy(published: &AgentBelief) -> Box<[u8]> {
     sums.iter().map(|sum| level(sum / greatest)).collect()
 }
 
-/// `None` if the hidden states are not among the belief's.
+/// Scores a belief. Returns `None` if a hidden state is not among the belief's states.
 fn score_of(published: &AgentBelief, truth: &[u8], target: usize) -> Option<Score> {
     let n_cells = truth.len();
     let numbers = published.belief.as_slice()?;

@@ -1,21 +1,21 @@
-//! What is remembered of the cells that were seen. Pure.
+//! The latest observation of each cell. Does no I/O.
 
 use crate::album::Strip;
 use crate::entry::Entry;
 use emberwatch_protocol::frame::UNOBSERVED;
 
-/// What each cell showed last.
+/// The latest observation of each cell, as of some step.
 pub(crate) struct LastSeen {
     /// The observation, [`UNOBSERVED`] if there was none.
     pub(crate) seen: Vec<u8>,
-    /// How many steps before, at most 255.
+    /// Its age in steps, at most 255.
     pub(crate) age: Vec<u8>,
-    /// The first step that is remembered; 0: the episode's first.
+    /// The first step that was searched; 0 if older steps can add nothing.
     pub(crate) since: u64,
 }
 
 impl LastSeen {
-    /// Of the steps of one run up to one of them.
+    /// Collects the observations of one run, up to the entry `last` with this serial number.
     pub(crate) fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
         let n_cells = last.shape.n_cells();
         let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);

@@ -1,9 +1,8 @@
-//! Shows in a browser what happens on an instance, or what a recording holds. Read-only.
+//! Shows a running instance, or a recording, in a browser. Read-only.
 //!
-//! In reading order: a [`watcher`] (a running instance) or a [`player`] (a recording) fills the [`album`],
-//! which keeps the last few thousand steps of each world; a browser asks for one [`picture`] after the other
-//! over a WebSocket of the [`server`], at its own pace; [`page`] is what draws them. [`access`] refuses pages of other
-//! sites.
+//! In reading order: a [`watcher`] (for an instance) or a [`player`] (for a recording) fills the [`album`], which keeps
+//! the last few thousand steps of each world. Over a WebSocket of the [`server`], a browser requests one [`picture`] at
+//! a time, at its own pace, and the [`page`] draws it. [`access`] refuses pages of other sites.
 
 #![allow(missing_docs, reason = "a program, which tests use as a library")]
 

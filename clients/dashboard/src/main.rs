@@ -1,4 +1,4 @@
-//! `emberwatch-dashboard`: a web page that shows what happens on an instance, or what a recording holds.
+//! `emberwatch-dashboard`: a web page that shows a running instance, or a recording.
 
 use anyhow::{Context, Result, ensure};
 use clap::Parser;
@@ -16,36 +16,36 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::net::TcpListener;
 
-/// How often the program looks whether to end.
+/// Interval at which the program checks whether to end.
 const TICK: Duration = Duration::from_millis(50);
 
-/// How much it gives way to others, of 19: on a busy machine a simulator that wakes up goes first.
+/// Niceness, of at most 19: on a busy machine, a simulator that wakes up runs first.
 const NICENESS: i32 = 5;
 
-/// What `--listen` needs.
-const LISTEN: &str = "expected an address of this machine and a free port, which port 0 finds";
+/// The expectation in errors about `--listen`.
+const LISTEN: &str = "expected an address of this machine and a free port; port 0 selects one";
 
-/// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
+/// Shows an Emberwatch instance, or a recording, in a browser. Only reads, never acts.
 #[derive(Parser)]
 #[command(name = "emberwatch-dashboard", version)]
 struct Cli {
-    /// The instance to watch; its server may start later, end and come back
+    /// The instance to watch; its server may start later, and may restart
     #[arg(long, default_value = "default")]
     instance: String,
     /// Play this recording instead
     #[arg(long, value_name = "FILE", conflicts_with = "instance")]
     recording: Option<PathBuf>,
-    /// Where browsers reach the page; port 0 takes a free one. Whoever reaches it sees everything
+    /// The page's address; port 0 selects a free port. Whoever can reach this address sees everything
     #[arg(long, default_value = "127.0.0.1:8600", value_name = "ADDRESS:PORT")]
     listen: SocketAddr,
-    /// A host name that browsers may call this machine by, in addition to its addresses, such as that of a proxy with
-    /// TLS; may be given for each
+    /// A host name under which browsers may reach the page besides this machine's addresses, such as a TLS proxy's;
+    /// repeatable
     #[arg(long, value_name = "HOST", value_parser = access::host_name)]
     name: Vec<String>,
     /// Open the page in the default browser
     #[arg(long)]
     open: bool,
-    /// End when this process ends
+    /// Exit when this process ends
     #[arg(long, value_name = "PID")]
     exit_with: Option<i32>,
 }
@@ -73,7 +73,7 @@ fn run(cli: &Cli) -> Result<()> {
         .context("start the web server")?;
     let bound = runtime.block_on(TcpListener::bind(cli.listen));
     let listener = bound.with_context(|| format!("--listen {}: {LISTEN}", cli.listen))?;
-    let address = listener.local_addr().context("the page's address")?;
+    let address = listener.local_addr().context("read the page's address")?;
     let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;
     let served = runtime.block_on(async {
@@ -90,14 +90,14 @@ fn run(cli: &Cli) -> Result<()> {
     served.context("serve the page")
 }
 
-/// Returns when the program or the process that it ends with is to stop.
+/// Waits until the program is asked to stop, or the process of `--exit-with` has ended.
 async fn end(stop: &AtomicBool, exit_with: Option<&WatchedProcess>) {
     while !stop.load(Ordering::Relaxed) && !exit_with.is_some_and(WatchedProcess::has_ended) {
         tokio::time::sleep(TICK).await;
     }
 }
 
-/// Begins to watch, or to play.
+/// Starts watching the instance, or playing the recording.
 fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandle<()>>)> {
     match &cli.recording {
         Some(file) => {
@@ -114,7 +114,7 @@ fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandl
     }
 }
 
-/// Tells where the page is, and opens it if asked.
+/// Prints the page's address, and opens the page if asked.
 fn announce(address: SocketAddr, open: bool) -> Result<()> {
     let url = format!("http://{address}/");
     let mut out = std::io::stdout();

@@ -1,4 +1,4 @@
-//! The page, as it is in this program: no build step, nothing fetched from elsewhere.
+//! The files of the page, which this program embeds. They need no build step, and fetch nothing from elsewhere.
 
 #[derive(Debug, Clone, Copy)]
 pub struct Asset {
@@ -48,7 +48,7 @@ pub const ASSETS: [Asset; 23] = assets![
 mod tests {
     use super::*;
 
-    /// A proxy may serve the page below a path, where `/main.js` is another's.
+    /// A proxy may serve the page below a path, where `/main.js` belongs to another page.
     #[test]
     fn files_name_each_other_relative_to_the_page() {
         for Asset { path, text, .. } in ASSETS {

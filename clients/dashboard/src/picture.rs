@@ -1,8 +1,8 @@
-//! One picture for a browser: what it asked for, what it gets. Pure.
+//! One picture for a browser: the browser's request, and the answer. Does no I/O.
 //!
-//! A picture is a `u32` length, so many bytes of JSON (a `Header`), and the arrays that the JSON lists; the
-//! JSON is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes.
-//! Numbers are little-endian.
+//! A picture is a `u32` length, JSON of this length in bytes (a `Header`), and the arrays that the JSON lists. The JSON
+//! is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes. Numbers are
+//! little-endian.
 
 use crate::album::Strip;
 use crate::entry::Entry;
@@ -14,39 +14,39 @@ use emberwatch_protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
-/// Least and most points of a time series.
+/// Minimum and maximum number of points of a time series.
 const BINS: (usize, usize) = (16, 2000);
 
-/// No objective.
+/// The number that stands for no objective.
 const NO_OBJECTIVE: u8 = 255;
 
-/// Most objectives with a colour of their own.
+/// Maximum number of distinct objectives; further objectives count as the last one.
 const MAX_OBJECTIVES: usize = 255;
 
-/// A step with a belief of its own is shown rather than a newer one without for so long.
+/// Maximum delay of a step with a belief that is shown instead of a newer step without one.
 const BELIEF_LAG: Duration = Duration::from_millis(200);
 
-/// An agent that has shown no belief for so long is said to be silent.
+/// Time without a new belief after which an agent counts as silent.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// What a browser wants to see.
+/// A browser's request for a picture.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ask {
     pub world: u32,
-    /// Serial number of a step; `None`: the newest.
+    /// Serial number of a step; `None` for the newest.
     pub at: Option<u64>,
-    /// Points wanted of each time series.
+    /// Number of points per time series.
     pub bins: usize,
     /// A recording's new speed, as [`Player::speed`].
     #[serde(default)]
     pub speed: Option<f64>,
-    /// Whether a recording shall run.
+    /// Whether a recording is to play.
     #[serde(default)]
     pub playing: Option<bool>,
 }
 
-/// What a picture says beside its arrays.
+/// Everything in a picture except its arrays.
 #[derive(Debug, Serialize)]
 struct Header<'a> {
     instance: &'a str,
@@ -78,7 +78,7 @@ struct Shown {
     height: usize,
     width: usize,
     seen_since: u64,
-    /// As text: browsers keep 53 bits of a number.
+    /// As text, because browsers keep only 53 bits of a number.
     seed: String,
     episode: u64,
     step: u64,
@@ -95,10 +95,10 @@ struct Shown {
 
 #[derive(Debug, Serialize)]
 struct ShownRobot {
-    /// `flew`, `hovered`, `late`, or after a reset `new`.
+    /// `flew`, `hovered`, `late`, or `new` after a reset.
     state: &'static str,
     cell: [u32; 2],
-    /// From its start on.
+    /// Row and column of each cell, beginning with the start.
     path: Vec<[usize; 2]>,
     share: f64,
 }
@@ -106,7 +106,7 @@ struct ShownRobot {
 #[derive(Debug, Serialize)]
 struct AgentFacts<'a> {
     pid: u32,
-    /// The first robot of the world that it flies.
+    /// The first robot that it flies, numbered within the world.
     first_robot: u32,
     n_robots: u32,
     policy: &'a str,
@@ -114,7 +114,7 @@ struct AgentFacts<'a> {
     objective: &'a str,
     plan_millis: f64,
     states: &'a [String],
-    /// The step that the belief is about, not after the one shown.
+    /// The step that the belief is about, which is not after the shown step.
     step: u64,
     is_live: bool,
 }
@@ -143,7 +143,7 @@ struct Arrays {
     bytes: Vec<u8>,
 }
 
-/// The picture that a browser asked for; `now` tells whether an agent still shows its belief.
+/// Builds the picture that a browser requested. By `now`, an agent without a recent belief counts as silent.
 pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     let strip = scene.album.strip(ask.world);
     let chosen = strip.and_then(|strip| match ask.at {
@@ -188,7 +188,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     [framed(&header), arrays.bytes].concat()
 }
 
-/// The newest step, or the newest with a belief if that is hardly older.
+/// Returns the newest step, or the newest step with a belief if it is hardly older.
 fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
     let (_, last) = strip.kept()?;
     let newest = strip.nearest(last)?;
@@ -198,7 +198,7 @@ fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
     Some(believed.map_or(newest, |(back, entry)| (last - back, entry)))
 }
 
-/// The length and the JSON.
+/// Returns the length and the padded JSON.
 fn framed(header: &Header<'_>) -> Vec<u8> {
     let mut text = serde_json::to_vec(header).expect("invariant: a header serialises");
     text.resize((text.len() + 4).next_multiple_of(8) - 4, b' ');
@@ -223,7 +223,7 @@ impl Arrays {
         self.add(name, "f32", numbers.len(), &bytes);
     }
 
-    /// Returns the first step that `seen` remembers.
+    /// Adds the grids of states and observations. Returns the first step that `seen` covers.
     fn add_grids(&mut self, strip: &Strip, serial: u64, entry: &Entry) -> u64 {
         if let Some(truth) = &entry.truth {
             self.add_bytes("truth", truth);
@@ -239,7 +239,7 @@ impl Arrays {
         last.since
     }
 
-    /// What lies on the grid; nothing where it is another than the server's.
+    /// Adds the maps of zones and no-fly cells, unless the entry's grid differs from the server's.
     fn add_land(&mut self, info: Option<&Info>, entry: &Entry) {
         let zones = info.and_then(|info| info.zone_map.clone());
         let airspace = info.and_then(|info| info.airspace.as_ref());
@@ -259,7 +259,8 @@ impl Arrays {
         }
     }
 
-    /// Means of so many stretches of all that is kept; the objective is each stretch's last.
+    /// Adds time series over all kept steps, divided into `n_bins` bins. Each bin has the mean of its steps, and the
+    /// last objective. Returns the names of the objectives.
     fn add_series<'a>(
         &mut self,
         strip: &'a Strip,
@@ -297,7 +298,7 @@ impl Arrays {
     }
 }
 
-/// An objective's number among those met so far.
+/// Returns an objective's number among the objectives so far, which grow if it is new.
 fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     let known = objectives.iter().position(|known| *known == objective);
     let number = known.unwrap_or_else(|| {
@@ -309,11 +310,11 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// Where the robots of an entry flew, as far as the server says.
+/// Returns the airspace of an entry: the server's, or an open one if that is unknown or of another grid.
 fn airspace(info: Option<&Info>, entry: &Entry) -> Airspace {
-    let told = info.and_then(|info| info.airspace.clone());
-    let told = told.filter(|airspace| airspace.shape() == entry.shape);
-    told.unwrap_or_else(|| Airspace::open(entry.shape))
+    let known = info.and_then(|info| info.airspace.clone());
+    let known = known.filter(|airspace| airspace.shape() == entry.shape);
+    known.unwrap_or_else(|| Airspace::open(entry.shape))
 }
 
 impl Shown {

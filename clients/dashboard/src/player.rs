@@ -11,13 +11,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How often a player that waits looks whether to go on.
+/// Interval at which a waiting player checks whether to continue.
 const TICK: Duration = Duration::from_millis(20);
 
-/// Plays a recording until `stop`, on the thread that is returned.
+/// Starts a thread that plays a recording until `stop`. Returns the thread.
 ///
 /// # Errors
-/// If it cannot be opened or is no recording. What is wrong later on is shown.
+/// If the file cannot be opened, or is not a recording. The page shows problems that occur later.
 pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<JoinHandle<()>> {
     let mut reader = Some(open(path)?);
     let player = Player {
@@ -81,13 +81,13 @@ fn change_player(stage: &Stage, act: impl FnOnce(&mut Player)) {
     stage.change(|scene| scene.player.as_mut().map(act));
 }
 
-/// How far a recording has been played.
+/// The playback of a recording.
 struct Playing<'a> {
     stage: &'a Stage,
     stop: &'a AtomicBool,
-    /// Recorded time that has passed.
+    /// Recorded time that has been played.
     clock: Duration,
-    /// When the clock was looked at last.
+    /// When the clock was last updated.
     looked: Instant,
 }
 
@@ -112,7 +112,7 @@ impl<'a> Playing<'a> {
         Ok(())
     }
 
-    /// Lets time pass until that moment of the recording; `false` if it is time to stop.
+    /// Waits until playback reaches a moment of the recording. Returns `false` if the player is to stop.
     fn wait_for(&mut self, moment: Duration) -> bool {
         loop {
             let Some((speed, playing)) = self.orders() else {

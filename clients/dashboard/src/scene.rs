@@ -1,4 +1,4 @@
-//! All that there is to show, shared between what watches and what answers browsers.
+//! Everything that the page can show, shared by the threads that fill it and the server that answers browsers.
 
 use crate::album::Album;
 use crate::entry::States;
@@ -9,29 +9,29 @@ use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
 
-/// What is watched, and how far it is.
+/// The watched instance or recording, and its current state.
 #[derive(Debug)]
 pub struct Scene {
     pub album: Album,
-    /// The instance's name; of a recording, its file's.
+    /// The instance's name, or the recording's file.
     pub instance: String,
-    /// Whether a server is there.
+    /// Whether a server answers; always for a recording.
     pub is_serving: bool,
-    /// How the server is, in one sentence for people.
+    /// Why the server cannot be asked, in one sentence for people.
     pub note: Option<String>,
-    /// What of its channels cannot be read.
+    /// Why some of its channels cannot be read.
     pub trouble: Option<String>,
-    /// What the server said of itself.
+    /// The server's description of itself.
     pub info: Option<Info>,
-    /// What it says now and then.
+    /// The server's latest status.
     pub status: Option<ServerStatus>,
-    /// What was missed.
+    /// Numbers of lost samples.
     pub lost: Lost,
-    /// The recording that is played.
+    /// The state of the recording's player.
     pub player: Option<Player>,
 }
 
-/// Samples missed since watching began.
+/// Numbers of samples lost since watching began.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Lost {
     pub frames: u64,
@@ -39,22 +39,22 @@ pub struct Lost {
     pub agent: u64,
 }
 
-/// A recording as it plays.
+/// The state of a recording's player.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Player {
     pub file: String,
-    /// Time since the recording began, seconds.
+    /// Time since the beginning of the recording, in seconds.
     pub seconds: f64,
-    /// How many times as fast as it was recorded; 0: as fast as possible.
+    /// Speed relative to the recording's own; 0 for as fast as possible.
     pub speed: f64,
     pub playing: bool,
-    /// Whether it has come to its end; to play it then begins again.
+    /// Whether the end was reached. Playing then starts from the beginning.
     pub ended: bool,
     /// Why it ended early.
     pub error: Option<String>,
 }
 
-/// What a server said of itself, as far as pictures need it.
+/// The parts of a server's description that pictures need.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Info {
     pid: u32,
@@ -69,7 +69,7 @@ pub struct Info {
     target_state: Option<usize>,
     observations: Vec<String>,
     observation_colours: Option<Vec<String>>,
-    /// Observations of the path; those of each ring around it follow, in the same colours.
+    /// Number of observations on the path. The observations of each outer ring follow, in the same colours.
     n_named: usize,
     /// Rows and columns that robots see beyond their path.
     radius: usize,
@@ -78,7 +78,7 @@ pub struct Info {
     /// The zone of each cell.
     #[serde(skip)]
     pub zone_map: Option<Grid<u8>>,
-    /// Where robots may fly; `None` if what the server says of it makes no sense.
+    /// Where robots may fly; `None` if the server's description of it is invalid.
     #[serde(skip)]
     pub airspace: Option<Airspace>,
     burn_in: u64,
@@ -87,7 +87,7 @@ pub struct Info {
     publish_truth: bool,
 }
 
-/// A scene with many readers.
+/// A scene shared by many readers.
 #[derive(Debug)]
 pub struct Stage {
     scene: Mutex<Scene>,
@@ -95,7 +95,7 @@ pub struct Stage {
 }
 
 impl Scene {
-    /// Nothing seen yet.
+    /// Returns an empty scene of this name.
     pub fn new(instance: &str) -> Self {
         Self {
             album: Album::default(),
@@ -110,7 +110,7 @@ impl Scene {
         }
     }
 
-    /// The model's states, if they are known.
+    /// Returns the model's states, if they are known.
     pub fn states(&self) -> Option<States> {
         let info = self.info.as_ref()?;
         Some(States {
@@ -121,8 +121,8 @@ impl Scene {
 }
 
 impl Info {
-    /// Reads the model or the description of recorded worlds, if the server reveals it; one that makes no sense counts
-    /// as hidden.
+    /// Reads a server's description, with its model or its description of recorded worlds if it reveals one. Treats an
+    /// invalid one as hidden.
     pub fn new(info: &ServerInfo) -> Self {
         let recorded = info.recorded_world.as_ref();
         let description = recorded.and_then(|recorded| recorded.description.as_deref());
@@ -179,18 +179,18 @@ impl Stage {
 
     /// Reads the scene.
     pub fn look(&self) -> MutexGuard<'_, Scene> {
-        // A thread that panicked while changing it left counts and pictures, nothing that others rely on.
+        // A panic during a change can only have left wrong counts or pictures, on which nothing relies.
         self.scene.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the scene, and tells all who wait for that.
+    /// Changes the scene, and notifies all who wait for changes.
     pub fn change<T>(&self, act: impl FnOnce(&mut Scene) -> T) -> T {
         let done = act(&mut self.look());
         self.changes.send_modify(|n| *n += 1);
         done
     }
 
-    /// Tells of each change.
+    /// Returns a receiver that is notified of each change.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }

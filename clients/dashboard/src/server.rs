@@ -1,6 +1,6 @@
-//! The web server: the page, and one WebSocket for each browser that looks.
+//! The web server: it serves the page, and one WebSocket per browser.
 //!
-//! A browser asks for each picture, so it is never sent more than it draws. Pages of other sites get nothing
+//! A browser requests each picture, so it never receives more than it draws. Pages of other sites receive nothing
 //! ([`access`]).
 
 use crate::access;
@@ -24,32 +24,32 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-/// Time between two pictures at least: thirty a second.
+/// Minimum time between two pictures: thirty per second.
 const PICTURE_INTERVAL: Duration = Duration::from_millis(33);
 
-/// Time after which a picture is sent though nothing has changed.
+/// Time after which a picture is sent even if nothing has changed.
 const PATIENCE: Duration = Duration::from_millis(500);
 
-/// How long a silent browser is left alone before it is asked whether it is there.
+/// Time after which a silent browser is pinged, and timeout for sending to it.
 const SILENCE: Duration = Duration::from_secs(20);
 
-/// How often it is asked before it counts as gone.
+/// Number of unanswered pings after which a browser counts as gone.
 const MAX_PINGS: u32 = 3;
 
-/// Longest message of a browser, bytes.
+/// Maximum size of a browser's message, in bytes.
 const MAX_ASK_BYTES: usize = 4096;
 
-/// Most browsers at a time.
+/// Maximum number of browsers at a time.
 const MAX_BROWSERS: usize = 32;
 
-/// Greatest speed of a recording.
+/// Maximum speed of a recording.
 const MAX_SPEED: f64 = 1e6;
 
-/// What the page may load: what is in this program.
+/// Content security policy: the page may load only files of this program.
 const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self'; script-src 'self'; \
      connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
-/// What every request needs.
+/// State that every request needs.
 #[derive(Clone)]
 struct Service {
     stage: Arc<Stage>,
@@ -57,11 +57,11 @@ struct Service {
     places: Arc<Semaphore>,
 }
 
-/// Serves forever. `names` are host names, in addition to addresses and `localhost`, that browsers may call this
-/// server by.
+/// Serves forever. `names` are host names, in addition to addresses and `localhost`, under which browsers may reach
+/// this server.
 ///
 /// # Errors
-/// The system's.
+/// If the system reports an error of the listener.
 pub async fn serve(
     listener: TcpListener,
     stage: Arc<Stage>,
@@ -105,7 +105,7 @@ async fn only_own_pages(State(service): State<Service>, request: Request, next: 
 
 async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Response {
     let Ok(place) = service.places.clone().try_acquire_owned() else {
-        let problem = format!("expected at most {MAX_BROWSERS} browsers");
+        let problem = format!("expected at most {MAX_BROWSERS} browsers at a time");
         return (StatusCode::SERVICE_UNAVAILABLE, problem).into_response();
     };
     let stage = service.stage;
@@ -118,7 +118,7 @@ async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Re
         })
 }
 
-/// Answers each ask with one picture, until the browser leaves or says what makes no sense.
+/// Answers each request with one picture, until the browser leaves or sends an invalid message.
 async fn answer(mut socket: WebSocket, stage: &Stage) {
     let mut changes = stage.changes();
     let mut sent = Instant::now() - PICTURE_INTERVAL;
@@ -132,17 +132,17 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         let ask: Ask = match serde_json::from_str(&text) {
             Ok(ask) => ask,
             Err(error) => {
-                tracing::warn!("a browser asked for what makes no sense: {error}");
+                tracing::warn!("a browser sent an invalid request: {error}");
                 return;
             }
         };
         order(stage, &ask);
         tokio::time::sleep(PICTURE_INTERVAL.saturating_sub(sent.elapsed())).await;
-        // Who asks for something else than before is answered though nothing has changed.
+        // A request for another world or step is answered at once, even if nothing has changed.
         let wanted = Some((ask.world, ask.at));
         if before == wanted {
             tokio::select! {
-                // A change since the last picture ends this at once, and so does the next ask.
+                // A change since the last picture ends the wait, and so does the next request.
                 _ = timeout(PATIENCE, changes.changed()) => {}
                 message = socket.recv() => match message {
                     Some(Ok(message)) => early = Some(message),
@@ -160,8 +160,8 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
     }
 }
 
-/// The next message: one that came while its predecessor was answered, or one that comes; `None` if the
-/// browser has gone, or does not say that it is there.
+/// Returns the next message, which may have arrived during the last answer. Returns `None` if the browser has gone, or
+/// does not answer pings.
 async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Option<Message> {
     if let Some(message) = early.take() {
         return Some(message);
@@ -175,12 +175,12 @@ async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Op
     None
 }
 
-/// Sends a message; `None` if the browser does not take it.
+/// Sends a message. Returns `None` if the browser does not accept it.
 async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
     timeout(SILENCE, socket.send(message)).await.ok()?.ok()
 }
 
-/// Tells a recording's player what the browser wants of it.
+/// Passes a browser's request on to the recording's player.
 fn order(stage: &Stage, ask: &Ask) {
     if ask.speed.is_none() && ask.playing.is_none() {
         return;

@@ -1,6 +1,7 @@
 //! Watches a running instance: before its server starts, while it runs, after it ended.
 //!
-//! One thread reads what is published, which needs no server; another asks the server now and then how it is.
+//! One thread reads the published samples, which needs no server. Another thread regularly asks the server for its
+//! status.
 
 use crate::scene::{Info, Stage};
 use anyhow::{Context, Result, bail};
@@ -16,40 +17,40 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Least time between two looks at the channels: a buffer of 64 frames lasts that long at 32,000 steps a second.
-const LEAST_INTERVAL: Duration = Duration::from_millis(2);
+/// Minimum time between two reads of the channels: a buffer of 64 frames lasts that long at 32,000 steps per second.
+const MIN_INTERVAL: Duration = Duration::from_millis(2);
 
-/// Most: each look takes processor time, perhaps the simulator's.
-const MOST_INTERVAL: Duration = Duration::from_millis(10);
+/// Maximum time between two reads: each read costs processor time that the simulator may need.
+const MAX_INTERVAL: Duration = Duration::from_millis(10);
 
-/// More frames or beliefs than that at a look, and the next ones are due soon: buffers may run over.
+/// Numbers of frames and beliefs in one read above which buffers may overflow, so that the next read is due soon.
 const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
 
-/// How long to look as often as that after much came.
+/// How long to read at the minimum interval after a large read.
 const BUSY: Duration = Duration::from_secs(1);
 
-/// Time after which channels that failed are opened again.
+/// Time after which failed channels are reopened.
 const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
-/// How long a belief waits for the frame that it is about: agents may be quicker than their server.
+/// How long a belief waits for its frame: an agent's belief may arrive before the server's frame.
 const EARLY: Duration = Duration::from_secs(1);
 
-/// Most samples of a channel taken in at a look, so that browsers get their turn.
-const MOST_AT_ONCE: usize = 128;
+/// Maximum number of samples per channel in one read, so that browsers get their turn.
+const MAX_AT_ONCE: usize = 128;
 
-/// Time between two questions to the server, and between two searches for one.
+/// Time between two status requests, and between two attempts to find a server.
 const ASK_INTERVAL: Duration = Duration::from_millis(250);
 
-/// How long the server may take to answer.
+/// Timeout of requests to the server.
 const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The name of this program in a server's log.
 const CLIENT_NAME: &str = "emberwatch-dashboard";
 
-/// Fills the stage until `stop`, on the threads that are returned.
+/// Starts threads that fill the stage until `stop`. Returns the threads.
 ///
 /// # Errors
-/// If the frames cannot be read, as when there are too many observers, or a thread cannot be had.
+/// If the frames cannot be read, for example because there are too many observers, or if a thread cannot start.
 pub fn watch(
     instance: &Instance,
     stage: &Arc<Stage>,
@@ -85,7 +86,7 @@ pub fn watch(
     Ok([reader, asker.context("start a thread")?])
 }
 
-/// Reads until `stop`; opens what fails again.
+/// Reads until `stop`. Reopens channels that fail.
 fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
     let mut reader = Ok(reader);
     while !stop.load(Ordering::Relaxed) {
@@ -101,7 +102,7 @@ fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
     }
 }
 
-/// Asks a server how it is until it is gone or `stop`.
+/// Asks a server for its status until it is gone or `stop`.
 fn ask(instance: &Instance, stage: &Stage, stop: &AtomicBool) -> Result<(), ConnectionError> {
     let mut connection = Connection::open(instance, CLIENT_NAME, ASK_TIMEOUT)?;
     let info = Info::new(connection.info());
@@ -125,26 +126,26 @@ fn status(connection: &mut Connection) -> Result<ServerStatus, ConnectionError> 
     }
 }
 
-/// The ports of an observer.
+/// The subscribers to the channels.
 struct Reader {
     frames: Observer<FrameHeader>,
     truth: Option<Observer<TruthHeader>>,
     agents: Option<Observer<AgentHeader>>,
-    /// Beliefs that came before their frames, and when.
+    /// Beliefs that arrived before their frames, with the times of arrival.
     early: Vec<(AgentBelief, Instant)>,
     frame_gaps: Gaps,
     truth_gaps: Gaps,
     agent_gaps: HashMap<u32, Gaps>,
 }
 
-/// Counts what is missing in a row of sequence numbers.
+/// Counts gaps in sequence numbers.
 #[derive(Default)]
 struct Gaps {
     next: Option<(Option<u32>, u64)>,
 }
 
 impl Gaps {
-    /// Samples missing right before this one; another publisher begins a new row.
+    /// Returns the number of samples missing right before this one. A new publisher begins a new sequence.
     fn before(&mut self, publisher: Option<u32>, sequence: u64) -> u64 {
         let next = self.next.replace((publisher, sequence.wrapping_add(1)));
         match next {
@@ -155,7 +156,8 @@ impl Gaps {
 }
 
 impl Reader {
-    /// Opens the channels; those of hidden states and beliefs may be full, which is told and done without.
+    /// Opens the channels. If the channel of hidden states or beliefs cannot be opened, reports that and reads the
+    /// others.
     fn open(instance: &Instance, stage: &Stage) -> Result<Self, ChannelError> {
         let frames = Observer::frames(instance)?;
         let (truth, agents) = (Observer::truth(instance), Observer::agents(instance));
@@ -187,17 +189,18 @@ impl Reader {
                 busy = Instant::now();
             }
             std::thread::sleep(if busy.elapsed() < BUSY {
-                LEAST_INTERVAL
+                MIN_INTERVAL
             } else {
-                MOST_INTERVAL
+                MAX_INTERVAL
             });
         }
         Ok(())
     }
 
-    /// Takes in what is there; returns whether it was much.
+    /// Reads the available samples. Returns whether there were many.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
-        // Beliefs first: what they are about is published at about the same time, so it mostly is there then.
+        // Beliefs are read first: their frames are published at about the same time, so they usually have arrived by
+        // then.
         let beliefs = self.agents.as_ref().map_or(Ok(Vec::new()), all)?;
         let frames = all(&self.frames)?;
         let truths = self.truth.as_ref().map_or(Ok(Vec::new()), all)?;
@@ -239,7 +242,7 @@ impl Reader {
 
 fn all<H: Header>(observer: &Observer<H>) -> Result<Vec<Sample<H>>, ChannelError> {
     let mut samples = Vec::new();
-    while samples.len() < MOST_AT_ONCE
+    while samples.len() < MAX_AT_ONCE
         && let Some(sample) = observer.try_receive()?
     {
         samples.push(sample);

@@ -1,4 +1,4 @@
-"""A deadline for each test, programs that end with it, and a browser whose errors fail it."""
+"""Gives each test a deadline, programs that end with it, and a browser whose errors fail it."""
 
 import os
 import shutil
@@ -14,14 +14,14 @@ from playwright.sync_api import Browser, BrowserContext, sync_playwright
 from looking import Look
 from running import PATIENCE, Dashboard, Program, Programs
 
-#: A whole test, seconds; a busy machine is no bug.
+#: Deadline of a whole test, in seconds; long, because a busy machine is not a bug.
 DEADLINE = 900
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Where the programs and the browser are, and where pictures go."""
+    """Adds options for the programs, the browser, and the folder of pictures."""
     parser.addoption("--programs", type=Path, default=ROOT / "target/debug")
     parser.addoption("--chromium", default=shutil.which("chromium"))
     parser.addoption("--screenshots", type=Path, default=ROOT / "target/screenshots")
@@ -55,7 +55,7 @@ def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
 
 @pytest.fixture
 def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
-    """Starts the programs: `programs.server(worlds=4)`; all end with the test."""
+    """Starts programs, such as `programs.server(worlds=4)`, which all end with the test."""
     with ExitStack() as stack:
         yield Programs(request.config.getoption("--programs"), stack)
 
@@ -64,7 +64,7 @@ def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
 def open_page(request: pytest.FixtureRequest, chromium: Browser) -> Iterator[Callable[..., Look]]:
     """Opens a dashboard's page: `open_page(dashboard, hash="#world=2", color_scheme="dark")`.
 
-    At the end of the test the page must not have complained, but about what the test allowed.
+    At the end of the test, the page must have no complaints except those that the test allowed.
     """
     throttle = request.config.getoption("--throttle")
     looks: list[Look] = []
@@ -88,7 +88,7 @@ def open_page(request: pytest.FixtureRequest, chromium: Browser) -> Iterator[Cal
 
 
 class Watched(NamedTuple):
-    """A server that publishes its truth, an agent, and a page that shows what it believes."""
+    """A server that publishes its hidden states, an agent, and a page that shows its belief."""
 
     server: Program
     dashboard: Dashboard

@@ -1,4 +1,4 @@
-//! What pages are told of zones, no-fly cells and sensors.
+//! The data that pages receive about zones, no-fly cells and sensors.
 
 use crate::server_info;
 use emberwatch_dashboard::scene::Info;

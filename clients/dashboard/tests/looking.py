@@ -1,4 +1,4 @@
-"""What a browser shows: its texts, its pixels, and the picture that they were drawn from."""
+"""Reads what a browser shows: texts, pixels, and the picture that they were drawn from."""
 
 import base64
 import re
@@ -10,7 +10,7 @@ from playwright.sync_api import Locator, Page, WebSocketRoute
 
 from running import eventually
 
-#: Bytes of an expression's typed array or canvas, as base64.
+#: Returns the bytes of an expression's typed array or canvas as base64.
 _BYTES = """bytes => {
   let text = "";
   for (let i = 0; i < bytes.length; i += 8192) {
@@ -19,8 +19,8 @@ _BYTES = """bytes => {
   return btoa(text);
 }"""
 
-#: The browser tells the harness all that a page gets, and doesn't wait for it. On a busy machine it
-#: would fall behind for minutes, so pages ask for 2 MB a second at most.
+#: The browser reports all data of a page to the harness, without waiting for it. On a busy machine
+#: the harness would fall behind for minutes, so pages request at most 2 MB per second.
 _PACE = """(() => {
   const BYTES_A_MILLI = 2000;
   window.WebSocket = class extends WebSocket {
@@ -41,12 +41,12 @@ _PACE = """(() => {
 
 
 class Look:
-    """A page, looked at. `allowed` are patterns of complaints that the test provokes."""
+    """A page under test. `allowed` are patterns of complaints that the test provokes."""
 
     def __init__(self, page: Page) -> None:
-        """Listens to everything that goes wrong."""
+        """Collects everything that goes wrong."""
         self.page = page
-        # Reading pixels back, as only tests do, is slow and said to be.
+        # Only tests read pixels back, about whose slowness the browser warns.
         self.allowed = ["willReadFrequently"]
         self._complaints: list[str] = []
         page.add_init_script(_PACE)
@@ -58,7 +58,7 @@ class Look:
             self._complaints.append(f"{message.type}: {message.text}")
 
     def complaints(self) -> list[str]:
-        """What was said on the console, policy violations included, that no test allowed."""
+        """Returns console messages, including policy violations, that the test has not allowed."""
         return [
             complaint
             for complaint in self._complaints
@@ -69,7 +69,7 @@ class Look:
         return sum(bool(re.search(pattern, complaint)) for complaint in self._complaints)
 
     def alter(self, change: Callable[[bytes], bytes]) -> None:
-        """Loads the page again; what the dashboard sends it is changed on the way."""
+        """Reloads the page, and changes the dashboard's messages on the way."""
 
         def route(socket: WebSocketRoute) -> None:
             dashboard = socket.connect_to_server()
@@ -89,12 +89,13 @@ class Look:
         return self.at(testid).text_content().strip()
 
     def number(self, testid: str) -> float:
-        """Its text as a number; NaN while there is none."""
+        """Returns an element's text as a number; NaN while it is not one."""
         text = self.text(testid).replace(",", "")
         return float(text) if re.fullmatch(r"-?[0-9.]+", text) else float("nan")
 
     def picture(self, expression: str = "") -> object:
-        """A part of the last drawn picture, such as `.shown.step`; None if it is not there."""
+        """Returns a part of the last drawn picture, such as `.shown.step`; None if it is
+        missing."""
         return self.page.evaluate(f"window.emberwatch?.picture{expression.replace('.', '?.')}")
 
     def drawn(self) -> int:
@@ -107,7 +108,7 @@ class Look:
         return self._bytes(f"window.emberwatch.picture.arrays.{name}")
 
     def pixels(self, testid: str) -> NDArray[np.uint8]:
-        """A canvas's pixels, `(H, W, 4)`, as they were drawn."""
+        """Returns a canvas's pixels as they were drawn, `(H, W, 4)`."""
         canvas = f"document.querySelector('[data-testid={testid}]')"
         height, width = self.page.evaluate(f"[{canvas}.height, {canvas}.width]")
         image = f"{canvas}.getContext('2d').getImageData(0, 0, {width}, {height}).data"
@@ -133,7 +134,8 @@ class Look:
         self.eventually(lambda: self.drawn() >= first + count, f"{count} more pictures")
 
     def wait_for_steps(self, count: int = 3) -> None:
-        """Waits until so many further steps were shown. Agents may begin at the first again."""
+        """Waits until the page has shown further steps. Agents may begin at the first step
+        again."""
         first = float("inf")
 
         def are_shown() -> bool:

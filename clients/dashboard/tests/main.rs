@@ -1,4 +1,4 @@
-//! One program: each would link the crate.
+//! All tests as one program, because each further program would link the crate again.
 
 use emberwatch_protocol::control::ServerInfo;
 use serde_json::{Value, json};
@@ -7,7 +7,7 @@ mod land;
 mod pictures;
 mod player;
 
-/// What a server of a 2 x 3 world says of itself, with some keys.
+/// Returns the description of a server of a 2 x 3 world, with some keys changed.
 fn server_info(keys: Value) -> ServerInfo {
     let mut info = json!({
         "protocol": 2, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,

@@ -1,4 +1,4 @@
-"""Model files of as many states and observations as a test wants."""
+"""Model files with any number of states and observations."""
 
 
 def model_file(
@@ -7,9 +7,9 @@ def model_file(
     weights: list[list[float]],
     scales: dict[tuple[str, str], float],
 ) -> str:
-    """The text of one: states have an initial probability, a reward and how they are observed.
+    """Returns a model file. States have an initial probability, a reward, and observation weights.
 
-    A kernel from one state to another is the weights times its scale.
+    The kernel between two states is `weights` times their scale.
     """
     lines = ['name = "made"', f"kernel_size = {[len(weights), len(weights[0])]}"]
     for number, (name, (initial, reward, observed_as)) in enumerate(states.items()):

@@ -1,4 +1,4 @@
-//! What browsers get, from what was published.
+//! The pictures that browsers receive, built from published samples.
 
 use emberwatch_dashboard::album::{Album, MAX_ENTRIES};
 use emberwatch_dashboard::entry::States;
@@ -13,7 +13,7 @@ use emberwatch_protocol::observer::Sample;
 use serde_json::Value;
 use std::time::{Duration, Instant};
 
-/// A frame of a 2 x 3 world: the robot flew right along the upper row and saw the values.
+/// Returns a frame of a 2 x 3 world: the robot flew right along the upper row and saw `values`.
 fn frame(step: u64, values: [u8; 6]) -> Sample<FrameHeader> {
     let robot = RobotResult {
         col: 2,
@@ -24,7 +24,7 @@ fn frame(step: u64, values: [u8; 6]) -> Sample<FrameHeader> {
     frame_of(step, &[(robot, values)])
 }
 
-/// A frame of several robots; who flew flew right.
+/// Returns a frame of several robots, whose moves all go right.
 fn frame_of(step: u64, robots: &[(RobotResult, [u8; 6])]) -> Sample<FrameHeader> {
     let header = FrameHeader {
         n_robots: robots.len() as u32,
@@ -60,7 +60,7 @@ fn truth(step: u64, states: [u8; 6]) -> Sample<TruthHeader> {
     Sample { header, payload }
 }
 
-/// Certain of state 1 in the left column, of nothing elsewhere.
+/// Returns a belief that is certain of state 1 in the left column, and uniform elsewhere.
 fn agent_belief(step: u64) -> AgentBelief {
     let p = |(state, _, col): (usize, usize, usize)| match (col, state) {
         (0, 1) => 1.0,
@@ -99,7 +99,7 @@ fn ask(at: Option<u64>) -> Ask {
     }
 }
 
-/// The JSON of a picture, and its arrays as bytes.
+/// Returns the JSON of a picture, and its arrays as bytes.
 fn read(album: Album, at: Option<u64>) -> (Value, impl Fn(&str) -> Vec<u8>) {
     let mut scene = Scene::new("test");
     scene.album = album;
@@ -127,7 +127,7 @@ fn read(album: Album, at: Option<u64>) -> (Value, impl Fn(&str) -> Vec<u8>) {
 fn a_picture_joins_frame_truth_and_belief_of_a_step() {
     let mut album = Album::default();
     let now = Instant::now();
-    // Hidden states wait for their frame.
+    // Hidden states are held until their frame arrives.
     album.add_truth(&truth(1, [0; 6]));
     album.add_truth(&truth(2, [1, 1, 0, 1, 0, 0]));
     album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), now);
@@ -150,7 +150,7 @@ fn a_picture_joins_frame_truth_and_belief_of_a_step() {
         [0, 128, 128, 0, 128, 128, 255, 128, 128, 255, 128, 128]
     );
     assert_eq!(array("entropy"), [0, 255, 255, 0, 255, 255]);
-    // Four cells of six cost ln 2, two nothing.
+    // Four of the six cells cost ln 2, and two cost nothing.
     let log_loss = header["shown"]["log_loss"].as_f64().expect("a number");
     assert!(
         (log_loss - 4.0 / 6.0 * 2f64.ln()).abs() < 1e-6,
@@ -184,7 +184,7 @@ fn a_picture_tells_what_each_robot_did_and_what_all_saw() {
     (sample.header.result.hovered, sample.header.result.late) = (0b1, 0b100);
     album.add_frame(&frame_of(3, &[(stayed, [255; 6]); 4]), Instant::now());
     album.add_frame(&sample, Instant::now());
-    album.add_frame(&sample, Instant::now()); // shown again
+    album.add_frame(&sample, Instant::now()); // repeated
     let (header, array) = read(album, None);
     assert_eq!(
         header["shown"]["robots"],
@@ -197,7 +197,7 @@ fn a_picture_tells_what_each_robot_did_and_what_all_saw() {
     );
     assert_eq!(array("frame"), [0, 255, 1, 255, 255, 255]);
     assert_eq!(header["kept"], serde_json::json!({"first": 0, "last": 1}));
-    // No robot flew in the first entry: its reward is none.
+    // No robot flew in the first entry, so it has no reward.
     let rewards: Vec<f32> = array("series_reward")
         .chunks_exact(4)
         .map(|bytes| f32::from_le_bytes(bytes.try_into().expect("a float")))
@@ -237,9 +237,9 @@ fn what_was_seen_is_remembered_with_its_age_and_how_far_it_reaches() {
             vec![(1, [NO, 0, 1, NO, NO, NO]), (4, [NO, 1, NO, NO, NO, NO])],
             [NO, 1, 1, NO, NO, NO],
             [NO, 0, 3, NO, NO, NO],
-            0, // since the episode began
+            0, // since the beginning of the episode
         ),
-        // An episode that begins again, or another server's, remembers nothing.
+        // An episode that begins again, or an episode of another server, starts without observations.
         (
             vec![(5, [NO, 0, 1, NO, NO, NO]), (1, [NO; 6])],
             [NO; 6],
@@ -278,7 +278,7 @@ fn the_last_few_thousand_steps_are_kept() {
     for step in 1..=n {
         album.add_frame(&frame(step, [255; 6]), Instant::now());
     }
-    album.add_frame(&frame(n, [255; 6]), Instant::now()); // shown again, as to one who has just come
+    album.add_frame(&frame(n, [255; 6]), Instant::now()); // repeated, as for a new observer
     let (header, array) = read(album, Some(3));
     assert_eq!(
         header["kept"],
@@ -323,13 +323,13 @@ fn what_makes_no_sense_is_left_out() {
         change(|sample| sample.header.result.late = 2),
         change(|sample| sample.payload[24] = 2), // the row where it started
         change(|sample| sample.payload[44] = 3), // moves
-        change(|sample| sample.payload[55] = 4), // the last of them
+        change(|sample| sample.payload[55] = 4), // the last move
         change(|sample| sample.payload.truncate(3)),
     ] {
         album.add_frame(&bad, Instant::now());
     }
     assert!(album.strip(0).is_none());
-    album.add_truth(&truth(2, [0; 6])); // of a frame that never comes
+    album.add_truth(&truth(2, [0; 6])); // its frame never arrives
     album.add_belief(&agent_belief(1), None);
     album.add_frame(&good, Instant::now());
     let mut short = truth(1, [0; 6]);

@@ -1,4 +1,4 @@
-"""The real programs as child processes, on instances of their own."""
+"""The real programs as child processes, each test on its own instance."""
 
 import itertools
 import os
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-#: How long anything may take that should take much less, seconds.
+#: Maximum time, in seconds, of operations that should take much less.
 PATIENCE = 180.0
 
-#: More steps a second than an agent can make.
+#: More steps per second than an agent can make.
 FAST = 1_000_000
 
 _numbers = itertools.count()
@@ -24,7 +24,7 @@ def unused_instance() -> str:
 
 
 class Program:
-    """A running program; killed with the test."""
+    """A running program, which is killed when the test ends."""
 
     def __init__(self, path: Path, arguments: list[str], instance: str = "") -> None:
         assert path.is_file(), f"expected {path}: cargo build --workspace"
@@ -40,7 +40,7 @@ class Program:
         self.pid = self._process.pid
 
     def line(self) -> str:
-        """The next line that it prints."""
+        """Returns the next line that the program prints."""
         late = threading.Timer(PATIENCE, self._process.kill)
         late.start()
         line = self._process.stdout.readline()
@@ -53,14 +53,14 @@ class Program:
         self.wait()
 
     def suspend(self) -> None:
-        """Stops it where it is: it hangs."""
+        """Suspends the program, as if it hung."""
         self._process.send_signal(signal.SIGSTOP)
 
     def wait(self) -> int:
         return self._process.wait(PATIENCE)
 
     def kill(self) -> None:
-        """Ends it as no handler can prevent; returns when it has ended."""
+        """Kills the program, which no handler can prevent, and waits until it has ended."""
         self._process.kill()
         self._process.wait(PATIENCE)
         self._process.stdout.close()
@@ -79,7 +79,7 @@ class Programs:
         self._stack = stack
 
     def server(self, instance: str | None = None, **settings: object) -> Program:
-        """A server, by default with a small world that is quickly burnt in."""
+        """Starts a server, by default with a small world that has a short burn-in."""
         instance = instance or unused_instance()
         settings = {
             "height": 24,
@@ -97,8 +97,9 @@ class Programs:
         return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
 
     def agent(self, instance: str, **settings: object) -> Program:
-        """An agent that acts on a world, once it is there, for some `steps` or until it is stopped.
-        It leaves the processor to the browser: its plans are cheap, and it acts slowly until then.
+        """Starts an agent that acts on a world for some `steps`, or until it is stopped.
+
+        The agent leaves the processor to the browser: its plans are cheap, and its steps are slow.
         """
         eventually(lambda: self.is_serving(instance), "a server")
         pace = {} if "steps" in settings else {"steps_per_second": 10}
@@ -107,7 +108,7 @@ class Programs:
         return self._keep(Program(self._path("agent"), ["run", *flags(settings)]))
 
     def record(self, out: Path, *, steps: int, **settings: object) -> None:
-        """Records so many steps of a server, hidden states too if it publishes them."""
+        """Records `steps` steps of a server, with hidden states if it publishes them."""
         server = self.server(**settings)
         eventually(lambda: self.is_serving(server.instance), "a server")
         what = flags({"instance": server.instance, "out": out, "steps": steps})
@@ -124,7 +125,7 @@ class Programs:
         port: int = 0,
         name: str | None = None,
     ):
-        """A dashboard of an instance, or of a recording. `name`: what else browsers may call it."""
+        """Starts a dashboard for an instance or a recording. `name` is a further host name."""
         source = {"recording": recording} if recording else {"instance": instance}
         arguments = flags(source | {"exit_with": os.getpid(), "name": name})
         return self._keep(Dashboard(self._path("dashboard"), arguments, port))
@@ -138,14 +139,14 @@ class Programs:
 
 
 def flags(settings: dict[str, object]) -> list[str]:
-    """Settings as command-line flags; None is left out."""
+    """Returns settings as command-line flags, without those that are None."""
     given = {name: value for name, value in settings.items() if value is not None}
     pairs = [(f"--{name.replace('_', '-')}", value) for name, value in given.items()]
     return [name if value is True else f"{name}={value}" for name, value in pairs]
 
 
 def eventually(holds: Callable[[], object], what: str, limit: float = PATIENCE) -> None:
-    """Looks until something holds; fails if it does not in time."""
+    """Waits until a condition holds; fails if it does not hold in time."""
     end = time.monotonic() + limit
     while not holds():
         assert time.monotonic() < end, f"expected within {limit} s: {what}"

@@ -1,4 +1,4 @@
-"""Who may connect, and who can use the page: other sites, screen readers, keys, small screens."""
+"""Access to the page: refusal of other sites, screen readers, keys, small screens."""
 
 import base64
 import os
@@ -15,7 +15,7 @@ DESK = {"viewport": {"width": 1280, "height": 720}}
 
 
 def answer(connection: HTTPConnection, path: str, **headers: str) -> HTTPResponse:
-    """The answer to a request with exactly these headers."""
+    """Returns the answer to a request with exactly these headers."""
     with closing(connection):
         connection.putrequest("GET", path, skip_host=True)
         for name, value in headers.items():
@@ -26,7 +26,7 @@ def answer(connection: HTTPConnection, path: str, **headers: str) -> HTTPRespons
 
 
 def handshake(connection: HTTPConnection, path: str, **headers: str) -> int:
-    """The status that a WebSocket's handshake is answered with."""
+    """Returns the status of the answer to a WebSocket's handshake."""
     key = base64.b64encode(os.urandom(16)).decode()
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
     return answer(connection, path, Sec_WebSocket_Key=key, **upgrade, **headers).status
@@ -56,7 +56,7 @@ def test_other_sites_are_refused_and_the_page_says_what_it_may_load(programs):
 
 
 def serious(look) -> list[str]:
-    """What axe holds to be serious or critical."""
+    """Returns the violations that axe rates as serious or critical."""
     found = Axe().run(look.page).response["violations"]
     return [
         f"{problem['id']}: {problem['help']}: {node['html']}"
@@ -68,7 +68,7 @@ def serious(look) -> list[str]:
 
 @pytest.mark.parametrize(("theme", "screen"), [("light", DESK), ("dark", PHONE)], ids=str)
 def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, theme, screen):
-    """A picture of it is kept for people to look at."""
+    """Also saves a screenshot for people to look at."""
     instance = unused_instance()
     look = open_page(programs.dashboard(instance), color_scheme=theme, **screen)
     look.eventually(lambda: look.text("state") == "waiting", "waiting")
@@ -96,7 +96,7 @@ def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, the
 def test_tab_reaches_every_control_and_canvases_tell_what_they_show(watched):
     look = watched.look
     truth, chart = look.at("panel-truth"), look.at("chart-reward")
-    # Descriptions follow what is drawn, now and then.
+    # Descriptions follow the drawing with a delay.
     look.eventually(
         lambda: "cells in state fire at step" in truth.get_attribute("aria-label"), "the truth"
     )

@@ -1,4 +1,4 @@
-"""Nothing is clipped, nothing covers anything else, at all usual sizes of a window."""
+"""At all common window sizes, nothing is clipped and nothing covers anything else."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from teams import write_recording
 
 SIZES = [(360, 740), (768, 1024), (1024, 768), (1056, 640), (1280, 720), (1920, 1080), (2560, 1440)]
 
-# Keeps where each canvas's texts are, in its own pixels, since it was last cleared.
+# Records the place of each text on a canvas, in the canvas's pixels, since it was last cleared.
 RECORD_TEXTS = """(() => {
   const { prototype } = CanvasRenderingContext2D;
   const { clearRect, fillText } = prototype;
@@ -29,7 +29,7 @@ RECORD_TEXTS = """(() => {
   };
 })()"""
 
-# What is wrong with the page as it is, in sentences.
+# Returns the page's present problems as sentences.
 PROBLEMS = """() => {
   const problems = [];
   const all = (selector) => [...document.querySelectorAll(selector)]
@@ -95,7 +95,7 @@ PROBLEMS = """() => {
   return problems;
 }"""
 
-# Controls within the window, and those of them that something else lies on.
+# Returns the controls within the window, and those that another element covers.
 CONTROLS = """() => {
   const seen = [], covered = [];
   const all = document.querySelectorAll("button, select, input[type=range], .theme label");
@@ -120,10 +120,10 @@ CONTROLS = """() => {
 
 
 def check(look, controls: set[str]) -> None:
-    """Looks for what is wrong at each size. Nothing else may happen meanwhile."""
+    """Checks for problems at each size. The page's data must not change meanwhile."""
     for width, height in SIZES:
         look.page.set_viewport_size({"width": width, "height": height})
-        # The texts of a canvas are kept since it was drawn.
+        # A canvas must be redrawn before its recorded texts are up to date.
         look.eventually(lambda w=width: look.page.evaluate("innerWidth") == w, "the window's size")
         look.wait_for_pictures()
         assert look.page.evaluate(PROBLEMS) == [], f"at {width} x {height}"
@@ -140,14 +140,14 @@ LIVE = {"world", "auto", "light", "dark", "pause", "scrub"}
 
 
 def begin(look) -> None:
-    """Loads the page again, with its texts recorded."""
+    """Reloads the page, and records the texts that it draws."""
     look.page.add_init_script(RECORD_TEXTS)
     look.page.reload()
     look.eventually(lambda: look.has("frame"), "a world")
 
 
 def test_before_and_after_an_agent_acts(programs, open_page):
-    # About two thousand cells burn, which five digits and a point tell of.
+    # About two thousand cells burn, a number with a separator of thousands.
     server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     begin(look)
@@ -183,7 +183,7 @@ def test_with_many_states(programs, open_page, tmp_path):
 
 
 def model_of(n_states: int) -> str:
-    """A model file: states that stay what they are, each seen as it is."""
+    """Returns a model file whose states never change, and are observed exactly."""
     names = [f"state-{state}" for state in range(n_states)]
     seen = [[float(other == state) for other in range(n_states)] for state in range(n_states)]
     states = {name: (1 / n_states, float(i == 0), seen[i]) for i, name in enumerate(names)}

@@ -1,4 +1,4 @@
-"""Every pixel against the arrays that it shows, coloured by a table of our own."""
+"""Compares every pixel with the arrays that it shows, coloured by the test's own table."""
 
 import tomllib
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from running import PATIENCE, eventually
 STEPS = 30
 UNOBSERVED = 255
 
-# Nine stops from 0 to 1, linear in between.
+# Nine stops from 0 to 1, with linear interpolation.
 BELIEF = {
     "light": "f9f8e1 c6e4be 87d0ab 4cb6a6 039aa0 057a91 005c80 003e6f 0d2156",
     "dark": "161d2b 1d3450 0d4f75 046e89 038e97 23af9b 70cb95 b8e095 f8f3a3",
@@ -26,12 +26,12 @@ UNSEEN = {"light": "e2e2e2", "dark": "2b2f36"}
 
 
 def rgb(color: str) -> np.ndarray:
-    """Three numbers of a colour, with or without #."""
+    """Converts a colour, with or without #, to three numbers."""
     return np.array(list(bytes.fromhex(color.lstrip("#"))), float)
 
 
 def ramp(stops: str, levels: np.ndarray) -> np.ndarray:
-    """Colours of 0..255 on a ramp."""
+    """Returns the colours of 0..255 on a ramp."""
     table = np.array([rgb(stop) for stop in stops.split()])
     at = levels / 255 * (len(table) - 1)
     channels = [np.interp(at, range(len(table)), table[:, channel]) for channel in range(3)]
@@ -39,7 +39,7 @@ def ramp(stops: str, levels: np.ndarray) -> np.ndarray:
 
 
 def of_values(values: np.ndarray, colors: list[str], unseen: str) -> np.ndarray:
-    """Colours of states or observations."""
+    """Returns the colours of states or observations."""
     table = np.zeros((256, 3))
     table[: len(colors)] = [rgb(color) for color in colors]
     table[UNOBSERVED] = rgb(unseen)
@@ -47,7 +47,7 @@ def of_values(values: np.ndarray, colors: list[str], unseen: str) -> np.ndarray:
 
 
 def check_pixels(look, panel: str, expected: np.ndarray) -> None:
-    """A panel's pixels are those colours, to rounding of halves."""
+    """Checks that a panel's pixels are these colours, up to rounding of halves."""
     pixels = look.pixels(panel).astype(float)
     assert (pixels[..., 3] == 255).all()
     assert pixels.shape[:2] == expected.shape[:2]
@@ -80,14 +80,14 @@ def test_panels_show_what_was_published(programs, open_page):
     assert (look.array("frame") == frame.frame.ravel()).all()
     assert look.number("step") == STEPS
     check_marks(look)
-    unseen = UNSEEN | {"light": "484848"}  # apart from its states' colours
+    unseen = UNSEEN | {"light": "484848"}  # distinct from its states' colours
     for theme in ("light", "dark"):
         look.page.get_by_label(theme).check(force=True)
         check_panels(look, theme, states, observations, unseen[theme])
 
 
 def check_marks(look) -> None:
-    """The path's line, its start and the robot are where they were, and no mark is elsewhere."""
+    """Checks the marks of the path, its start and the robot, and that no other marks exist."""
     pixels = look.pixels("overlay-frame").astype(int)
     shape = look.pixels("panel-frame").shape[:2]
     scale = np.array(pixels.shape[:2]) / shape
@@ -119,9 +119,9 @@ def check_marks(look) -> None:
 
 
 def check_panels(look, theme, states, observations, unseen) -> None:
-    """The pixels are what the arrays are to be coloured like."""
+    """Checks that the panels' pixels have the colours of their arrays."""
     grid = look.pixels("panel-frame").shape[:2]
-    # The page draws again in its next frame.
+    # The page redraws in its next frame.
     frame = of_values(look.array("frame").reshape(grid), observations, unseen)
     eventually(
         lambda: np.abs(look.pixels("panel-frame")[..., :3] - frame).max() < 1, f"the theme {theme}"
@@ -141,12 +141,12 @@ def check_panels(look, theme, states, observations, unseen) -> None:
 def test_ramps_are_perceptually_even(stops):
     lightness = [oklab_lightness(rgb(stop) / 255) for stop in stops.split()]
     steps = np.diff(lightness)
-    # Stops are rounded to bytes and kept within the screen's gamut.
+    # Stops are rounded to bytes, and clamped to the screen's gamut.
     assert np.abs(steps - steps.mean()).max() < 0.1 * abs(steps.mean())
 
 
 def oklab_lightness(color: np.ndarray) -> float:
-    """L of OKLab, of an sRGB colour."""
+    """Returns the OKLab lightness L of an sRGB colour."""
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     cones = np.array(
         [

@@ -1,4 +1,4 @@
-"""A pointer that rests is told what lies under it now, whatever changes there."""
+"""The page shows what lies under a resting pointer, even as that changes."""
 
 import re
 
@@ -8,18 +8,18 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True}
 
 
 def is_at(look, cell: str) -> bool:
-    """Whether the inspector is about this cell, such as "row 1, col 2"."""
+    """Returns whether the inspector shows this cell, such as "row 1, col 2"."""
     return look.page.get_by_label("one cell in numbers").locator("h3 b").text_content() == cell
 
 
 def is_at_robot(look) -> bool:
-    """Whether it is about the robot's cell, as nothing is pointed at."""
+    """Returns whether the inspector shows the robot's cell, as nothing is pointed at."""
     hint = look.page.get_by_label("one cell in numbers").locator("h3 .hint")
     return hint.text_content() == "robot"
 
 
 def middle(look, panel: str, row: int, col: int) -> tuple[float, float]:
-    """Where the middle of a cell is in the window."""
+    """Returns the position of a cell's middle in the window."""
     box = look.at(panel).bounding_box()
     height, width = look.page.evaluate(
         "[emberwatch.picture.shown.height, emberwatch.picture.shown.width]"
@@ -31,13 +31,13 @@ def middle(look, panel: str, row: int, col: int) -> tuple[float, float]:
 
 
 def told(look, chart: str) -> str:
-    """Which step a chart tells the value of, such as "at k 12"."""
+    """Returns the step whose value a chart shows, such as "at k 12"."""
     return look.page.locator(f".chart-{chart} .at").text_content()
 
 
 @pytest.fixture
 def resting(programs, open_page):
-    """A page of 24 x 32 cells before an agent acts: nothing changes."""
+    """Opens a page of 24 x 32 cells before an agent acts, so that nothing changes."""
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     look.eventually(lambda: look.has("truth"), "the world before its first step")
@@ -52,7 +52,7 @@ def test_values_come_under_the_pointer(resting, programs):
     canvas.hover(position={"x": canvas.bounding_box()["width"] - 1, "y": 20})
     look.eventually(lambda: told(look, "target") == "at k 0", "all that there is")
     assert programs.agent(server.instance, steps=40).wait() == 0
-    # No step is lost: 40 are fewer than a reader's buffer holds.
+    # No step is lost, because 40 steps fit into a reader's buffer.
     look.eventually(lambda: told(look, "target") == "at k 40", "the step that came there")
     value = look.page.locator(".chart-target output")
     look.eventually(
@@ -69,13 +69,13 @@ def test_what_moves_under_the_pointer_is_told(resting):
     assert not is_at_robot(look)
     look.page.set_viewport_size({"width": 1280, "height": 720})
     look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell again")
-    # Keys and the pointer take turns.
+    # The last of keys and pointer selects the cell.
     look.page.get_by_label("cells of seen so far").focus()
     look.page.keyboard.press("ArrowDown")
     look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")
     look.page.mouse.move(*middle(look, "panel-truth", 6, 7))
     look.eventually(lambda: is_at(look, "row 6, col 7"), "where the pointer went then")
-    # A pointer that leaves points at nothing.
+    # After the pointer leaves, nothing is pointed at.
     look.page.get_by_label("cells of seen so far").blur()
     look.page.mouse.move(2, 2)
     look.eventually(lambda: is_at_robot(look), "it left the panel")
@@ -86,7 +86,7 @@ def test_what_moves_under_the_pointer_is_told(resting):
         "new PointerEvent('pointerleave', { isPrimary: true }))"
     )
     look.eventually(lambda: told(look, "target") == "", "it left the window")
-    # A page that scrolls moves under it.
+    # Scrolling moves the page under the pointer.
     look.page.set_viewport_size({"width": 800, "height": 600})
     look.wait_for_pictures()
     x, y = middle(look, "panel-truth", 3, 4)

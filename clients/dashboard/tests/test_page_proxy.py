@@ -1,4 +1,4 @@
-"""The dashboard behind nginx, with TLS and below a path, by the block that the documents show."""
+"""The dashboard behind nginx with TLS and below a path, configured as in the documents."""
 
 import re
 import shutil
@@ -38,7 +38,7 @@ class Proxy:
 
     def __init__(self, command: list[str], port: int) -> None:
         self.port, self._command = port, command
-        #: Where browsers see the page.
+        #: The page's address for browsers.
         self.url = f"https://localhost:{port}/fire/"
         self.start()
 
@@ -51,7 +51,7 @@ class Proxy:
         self._process.wait(PATIENCE)
 
     def connect(self) -> HTTPSConnection:
-        """A connection that trusts the proxy."""
+        """Opens a connection that trusts the proxy's certificate."""
         context = ssl.create_default_context()
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         return HTTPSConnection("127.0.0.1", self.port, timeout=PATIENCE, context=context)
@@ -65,7 +65,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def proxy(tmp_path: Path) -> Iterator[Callable[[Dashboard], Proxy]]:
-    """Starts nginx with the documents' block: `proxy(dashboard)`."""
+    """Starts nginx with the documents' configuration: `proxy(dashboard)`."""
     nginx = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
     if nginx is None or shutil.which("openssl") is None:
         pytest.skip("no nginx or openssl: apt-get install nginx-light openssl")
@@ -122,7 +122,7 @@ def test_the_page_works_with_tls_below_a_path(programs, proxy, open_page):
     look.wait_for_steps()
     icon = look.page.locator("h1 img")
     assert icon.evaluate("icon => icon.naturalWidth > 0")
-    # A dashboard and a proxy that come back are found again.
+    # The page reconnects when the dashboard and the proxy restart.
     dashboard.kill()
     look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
     programs.dashboard(server.instance, port=dashboard.port)

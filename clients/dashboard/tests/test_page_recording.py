@@ -1,4 +1,4 @@
-"""A recording: it plays, waits, goes fast, ends, and begins again."""
+"""A recording plays, pauses, plays fast, ends, and restarts."""
 
 from teams import write_recording
 
@@ -15,7 +15,7 @@ def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
     assert look.picture(".kept.last") > look.picture(".kept.first")
     assert look.has("frame", "seen")
     scrub_at_rest(look)
-    # So slowly that the end does not come before the next press.
+    # So slow that the recording does not end before the next press.
     look.page.evaluate("document.getElementById('speed').options[0].value = '0.001'")
     look.at("speed").select_option("0.001")
     look.eventually(lambda: look.picture(".player.speed") == 0.001, "slow")
@@ -31,7 +31,7 @@ def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
 
 
 def scrub_at_rest(look) -> None:
-    """Entries of the past are shown though nothing happens."""
+    """Checks that past entries are shown even if no new step arrives."""
     first = look.picture(".kept.first")
     look.page.keyboard.press("Home")
     look.eventually(lambda: look.picture(".shown.serial") == first, "the first entry")
@@ -39,7 +39,7 @@ def scrub_at_rest(look) -> None:
     for serial in range(first + 1, last):
         look.page.keyboard.press("ArrowRight")
         look.eventually(lambda at=serial: look.picture(".shown.serial") == at, "the next")
-        if look.has("truth"):  # a slow recorder lost those of some entries
+        if look.has("truth"):  # a slow recorder may have lost some hidden states
             break
     assert look.has("truth"), "some entry has its hidden states"
     look.page.keyboard.press("Space")

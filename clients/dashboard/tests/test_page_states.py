@@ -1,4 +1,4 @@
-"""Servers and agents that come and go; pause, scrub and live."""
+"""Servers and agents that start and end, and the page's pause, scrubbing and live view."""
 
 import os
 
@@ -32,7 +32,7 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
 
 
 def settled_serial(look) -> int:
-    """The serial looked at, once the page has it on the slider as well."""
+    """Waits until the page and its slider show the same entry. Returns its serial number."""
     look.eventually(
         lambda: (
             look.at("pause").text_content() != "Pause"
@@ -73,13 +73,13 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
 
 
 def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
-    # Thousands of steps a second: a path costs a small world nothing.
+    # Thousands of steps per second, because paths in a small world cost almost nothing.
     server = programs.server(height=4, width=4, moves=2, burn_in=0)
     look = open_page(programs.dashboard(server.instance))
     programs.agent(server.instance, policy="random_walk", steps_per_second=FAST)
     look.wait_for_steps()
     look.page.keyboard.press("Space")
-    # Not `settled_serial`: once the oldest is shown, its serial never settles.
+    # Not `settled_serial`: once the oldest entry is shown, its serial keeps changing.
     at = look.picture(".shown.serial")
     look.eventually(lambda: look.picture(".kept.first") > at, "it fell out of what is kept")
     look.eventually(lambda: look.page.get_by_text("is no longer").is_visible(), "said so")
@@ -95,14 +95,14 @@ def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_p
         programs.agent(server.instance, steps=5)
         while beliefs.receive(PATIENCE).step < 5:
             pass
-        # Soon after its last belief, as older ones than some seconds are not shown.
+        # Soon after the last belief, because a belief is shown for only some seconds.
         lease = client.acquire(takeover=True)
         for _ in range(3):
             lease.step([0, 1])
     look.eventually(lambda: look.picture(".series.last_step") == 8, "three steps without a belief")
     look.page.keyboard.press("End")
     look.eventually(lambda: look.text("step") == "8", "the last of them")
-    assert look.page.locator("[data-panel=belief-0] .hint").text_content() == "of 3 steps before"
+    assert look.page.locator("[data-panel=belief-0] .hint").text_content() == "3 steps old"
     assert look.text("objective") == "–"
 
 
@@ -139,7 +139,7 @@ def test_another_agent_takes_over(watched, programs):
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     server, _, _, look = watched
-    # A port of our own: the system gives those from 32768 on to anybody who asks.
+    # A fixed port, below those that the system assigns to any program (from 32768).
     dashboard = programs.dashboard(server.instance, port=20000 + os.getpid() % 10000)
     look.page.goto(dashboard.url)
     look.eventually(look.at("panel-frame").is_visible, "a world")

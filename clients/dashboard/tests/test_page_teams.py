@@ -1,4 +1,4 @@
-"""Several robots in a world: what each did, who holds it, and its marks."""
+"""Several robots in a world: each robot's state, holder and marks."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from teams import STATES, write_recording
 from test_page_access import serious
 from test_page_pixels import rgb
 
-#: Of robots 0 to 2.
+#: Colours of robots 0 to 2.
 COLORS = ["#5ee6c8", "#ff9ad5", "#b9f04a"]
 
 
@@ -33,7 +33,7 @@ def test_each_robot_is_told_and_marked(programs, open_page, tmp_path):
 
 
 def check_marks(look) -> None:
-    """Discs are of who flew, rings of who hovered, dashed rings of who was late."""
+    """Checks the marks: a disc if a robot flew, a ring if it hovered, a dashed ring if late."""
     pixels = look.pixels("overlay-frame")[..., :3].astype(int)
     scale = np.array(pixels.shape[:2]) / look.pixels("panel-frame").shape[:2]
     radius = max(0.85 * scale[1], 8)
@@ -41,7 +41,7 @@ def check_marks(look) -> None:
     around = np.stack([np.sin(turns), np.cos(turns)], axis=-1)
 
     def share(robot: int, reach: float) -> float:
-        """Of the colour on a circle around a robot."""
+        """Returns the share of its colour on a circle around a robot."""
         middle = (np.array(look.picture(".shown.robots")[robot]["cell"]) + 0.5) * scale
         rows, cols = (middle + reach * radius * around).astype(int).T
         return np.mean((np.abs(pixels[rows, cols] - rgb(COLORS[robot])) < 30).all(-1))
@@ -53,7 +53,7 @@ def check_marks(look) -> None:
     assert 0.3 < share(2, 0.87) < 0.7
     path = look.picture(".shown.robots")[0]["path"]
     line = pixels[tuple(((np.array(path[3:9]) + 0.5) * scale).astype(int).T)]
-    # A line between two rows of pixels takes some of the dark edge.
+    # A line between two rows of pixels covers some of the dark edge.
     assert (np.abs(line - rgb(COLORS[0])) < 60).all(), "its path has its colour"
 
 
@@ -68,7 +68,7 @@ def test_a_team_of_an_agent_that_flies_one_that_hangs_and_nobody(programs, open_
     look.eventually(lambda: states(look) == ["flew", "late", "hovered"], "two of them")
     look.eventually(lambda: look.text("believer") == "robot 0", "another belief")
     look.wait_for_steps()
-    # The page asks the server for holders now and then, so these come later than steps.
+    # The page asks the server for holders only at intervals, so they arrive later than steps.
     held = f" · pid {flying.pid}"
     look.eventually(lambda: lines(look)[0].endswith(held), "who holds the first")
     told = lines(look)

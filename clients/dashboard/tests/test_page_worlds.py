@@ -1,4 +1,4 @@
-"""Large, oblong and many worlds; slow browsers; what is not published."""
+"""Large, oblong and many worlds; slow browsers; unpublished data."""
 
 import re
 
@@ -51,7 +51,7 @@ def test_an_address_that_makes_no_sense_shows_the_first_world(programs, open_pag
 
 
 def model_of_ten_observations() -> str:
-    """A model file: two states, each seen as one of ten things."""
+    """Returns a model file with two states and ten observations."""
     shares = [0.19, 0.17, 0.15, 0.13, 0.11, 0.09, 0.07, 0.05, 0.03, 0.01]
     states = {"calm": (0.5, 0.0, shares), "fire": (0.5, 1.0, shares[::-1])}
     weights = [[0.1, 0.1, 0.1], [0.1, 1.0, 0.1], [0.1, 0.1, 0.1]]
@@ -81,7 +81,7 @@ def test_ten_observations_of_a_hidden_model(programs, open_page, tmp_path):
 def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
-    # Asks that were not answered yet, after each message of each connection.
+    # Numbers of unanswered requests, after each message of each connection.
     waiting: list[int] = []
 
     def watch(socket) -> None:
@@ -131,7 +131,7 @@ def test_one_cell_is_the_same_in_all_panels(watched):
 def test_charts_tell_values_and_seek(watched):
     look, pause = watched.look, watched.look.at("pause")
     look.eventually(lambda: look.picture(".kept.last") > 20, "some steps")
-    # Entries and steps part where a busy machine lost frames.
+    # Entries and steps differ if a busy machine lost frames.
     at = re.compile(r"^at (k|entry) [\d,]+$")
     is_older = "emberwatch.picture.shown.serial < emberwatch.picture.kept.last"
     for chart in ("reward", "target", "log-loss", "objective"):

@@ -1,6 +1,6 @@
-"""How soon Ctrl-C and the death of a server end a step that waits.
+"""Measures how soon Ctrl-C and the death of a server end a waiting step.
 
-Peers: Ctrl-C in `time.sleep`, and a pidfd that says that the same server has ended.
+Peers: Ctrl-C in `time.sleep`, and a pidfd that reports the end of the same server.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from emberwatch.errors import ServerGoneError
 
 N_ROUNDS = 20
 
-#: Until a step sleeps on its answer, seconds.
+#: Seconds after which a step surely waits for its answer.
 PAUSE = 0.05
 
 TIMEOUT = 20.0
@@ -30,7 +30,7 @@ Times = tuple[float, float]
 
 
 class Stopped:
-    """A server that is paused, and a lease of it."""
+    """A paused server, and a lease on its robot."""
 
     def __init__(self) -> None:
         instance = f"endings-{uuid.uuid4().hex}"
@@ -41,7 +41,7 @@ class Stopped:
         os.kill(self.program.pid, signal.SIGSTOP)
 
     def step(self) -> None:
-        """Waits for an answer that does not come."""
+        """Waits for an answer that never comes."""
         self.lease.step([3] * 6, timeout=TIMEOUT)
 
     def close(self) -> None:
@@ -52,7 +52,7 @@ class Stopped:
 
 
 def interrupted(call: Callable[[], object]) -> float:
-    """Seconds from Ctrl-C to the end of a call."""
+    """Returns the seconds from Ctrl-C to the end of a call."""
     sent: list[float] = []
 
     def interrupt() -> None:
@@ -70,7 +70,7 @@ def interrupted(call: Callable[[], object]) -> float:
 
 
 def interruption() -> Times:
-    """Of a step, and of `time.sleep`."""
+    """Measures the interruption of a step, and of `time.sleep`."""
     server = Stopped()
     times = interrupted(server.step), interrupted(lambda: time.sleep(TIMEOUT))
     server.close()
@@ -78,7 +78,7 @@ def interruption() -> Times:
 
 
 def death() -> Times:
-    """Noticed by a step, and by a pidfd."""
+    """Measures how soon a step and a pidfd notice a server's death."""
     server = Stopped()
     process = os.pidfd_open(server.program.pid)
     seen: list[float] = []
@@ -102,7 +102,7 @@ def death() -> Times:
 
 
 def report(what: str, measure: Callable[[], Times], peer: str) -> None:
-    """Prints medians and the longest of them, and the ratio."""
+    """Prints the medians, the maximum, and the ratio of the medians."""
     ours, theirs = zip(*(measure() for _ in range(N_ROUNDS)), strict=True)
     median, other = statistics.median(ours), statistics.median(theirs)
     print(

@@ -1,8 +1,9 @@
-"""Moves a second of many worlds of `WildfireMoves-v0`, and decisions of `WildfireObjective-v1`.
+"""Measures moves per second of `WildfireMoves-v0`, and decisions of `WildfireObjective-v1`.
 
-Peers: Gymnasium's `SyncVectorEnv` of the single environments, and of an environment with the same
-spaces that simulates nothing. Rounds take turns, so that a noisy machine is noisy for all. Prints
-the median over rounds, by the wall clock, and by this process's processor time.
+Peers: Gymnasium's `SyncVectorEnv` around the single environments, and around an environment with
+the same spaces that simulates nothing. Rounds alternate, so that noise on the machine affects all
+alike. Prints medians over rounds, per second of wall time and per second of this process's
+processor time.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ class Trivial(gymnasium.Env[Any, Any]):
 
 
 def main() -> None:
-    """Races moves, then decisions."""
+    """Measures moves, then decisions."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--moves", type=int, default=160, help="of each world, a round")
+    parser.add_argument("--moves", type=int, default=160, help="moves of each world per round")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--model", default="wildfire-small")
     args = parser.parse_args()
@@ -54,7 +55,7 @@ def main() -> None:
 
 
 def moves(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
-    """Environments whose steps are moves."""
+    """Returns environments whose steps are moves."""
     world = {"observation": "local", **world}
     one = gymnasium.make(MOVES, **world).unwrapped
     single = [partial(gymnasium.make, MOVES, **world)] * n_worlds
@@ -67,7 +68,7 @@ def moves(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
 
 
 def decisions(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
-    """Environments whose steps are decisions."""
+    """Returns environments whose steps are decisions."""
     world = {"prior": "initial", **world}
     single = [partial(gymnasium.make, OBJECTIVE, **world)] * n_worlds
     native = gymnasium.make_vec(OBJECTIVE, n_worlds, **world)
@@ -75,7 +76,7 @@ def decisions(world: dict[str, Any], n_worlds: int) -> dict[str, Any]:
 
 
 def race(peers: dict[str, Any], actions: Any, rounds: int, unit: str) -> None:
-    """Steps each in turn, prints how fast, and closes it."""
+    """Steps the environments in alternating rounds, prints their rates, and closes them."""
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in peers}
     for envs in peers.values():
         envs.reset(seed=1000)
@@ -88,7 +89,7 @@ def race(peers: dict[str, Any], actions: Any, rounds: int, unit: str) -> None:
             rates[name].append((actions.size / used[0], actions.size / used[1]))
     for name, envs in peers.items():
         wall, cpu = (statistics.median(rate) for rate in zip(*rates[name], strict=True))
-        print(f"{name:34} {wall:9.0f} {unit}, {cpu:9.0f} a processor second")
+        print(f"{name:34} {wall:9.0f} {unit}, {cpu:9.0f} per processor second")
         envs.close()
 
 

@@ -1,7 +1,8 @@
-"""Steps a second of several processes, which simulate their worlds or share one server.
+"""Measures steps per second of several processes with their own worlds, or with a shared server.
 
-Each process steps worlds of its own together, and all of them at the same time. Rounds take turns,
-so that a noisy machine is noisy for all. Prints the median over rounds, of all processes together.
+All processes step at the same time, each its own worlds as one vector environment. Rounds
+alternate, so that noise on the machine affects all alike. Prints the median over rounds of the
+total rate.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SEEN: dict[str, Any] = {"observation": "frame", "max_episode_steps": 2**31 - 1}
 
 
 def work(pipe: Connection, instance: str, process: int, n_worlds: int) -> None:
-    """Steps for as long as it is told and tells how fast, until it is told to end."""
+    """Steps for each duration received, and sends the rate; `None` ends the process."""
     shared = {"instance": instance, "world": process * n_worlds}
     peers = {
         "own": gymnasium.make_vec(WILDFIRE, n_worlds, **SEEN),
@@ -46,11 +47,11 @@ def work(pipe: Connection, instance: str, process: int, n_worlds: int) -> None:
 
 
 def main() -> None:
-    """Races numbers of processes."""
+    """Measures each number of processes."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--worlds", type=int, default=8, help="of each process")
-    parser.add_argument("--seconds", type=float, default=0.5, help="of a round")
+    parser.add_argument("--worlds", type=int, default=8, help="worlds per process")
+    parser.add_argument("--seconds", type=float, default=0.5, help="seconds per round")
     parser.add_argument("--rounds", type=int, default=7)
     args = parser.parse_args()
     instance, most = f"shared-{os.getpid()}", max(args.processes)

@@ -1,9 +1,9 @@
-"""How fast the environments step, beside peers in the same run.
+"""Measures how fast the environments step, compared with peers in the same run.
 
-Each row's rounds take turns with the others', so that a noisy machine is noisy for all. Peers:
-Gymnasium's `AsyncVectorEnv(shared_memory=True)` around an environment with the same spaces that
-simulates nothing, and EnvPool's CartPole where its wheel installs (in process, 4 numbers a step).
-Prints p50 and p99 with their least and greatest over rounds.
+Rounds of all rows alternate, so that noise on the machine affects all alike. Peers: Gymnasium's
+`AsyncVectorEnv(shared_memory=True)` around an environment with the same spaces that simulates
+nothing, and EnvPool's CartPole where it is installed (in process, 4 numbers per step). Prints the
+medians of p50 and p99 over rounds, with their minima and maxima.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Row:
         self.rounds: list[tuple[float, float, float]] = []
 
     def go(self, n_steps: int) -> None:
-        """One round: p50 and p99 of a step, and the mean, microseconds."""
+        """Runs one round: records p50, p99 and mean of a step, in microseconds."""
         micros: list[float] = []
         for _ in range(n_steps):
             start = time.perf_counter()
@@ -77,7 +77,7 @@ def _spread(values: Any) -> str:
 
 
 def emberwatch_row(n_envs: int, instance: str | None = None) -> Row:
-    """Wildfire-v0, the simulation included: single, or the vector environment."""
+    """Returns the row of Wildfire-v0: a single environment, or the vector environment."""
     world: dict[str, Any] = {"max_episode_steps": NO_END, "burn_in": 1000, "instance": instance}
     envs: Any = (
         gymnasium.make("emberwatch/Wildfire-v0", **world)
@@ -92,7 +92,7 @@ def emberwatch_row(n_envs: int, instance: str | None = None) -> Row:
 
 @contextlib.contextmanager
 def server_row() -> Iterator[Callable[[int], Row]]:
-    """The same through a server."""
+    """Starts a server. Yields a function that makes the row of Wildfire-v0 on it."""
     instance = f"step-{os.getpid()}"
     flags = [f"--instance={instance}", "--worlds=64", "--burn-in=1000"]
     server = subprocess.Popen(["emberwatch-server", *flags])
@@ -103,14 +103,14 @@ def server_row() -> Iterator[Callable[[int], Row]]:
 
 
 def async_row(n_envs: int) -> Row:
-    """Gymnasium's worker processes around nothing."""
+    """Returns the row of Gymnasium's worker processes around trivial environments."""
     envs = gymnasium.vector.AsyncVectorEnv([Trivial] * n_envs, shared_memory=True)
     envs.reset(seed=0)
     return Row(f"AsyncVectorEnv, {n_envs} trivial", envs, envs.action_space.sample(), n_envs)
 
 
 def envpool_row(n_envs: int) -> Row | None:
-    """EnvPool's CartPole; `None` where it is not installed or does not run."""
+    """Returns the row of EnvPool's CartPole; `None` if it is not installed or does not run."""
     try:
         import envpool
 
@@ -123,7 +123,7 @@ def envpool_row(n_envs: int) -> Row | None:
 
 
 def race(makers: list[Callable[[int], Row | None]], n_envs: int, n_steps: int, rounds: int) -> None:
-    """Runs rows of the same size in turns."""
+    """Runs rows with the same number of environments in alternating rounds."""
     rows = [row for row in (maker(n_envs) for maker in makers) if row is not None]
     for row in rows:
         row.go(n_steps // 10)
@@ -137,13 +137,13 @@ def race(makers: list[Callable[[int], Row | None]], n_envs: int, n_steps: int, r
 
 
 def spin() -> None:
-    """A process that never sleeps."""
+    """Runs forever without sleeping."""
     while True:
         pass
 
 
 def start_up(n: int) -> None:
-    """From `gymnasium.make` to the first step."""
+    """Prints the time from `gymnasium.make` to the end of the first step."""
     seconds: list[float] = []
     for seed in range(n):
         start = time.perf_counter()
@@ -160,7 +160,7 @@ def start_up(n: int) -> None:
 
 @contextlib.contextmanager
 def busy_processes(n: int) -> Iterator[None]:
-    """So many processes that never sleep."""
+    """Runs `n` processes that never sleep."""
     context = multiprocessing.get_context("spawn")
     busy = [context.Process(target=spin, daemon=True) for _ in range(n)]
     for process in busy:
@@ -178,7 +178,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument(
-        "--busy", type=int, nargs="+", help="only single steps, beside so many busy processes"
+        "--busy", type=int, nargs="+", help="only single steps, next to N busy processes"
     )
     args = parser.parse_args()
     if args.busy is None:
@@ -192,7 +192,7 @@ def main() -> None:
                     args.rounds,
                 )
     for n in args.busy or [3]:
-        print(f"beside {n} busy processes:")
+        print(f"next to {n} busy processes:")
         with busy_processes(n):
             race([emberwatch_row, async_row], 1, 1000, args.rounds)
 

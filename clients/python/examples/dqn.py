@@ -1,8 +1,8 @@
 """Deep Q-learning on `emberwatch/WildfireMoves-v0`, in one file.
 
-A convolutional network sees three images, the last frame, the cells already visited on this path
-and where the robot is, and learns a value for each of the four moves. The reward of a cell comes
-with its move (`reward="move"`), so that credit need not travel back over a whole path.
+A convolutional network sees three images: the latest frame, the cells already visited on this path,
+and the robot's cell. It learns a value for each of the four moves. The reward of a cell comes with
+the move that enters it (`reward="move"`), so that credit need not propagate back over a whole path.
 
     python dqn.py --total-steps 200000
 """
@@ -26,9 +26,9 @@ import emberwatch  # noqa: F401  (registers the environments)
 def parse() -> argparse.Namespace:
     """Reads the flags."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--total-steps", type=int, default=200_000, help="moves")
-    parser.add_argument("--grid", type=int, default=16, help="height and width, cells")
-    parser.add_argument("--moves", type=int, default=16, help="moves of a path")
+    parser.add_argument("--total-steps", type=int, default=200_000, help="training moves")
+    parser.add_argument("--grid", type=int, default=16, help="height and width in cells")
+    parser.add_argument("--moves", type=int, default=16, help="moves per path")
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--gamma", type=float, default=0.9)
@@ -43,7 +43,7 @@ def parse() -> argparse.Namespace:
 
 
 class QNetwork(nn.Module):
-    """Images `(N, 3, H, W)` to the values of the four moves."""
+    """Maps images `(N, 3, H, W)` to the values of the four moves."""
 
     def __init__(self, grid: int) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class QNetwork(nn.Module):
 
 
 class ReplayBuffer:
-    """The last transitions, images as bytes."""
+    """A ring buffer of the latest transitions, with images as bytes."""
 
     def __init__(self, size: int, image: tuple[int, ...]) -> None:
         self.images = np.zeros((size, *image), np.uint8)
@@ -89,7 +89,7 @@ class ReplayBuffer:
 
 
 def picture(observation: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """The observation as bytes `(3, H, W)`: frame (fire brightest), visited cells, robot."""
+    """Returns an observation as bytes `(3, H, W)`: frame (fire brightest), visited cells, robot."""
     frame = observation["frame"][:, :, 0]
     robot = np.zeros_like(frame)
     robot[tuple(observation["robot"])] = 255
@@ -98,7 +98,7 @@ def picture(observation: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Trains, and reports the reward per path beside that of random moves."""
+    """Trains, and prints the reward per path."""
     args = parse()
     random.seed(args.seed)
     torch.manual_seed(args.seed)
@@ -108,7 +108,7 @@ def main() -> None:
         "emberwatch/WildfireMoves-v0",
         reward="move",
         observation=("frame", "visited", "robot"),
-        model="wildfire-small",  # whose fires last on small grids
+        model="wildfire-small",  # its fires persist on small grids
         burn_in=3000,
         height=args.grid,
         width=args.grid,

@@ -1,7 +1,7 @@
 """Scores filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
 
-    python filter_benchmark.py                          # on fires that are simulated here
-    python filter_benchmark.py --fires fires-all.npz    # on recorded ones
+    python filter_benchmark.py                          # on simulated fires python
+    filter_benchmark.py --fires fires-all.npz    # on recorded fires
 
 25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with probability
 1 - (1 - a)**f, where f of its four neighbours burn and a rises from .1 in the first column to .4 in
@@ -98,13 +98,13 @@ def burn(random: np.random.Generator) -> NDArray[np.uint8]:
 def observe(
     states: NDArray[np.uint8], seen: NDArray[np.bool_], random: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns frames that show the trees `seen`."""
+    """Returns frames that show the trees marked in `seen`."""
     shown = (states + random.choice(3, states.shape, p=[0.9, 0.05, 0.05])) % 3
     return np.where(seen, shown, 255).astype(np.uint8)
 
 
 def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """Returns the trees that a camera sees, 9 x 9 at a time, as it flies between random points."""
+    """Returns masks of the 9 x 9 trees that a camera sees as it flies between random points."""
     seen = np.zeros((steps, SIDE, SIDE), bool)
     at, goal = np.array([12, 12]), np.array([12, 12])
     for step in range(steps):
@@ -116,7 +116,7 @@ def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
 
 
 def simulated(which: str, n_fires: int, seed: int) -> Iterator[Fire]:
-    """Simulates fires; `which` says which trees are seen: "all", "tenth" or "window"."""
+    """Simulates fires. `which` selects the observed trees: "all", "tenth" or "window"."""
     for fire in range(n_fires):
         random = np.random.default_rng([seed, fire])
         states = burn(random)
@@ -136,7 +136,7 @@ def recorded(path: Path) -> Iterator[Fire]:
 
 
 def score(fires: list[Fire], kinds: list[str]) -> None:
-    """Prints the table, a row for each kind of belief."""
+    """Prints the table, with one row for each kind of belief."""
     forest = model()
     losses: dict[str, NDArray[np.float64]] = {}
     print("| filter | accuracy | NLL | difference | us a step |\n|---|--:|--:|--:|--:|")
@@ -154,8 +154,8 @@ def score(fires: list[Fire], kinds: list[str]) -> None:
 def figures(forest: Model, fires: list[Fire], kind: str) -> list[tuple[float, float, float]]:
     """Returns the accuracy, the NLL and the microseconds per step of each fire.
 
-    All fires start from the same state. Spatial filters learn how cells vary together as they run,
-    so they filter all fires twice, and only the second run is scored.
+    All fires start from the same state. Spatial filters learn the correlations between cells as
+    they run, so they filter all fires twice, and only the second run is scored.
     """
     exact = np.eye(3)[fires[0][0][0]].transpose(2, 0, 1)
     it = belief.known(forest, prior=exact, kind=kind)

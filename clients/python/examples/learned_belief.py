@@ -2,10 +2,11 @@
 
 python learned_belief.py --cpu-seconds 300 --evaluate 0..32 --out learned_belief
 
-The filter takes cells as independent: what is seen at one says nothing about those around it. The
-network learns from frames what it says. It adds to the filter's log-probabilities, from what was
-last seen at each cell and around it, and its loss is how improbable the next observations were,
-under the model's observation matrix. Neither hidden states nor rewards are needed.
+The filter treats cells as independent: an observation of one cell says nothing about its
+neighbours. The network learns these dependencies. From the last observations of each cell and its
+surroundings, it computes a correction to the filter's log-probabilities. Its loss is the negative
+log-likelihood of the next observations under the model's observation matrix. It trains on frames
+alone, without hidden states or rewards.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from emberwatch.planning import beam_search
 ENV = "emberwatch/Wildfire-v0"
 PARTS = ("belief", "frame", "robot")
 UNOBSERVED = 255
-#: Columns of the log: means since the last row, but for what has been used in all.
+#: Columns of the log: total seconds and moves, and mean rewards and losses since the last row.
 COLUMNS = ("cpu_seconds", "moves", "reward_per_path", "loss", "filters_loss", "env_seconds")
 
 
 class Sightings:
-    """What each cell looked like when it was last seen, and the time before, with ages in steps."""
+    """The last two observations of each cell, with their ages in steps."""
 
     def __init__(self, frames: np.ndarray, n_observations: int) -> None:
         self.never = n_observations
@@ -51,20 +52,20 @@ class Sightings:
         self.values[0, seen], self.ages[0, seen] = frames[seen], 1
 
     def images(self, beliefs: np.ndarray) -> torch.Tensor:
-        """What the network sees, `(n, channels, H, W)`; the first channels are the belief."""
+        """Returns the network's input, `(n, channels, H, W)`; the first channels are the belief."""
         one_hot = np.eye(self.never + 1, dtype=np.float32)[self.values]
         parts = [
             beliefs / np.float32(255),
             *one_hot,
             *(np.exp(-self.ages[0] / steps)[..., np.newaxis] for steps in (4, 32)),
             np.exp(-self.ages[1] / 32)[..., np.newaxis],
-            np.ones((*beliefs.shape[:-1], 1), np.float32),  # unlike what is off the grid
+            np.ones((*beliefs.shape[:-1], 1), np.float32),  # 1 on the grid; padding is 0
         ]
         return torch.from_numpy(np.concatenate(parts, axis=-1)).permute(0, 3, 1, 2)
 
 
 class Belief(nn.Module):
-    """Log-probabilities of each cell's states: the filter's and what the network adds."""
+    """Log-probabilities of each cell's states: the filter's plus a learned correction."""
 
     def __init__(self, model: Model) -> None:
         super().__init__()
@@ -80,7 +81,7 @@ class Belief(nn.Module):
         nn.init.zeros_(self.layers[-1].bias)
 
     def filtered(self, images: torch.Tensor) -> torch.Tensor:
-        # A belief comes in steps of 1 / 255.
+        # A belief comes in steps of 1 / 255; half a step avoids log(0).
         return images[:, : self.n_states].clamp(min=1 / 510).log().log_softmax(1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -88,7 +89,8 @@ class Belief(nn.Module):
 
 
 class Policy:
-    """Paths over the cells that most probably pay; remembers what it saw in each world."""
+    """Plans paths over the cells that most probably pay, and remembers each world's
+    observations."""
 
     def __init__(self, belief: Belief, model: Model, args: argparse.Namespace) -> None:
         self.belief, self.model, self.args = belief, model, args
@@ -96,11 +98,11 @@ class Policy:
         self.sightings: Sightings | None = None
 
     def begin(self, n_worlds: int) -> None:
-        """Other worlds begin."""
+        """Forgets all observations, because new worlds begin."""
         self.sightings = None
 
     def look(self, seen: dict[str, np.ndarray]) -> torch.Tensor:
-        """What is known now that these observations have come."""
+        """Records the observations and returns the network's input."""
         frames = seen["frame"][..., 0]
         if self.sightings is None:
             self.sightings = Sightings(frames, self.model.n_observations)
@@ -118,7 +120,7 @@ class Policy:
 
 
 class Replay:
-    """Images, and what was then observed."""
+    """A replay buffer of network inputs, each with the frame observed next."""
 
     def __init__(self, images: torch.Tensor, size: int) -> None:
         self.images = torch.zeros((size, *images.shape[1:]), dtype=torch.float16)
@@ -133,13 +135,13 @@ class Replay:
     def sample(self, n: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         at = rng.integers(0, min(self.n_added, len(self.images)), n)
         images, frames = self.images[at].float(), torch.from_numpy(self.frames[at])
-        if rng.random() < 0.5:  # the world looks the same mirrored
+        if rng.random() < 0.5:  # mirroring preserves the dynamics
             images, frames = images.flip(3), frames.flip(2)
         return images, frames
 
 
 class Training:
-    """Worlds that the policy flies, and the network that learns from its frames."""
+    """The worlds in which the policy flies, and the network that learns from its frames."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         torch.set_num_threads(args.threads)
@@ -195,7 +197,7 @@ class Training:
         torch.save(self.belief.state_dict(), self.args.out / "belief.pt")
 
     def update(self, optimizer: Any, replay: Replay) -> tuple[float, float]:
-        """The network's loss and the filter's, in nats per visited cell."""
+        """Updates the network once. Returns its loss and the filter's, in nats per visited cell."""
         images, frames = replay.sample(64, self.rng)
         visited = frames != UNOBSERVED
         if not visited.any():
@@ -214,7 +216,7 @@ class Training:
 
 
 class Log:
-    """Means of what was added, as rows of a file."""
+    """A CSV file whose rows are means over the numbers added since the last row."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -233,20 +235,20 @@ class Log:
 
 
 def draw(folder: Path) -> None:
-    """How much less the network's loss is than the filter's."""
+    """Plots how far the network's loss is below the filter's."""
     with (folder / "log.csv").open() as log:
         rows = list(csv.DictReader(log))
     gains = [float(row["filters_loss"]) - float(row["loss"]) for row in rows]
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     axes.plot([float(row["cpu_seconds"]) for row in rows], gains)
-    axes.set(xlabel="processor seconds", ylabel="nats per visited cell, better than the filter")
+    axes.set(xlabel="processor seconds", ylabel="gain over the filter, nats per visited cell")
     figure.savefig(folder / "curve.png", dpi=120)
 
 
 def world(args: argparse.Namespace) -> dict[str, Any]:
-    """The keywords of the worlds."""
+    """Returns the keyword arguments of the environments."""
     names = ("model", "height", "width", "n_moves", "burn_in")
-    # A busy machine may take its time.
+    # A long timeout, for busy machines.
     return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
 
@@ -259,36 +261,38 @@ def seeds(text: str) -> range:
 
 def positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected an integer from 1 on, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected a positive integer, got {text!r}")
     return int(text)
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--cpu-seconds", type=float, default=300, help="of the training")
-    parser.add_argument("--out", type=Path, default=Path("learned_belief"), help="a folder")
+    parser.add_argument("--cpu-seconds", type=float, default=300, help="processor seconds to train")
+    parser.add_argument("--out", type=Path, default=Path("learned_belief"), help="output folder")
     parser.add_argument(
         "--evaluate",
         type=seeds,
         default="5000..5008",
-        help="seeds, FIRST..END; below 1000: test",
+        help="evaluation seeds, FIRST..END; seeds below 1000 are test worlds",
     )
-    parser.add_argument("--steps", type=positive, default=100, help="paths of each world evaluated")
-    parser.add_argument("--suite", type=Path, help="a folder: test on the task small instead")
-    parser.add_argument("--load", type=Path, help="a network to begin with")
-    parser.add_argument("--name", default="learned_belief", help="in the benchmark's table")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
+    parser.add_argument("--steps", type=positive, default=100, help="evaluated paths per world")
+    parser.add_argument("--suite", type=Path, help="evaluate on the task small, into this folder")
+    parser.add_argument("--load", type=Path, help="saved network to start from")
+    parser.add_argument("--name", default="learned_belief", help="name in the benchmark's table")
+    parser.add_argument("--seed", type=int, default=1000, help="also of the first training world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--beam", type=positive, default=64, help="width of the beam")
     parser.add_argument("--worlds", type=positive, default=64)
-    parser.add_argument("--episode", type=positive, default=400, help="paths of an episode")
-    parser.add_argument("--updates", type=positive, default=2, help="for each step of the worlds")
+    parser.add_argument("--episode", type=positive, default=400, help="paths per episode")
+    parser.add_argument("--updates", type=positive, default=2, help="per step of the worlds")
     parser.add_argument("--threads", type=positive, default=1)
     args = parser.parse_args()
     if (args.out / "log.csv").exists():
-        parser.error(f"--out: expected a folder without an earlier training, got {args.out}")
+        parser.error(
+            f"--out: expected a folder without the log of an earlier training, got {args.out}"
+        )
     return args
 
 

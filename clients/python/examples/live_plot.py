@@ -1,4 +1,4 @@
-"""Plots what happens on a running server, live: an observer, which never slows the server.
+"""Plots a running server live, as an observer that never slows the server.
 
 emberwatch-server & emberwatch-agent run & python live_plot.py
 python live_plot.py --start --frames 200 --out plot.png      # without a screen
@@ -17,13 +17,13 @@ import emberwatch
 
 
 def main() -> None:
-    """Draws the last frame, the cells seen so far, and the rewards."""
+    """Draws the last observed value of each cell, and the rewards."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--instance", default="default")
     parser.add_argument("--world", type=int, default=0)
     parser.add_argument("--start", action="store_true", help="start a server and an agent")
     parser.add_argument(
-        "--frames", type=int, default=0, help="end after this many frames; 0: never"
+        "--frames", type=int, default=0, help="end after this many frames, 0 for never"
     )
     parser.add_argument("--every", type=int, default=20, help="draw every n-th frame")
     parser.add_argument("--out", help="write the last picture here instead of showing a window")
@@ -59,7 +59,7 @@ def main() -> None:
                 image = left.imshow(seen, cmap=colors, vmin=0, vmax=2)
             image.set_data(seen)
             line.set_data(*zip(*rewards, strict=True))
-            right.set_title(f"reward ({n_frames} frames drawn from, {n_lost} missed)")
+            right.set_title(f"reward ({n_frames} frames received, {n_lost} missed)")
             right.relim()
             right.autoscale_view()
             plt.pause(0.001)

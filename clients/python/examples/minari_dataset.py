@@ -18,13 +18,13 @@ def main() -> None:
     """Flies random paths, records them, and reads them back."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=100, help="steps of an episode")
-    parser.add_argument("--folder", help="where data sets lie; a temporary one by default")
+    parser.add_argument("--steps", type=int, default=100, help="steps per episode")
+    parser.add_argument("--folder", help="folder of data sets; default: a temporary one")
     args = parser.parse_args()
     os.environ["MINARI_DATASETS_PATH"] = args.folder or tempfile.mkdtemp(prefix="emberwatch-")
-    import minari  # reads that variable
+    import minari  # reads MINARI_DATASETS_PATH
 
-    # Without JPEG, which would change the values: a frame holds codes, not shades.
+    # JPEG would change the values: a frame holds codes, not shades of grey.
     env = minari.DataCollector(
         gymnasium.make("emberwatch/Wildfire-v0", max_episode_steps=args.steps),
         data_format="arrow",
@@ -48,7 +48,7 @@ def main() -> None:
         seen = (frames[1:] != 255).sum() / len(episode.actions)
         print(
             f"episode {episode.id}: {len(episode.actions)} steps, "
-            f"reward {episode.rewards.sum():.0f}, {seen:.1f} cells seen a step"
+            f"reward {episode.rewards.sum():.0f}, {seen:.1f} cells seen per step"
         )
 
 

@@ -2,10 +2,10 @@
 
 python ppo.py --imitate 60 --cpu-seconds 600 --out ppo --evaluate 0..32
 
-`--observation recent` shows what was last seen there instead: frames alone, no model, no filter.
+`--observation recent` shows the last observations instead, which need no model and no filter.
 
-First the network may imitate beam search on the same belief, for the moves it chooses itself
-(DAgger: Ross, Gordon, Bagnell, 2011); then PPO improves on it. `--imitate 0` leaves that out.
+With `--imitate`, the network first imitates beam search on the same belief, in the states that its
+own moves reach (DAgger: Ross, Gordon, Bagnell, 2011). Then PPO improves it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from emberwatch.planning import beam_search
 
 ENV = "emberwatch/WildfireMoves-v0"
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
-#: Columns of the log: what has been used, and what a path earned since the last row.
+#: Columns of the log: total use of resources, and the mean reward per path since the last row.
 COLUMNS = ("phase", "cpu_seconds", "seconds", "moves", "reward_per_path", "env_seconds", "entropy")
 
 
 class Network(nn.Module):
-    """Where to move, and what the future is worth, from a window `(n, side, side, channels)`."""
+    """Policy and value of a window `(n, side, side, channels)` around the robot."""
 
     def __init__(self, side: int, n_channels: int) -> None:
         super().__init__()
@@ -61,7 +61,8 @@ class Network(nn.Module):
 
 
 def symmetries() -> list[tuple[int, bool, torch.Tensor]]:
-    """Quarter turns, whether mirrored before, and what each move is called after."""
+    """Returns the square's symmetries: quarter turns, mirrored first or not, and moves
+    afterwards."""
     found = []
     for mirrored in (False, True):
         for turns in range(4):
@@ -112,7 +113,7 @@ class Training:
         self.rows.writerow(COLUMNS)
 
     def used(self) -> float:
-        """Processor seconds used."""
+        """Returns the processor seconds used so far."""
         return time.process_time() - self.cpu
 
     def windows(self) -> np.ndarray:
@@ -136,7 +137,7 @@ class Training:
         torch.save(self.network.state_dict(), self.args.out / "ppo.pt")
 
     def imitate(self) -> None:
-        """Learns the first moves of beam search, wherever its own moves have led."""
+        """Learns the first moves of beam search, in the states that its own moves reach."""
         args = self.args
         shape = self.envs.single_observation_space[args.observation].shape
         windows, wanted = np.zeros((40_960, *shape), np.uint8), np.zeros(40_960, np.int64)
@@ -178,7 +179,7 @@ class Training:
         torch.save(self.network.state_dict(), self.args.out / "imitation.pt")
 
     def improve(self) -> None:
-        """Proximal policy optimisation (Schulman et al., 2017)."""
+        """Improves the policy by proximal policy optimisation (Schulman et al., 2017)."""
         args, first = self.args, self.used()
         optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
         rounds = 0
@@ -194,9 +195,10 @@ class Training:
                 self.report("PPO", entropy)
 
     def rollout(self) -> list[torch.Tensor]:
-        """Windows, actions, their log-probabilities, advantages and returns of `horizon` moves."""
+        """Flies `horizon` moves. Returns windows, actions, log-probabilities, advantages,
+        returns."""
         args, n = self.args, self.args.worlds
-        # The world looks the same mirrored; turned, fire drifts another way.
+        # Mirroring preserves the dynamics. Rotation does not, because fire drifts in one direction.
         turns, mirrored, names = SYMMETRIES[4 * self.rng.integers(2)]
         back = names.argsort()
         windows, actions, log_probabilities, values, rewards, ends = [], [], [], [], [], []
@@ -208,7 +210,7 @@ class Training:
             action = moves.sample()
             reward, truncated, infos = self.step(back[action].numpy())
             earned, end = torch.from_numpy(reward).float(), torch.from_numpy(truncated)
-            if truncated.any():  # the world would have gone on
+            if truncated.any():  # the world itself did not end
                 last = np.stack([seen[args.observation] for seen in infos["final_obs"][truncated]])
                 with torch.no_grad():
                     last = turned(torch.from_numpy(last), turns, mirrored)
@@ -224,9 +226,9 @@ class Training:
             values.append(self.network(last)[1])
         advantages, advantage = [], torch.zeros(n)
         for at in reversed(range(args.horizon)):
-            goes_on = 1 - ends[at]
-            error = rewards[at] + args.gamma * goes_on * values[at + 1] - values[at]
-            advantage = error + args.gamma * args.lambda_ * goes_on * advantage
+            continues = 1 - ends[at]
+            error = rewards[at] + args.gamma * continues * values[at + 1] - values[at]
+            advantage = error + args.gamma * args.lambda_ * continues * advantage
             advantages.insert(0, advantage)
         returns = [a + v for a, v in zip(advantages, values, strict=False)]
         parts = (windows, actions, log_probabilities, advantages, returns)
@@ -248,7 +250,7 @@ class Training:
                     loss = 0.5 * loss - gain - args.entropy * entropy
                 optimizer.zero_grad()
                 loss.backward()
-                if only_value:  # what the policy sees stays as it is
+                if only_value:  # shared layers and policy stay unchanged
                     for name, parameter in self.network.named_parameters():
                         parameter.grad = parameter.grad if name.startswith("value") else None
                 nn.utils.clip_grad_norm_(self.network.parameters(), 0.5)
@@ -258,7 +260,10 @@ class Training:
 
 
 def acting(network: Network, *, sampled: bool) -> Any:
-    """A policy for the benchmark: the mean of both mirror images, sampled or its most probable."""
+    """Returns a policy for the benchmark, which averages logits over both mirror images.
+
+    It samples a move, or takes the most probable one.
+    """
 
     @torch.no_grad()
     def act(windows: np.ndarray) -> np.ndarray:
@@ -274,7 +279,7 @@ def acting(network: Network, *, sampled: bool) -> Any:
 
 
 def draw(folder: Path) -> None:
-    """The curve of a training, from its log."""
+    """Plots the learning curve from the log."""
     with (folder / "log.csv").open() as log:
         rows = list(csv.DictReader(log))
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
@@ -288,36 +293,36 @@ def draw(folder: Path) -> None:
 
 
 def world(args: argparse.Namespace) -> dict[str, Any]:
-    """The keywords of the worlds."""
+    """Returns the keyword arguments of the environments."""
     names = ("model", "height", "width", "n_moves", "burn_in", "window")
-    # A busy machine may take its time.
+    # A long timeout, for busy machines.
     return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--cpu-seconds", type=float, default=600, help="for all of the training")
-    parser.add_argument("--imitate", type=float, default=0, help="processor seconds of these")
-    parser.add_argument("--out", type=Path, default=Path("ppo"), help="folder of what comes out")
+    parser.add_argument("--cpu-seconds", type=float, default=600, help="processor seconds to train")
+    parser.add_argument("--imitate", type=float, default=0, help="processor seconds to imitate")
+    parser.add_argument("--out", type=Path, default=Path("ppo"), help="output folder")
     parser.add_argument(
-        "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
+        "--evaluate", default="5000..5008", help="seeds, FIRST..END; test worlds are below 1000"
     )
-    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
-    parser.add_argument("--suite", type=Path, help="a folder: test on the task small instead")
+    parser.add_argument("--steps", type=int, default=100, help="evaluated paths per world")
+    parser.add_argument("--suite", type=Path, help="evaluate on the task small, into this folder")
     parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
-    parser.add_argument("--load", type=Path, help="a network to begin with")
-    parser.add_argument("--name", default="ppo", help="in the benchmark's table")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
+    parser.add_argument("--load", type=Path, help="saved network to start from")
+    parser.add_argument("--name", default="ppo", help="name in the benchmark's table")
+    parser.add_argument("--seed", type=int, default=1000, help="also of the first training world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--observation", choices=("local", "recent"), default="local")
-    parser.add_argument("--window", type=int, default=15, help="cells along a side")
+    parser.add_argument("--window", type=int, default=15, help="side of the window in cells")
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--horizon", type=int, default=32, help="moves of a rollout")
+    parser.add_argument("--horizon", type=int, default=32, help="moves per rollout")
     parser.add_argument("--batch", type=int, default=512)
     parser.add_argument("--epochs", type=int, default=4)
-    parser.add_argument("--value-rounds", type=int, default=5, help="rollouts for the value alone")
+    parser.add_argument("--value-rounds", type=int, default=5, help="rollouts that train the value")
     parser.add_argument("--learning-rate", type=float, default=7e-4)
     parser.add_argument("--gamma", type=float, default=0.95)
     parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)

@@ -1,11 +1,11 @@
-"""RLlib's PPO on several machines, with one server on each, which the runners there share.
+"""RLlib's PPO on several machines. The runners on each machine share one server.
 
-Shared memory ends at the host, so each node of the cluster has a server of its own. A runner flies
-a part of its worlds that no other runner holds. Runners and servers may die: training goes on.
+Shared memory does not span machines, so each node of the cluster runs its own server. Each runner
+leases a part of the server's worlds. Training survives the death of runners and servers.
 
-    python ray_cluster.py --iterations 50                 # two nodes on this machine
-    python ray_cluster.py --address auto --runners 30     # a cluster that runs already
-    python ray_cluster.py --kill                          # kills a runner, and later a server
+    python ray_cluster.py --iterations 50                 # two nodes on this machine python
+    ray_cluster.py --address auto --runners 30     # a running cluster python ray_cluster.py --kill
+    # kills a runner, and later a server
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ WORLD: dict[str, Any] = {
     "n_moves": 16,
     "burn_in": 3000,
 }
-#: The same worlds, as flags of a server.
+#: `WORLD` as flags of a server.
 FLAGS = "--model=wildfire-small --height=16 --width=16 --moves=16 --burn-in=3000".split()
 SEEN = {"observation": "local", "max_episode_steps": 96}
 
 
 @ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)
 class NodeServer:
-    """Keeps a server on its node, which ends with it."""
+    """Keeps a server running on its node. The server ends with this actor."""
 
     def __init__(self, n_worlds: int) -> None:
         self._instance = f"ray-{uuid.uuid4().hex}"
@@ -56,7 +56,7 @@ class NodeServer:
         self._start()
 
     def instance(self) -> str:
-        """The instance to attach to; starts another server if the last one has died."""
+        """Returns the instance to attach to. Restarts the server if it has died."""
         try:
             emberwatch.connect(self._instance).close()
         except EmberwatchError:
@@ -72,21 +72,22 @@ class NodeServer:
 
 @ray.remote(num_cpus=0)
 class Servers:
-    """Those of all nodes, made when a runner asks. They end with the training, however it ends."""
+    """The servers of all nodes, each started on request. They end with the training, even a
+    crash."""
 
     def __init__(self, n_worlds: int) -> None:
         self._n_worlds = n_worlds
         self._servers: dict[str, Any] = {}
 
     def instance(self, node: str) -> str:
-        """The instance on a node."""
+        """Returns the instance on a node."""
         if node not in self._servers:
             self._servers[node] = NodeServer.options(**on(node)).remote(self._n_worlds)
         return ray.get(self._servers[node].instance.remote())
 
 
 def on(node: str) -> dict[str, Any]:
-    """The options of an actor that runs on this node and nowhere else."""
+    """Returns the options that pin an actor to this node."""
     return {"scheduling_strategy": NodeAffinitySchedulingStrategy(node, soft=False)}
 
 
@@ -100,17 +101,17 @@ def make(settings: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     for part in range(settings["runners"]):
         envs = gymnasium.make_vec(MOVES, n_worlds, instance=instance, world=part * n_worlds, **SEEN)
         try:
-            envs.reset(options={"resume": True})  # takes these worlds
+            envs.reset(options={"resume": True})  # leases these worlds
             return scaled(envs)
         except EmberwatchError as error:
             envs.close()
             if error.code != "busy":
                 raise
-    raise RuntimeError(f"instance {instance}: other clients hold its worlds")
+    raise RuntimeError(f"instance {instance}: other clients hold all its worlds")
 
 
 def scaled(envs: gymnasium.vector.VectorEnv) -> gymnasium.vector.VectorEnv:
-    """Windows as vectors of 0 to 1."""
+    """Flattens the windows to vectors of numbers from 0 to 1."""
     length = int(np.prod(envs.single_observation_space.shape))
     return TransformObservation(
         envs,
@@ -120,7 +121,7 @@ def scaled(envs: gymnasium.vector.VectorEnv) -> gymnasium.vector.VectorEnv:
 
 
 def places(algorithm: Algorithm) -> dict[tuple[str, int], list[int]]:
-    """The processes of the runners on each server: its node, and its process."""
+    """Returns the runners' process ids by server, which is a node and a process id."""
 
     def place(runner: Any) -> tuple[tuple[str, int], int]:
         node = ray.get_runtime_context().get_node_id()
@@ -135,7 +136,7 @@ def places(algorithm: Algorithm) -> dict[tuple[str, int], list[int]]:
 
 
 def kill_soon(kind: str, pid: int) -> None:
-    """Kills a process of this machine while the next iteration samples."""
+    """Kills a process on this machine while the next iteration samples."""
 
     def kill() -> None:
         os.kill(pid, signal.SIGKILL)
@@ -145,7 +146,10 @@ def kill_soon(kind: str, pid: int) -> None:
 
 
 def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
-    """Prints what each iteration made, and who made it; after kills goes on until all are back."""
+    """Trains, and prints each iteration's return and runners.
+
+    After kills, continues until all runners are back.
+    """
     iteration = n_flying = 0
     victims = ["runner", "server"] if kills else []
     n_runners = algorithm.config.num_env_runners
@@ -160,7 +164,7 @@ def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
             f"{', '.join(words)}",
             flush=True,
         )
-        if victims and where:  # a busy machine may not answer in time
+        if victims and where:  # empty if a busy machine was too slow
             at = min(where, key=lambda server: len(where[server]))
             victim = victims.pop(0)
             kill_soon(victim, where[at][0] if victim == "runner" else at[1])
@@ -168,18 +172,20 @@ def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
 
 
 def main() -> None:
-    """Trains on a cluster, of two nodes on this machine if there is none."""
+    """Trains on a cluster; by default, on two nodes on this machine."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--address", help="of a running cluster; else two nodes here")
+    parser.add_argument("--address", help="of a running cluster; default: start two nodes here")
     parser.add_argument("--iterations", type=int, default=20)
-    parser.add_argument("--runners", type=int, default=4, help="at most 15 on a node")
-    parser.add_argument("--worlds", type=int, default=8, help="of each runner")
-    parser.add_argument("--batch", type=int, default=4000, help="moves of an iteration")
-    parser.add_argument("--own", action="store_true", help="worlds in each runner's process")
-    parser.add_argument("--kill", action="store_true", help="a runner and a server, on nodes here")
+    parser.add_argument("--runners", type=int, default=4, help="at most 15 per node")
+    parser.add_argument("--worlds", type=int, default=8, help="worlds per runner")
+    parser.add_argument("--batch", type=int, default=4000, help="moves per iteration")
+    parser.add_argument("--own", action="store_true", help="simulate in each runner's process")
+    parser.add_argument(
+        "--kill", action="store_true", help="kill a local runner and a local server"
+    )
     args = parser.parse_args()
     if args.kill and args.address is not None:
-        parser.error("--kill: expected no --address, as it kills processes of this machine")
+        parser.error("--kill: applies only without --address, as it kills local processes")
 
     cluster = None
     if args.address is None:

@@ -1,7 +1,7 @@
 """RLlib's PPO with several environment runners.
 
-Each runner makes its own environment, thus starts its own server on its own node: that is the
-way to many machines, as shared memory ends at the host. Give Ray a cluster, and more runners.
+Each runner makes its own environment, which simulates its world in the runner's process. This
+scales to many machines, which cannot share memory: give Ray a cluster, and more runners.
 
     python rllib_ppo.py --iterations 20 --runners 2
 """
@@ -18,7 +18,7 @@ from ray.tune.registry import register_env
 
 
 def make(settings: dict[str, Any]) -> gymnasium.Env:
-    """Makes the environment, in the runner's process; RLlib wants observations of one axis."""
+    """Makes the environment in the runner's process. RLlib expects flat observations."""
     import emberwatch  # noqa: F401  (registers the environments there)
 
     env = gymnasium.make("emberwatch/WildfireObjective-v1", **settings)
@@ -26,11 +26,11 @@ def make(settings: dict[str, Any]) -> gymnasium.Env:
 
 
 def main() -> None:
-    """Trains, and prints how long episodes pay."""
+    """Trains, and prints the mean return of an episode."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--runners", type=int, default=2)
-    parser.add_argument("--batch", type=int, default=1000, help="steps of an iteration")
+    parser.add_argument("--batch", type=int, default=1000, help="steps per iteration")
     args = parser.parse_args()
 
     ray.init(include_dashboard=False, log_to_driver=False)

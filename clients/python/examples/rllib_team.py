@@ -1,8 +1,8 @@
-"""RLlib's PPO on all robots of a world, with one policy for all of them.
+"""RLlib's PPO on all robots of a world, which share one policy.
 
     python rllib_team.py --iterations 50 --robots 4
 
-Give `policies` and `policy_mapping_fn` other names to train a policy for each robot.
+To train one policy per robot, name them all in `policies` and `policy_mapping_fn`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ray.tune.registry import register_env
 
 
 def make(settings: dict[str, Any]) -> ParallelPettingZooEnv:
-    """Makes the environment, in the runner's process: windows as vectors of 0 to 1."""
+    """Makes the environment in the runner's process. Observations are flat windows from 0 to 1."""
     import emberwatch
 
-    with warnings.catch_warnings(action="ignore"):  # it imports Gymnasium's old wrappers
+    with warnings.catch_warnings(action="ignore"):  # SuperSuit imports deprecated wrappers
         import supersuit
 
     team = supersuit.dtype_v0(emberwatch.parallel_env(**settings), "float32")
@@ -29,12 +29,12 @@ def make(settings: dict[str, Any]) -> ParallelPettingZooEnv:
 
 
 def main() -> None:
-    """Trains, and prints what the team earns in an episode."""
+    """Trains, and prints the team's mean return of an episode."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--iterations", type=int, default=50)
     parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--runners", type=int, default=2)
-    parser.add_argument("--batch", type=int, default=4000, help="moves of an iteration")
+    parser.add_argument("--batch", type=int, default=4000, help="moves per iteration")
     parser.add_argument("--reward", default="share", choices=("share", "team", "marginal"))
     args = parser.parse_args()
 

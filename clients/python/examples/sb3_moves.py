@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO on many worlds of `emberwatch/WildfireMoves-v0`, seen through windows.
+"""Stable-Baselines3's PPO on many worlds of `emberwatch/WildfireMoves-v0`, with local windows.
 
 python sb3_moves.py --total-steps 500000 --out sb3 --evaluate 0..32
 """
@@ -23,7 +23,7 @@ from emberwatch.sb3 import make_vec_env
 
 
 class Windows(BaseFeaturesExtractor):
-    """A network for windows, which are smaller than the images that SB3's own is made for."""
+    """A network for windows, which are too small for SB3's default convolutional network."""
 
     def __init__(self, space: gymnasium.spaces.Box) -> None:
         super().__init__(space, features_dim=128)
@@ -39,7 +39,7 @@ class Windows(BaseFeaturesExtractor):
 
 
 class Curve(BaseCallback):
-    """Writes moves and reward per path to a file, a row for each rollout."""
+    """Writes moves and reward per path to a file, one row per rollout."""
 
     def __init__(self, file: Path, n_moves: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Curve(BaseCallback):
 
 
 def draw(log: Path) -> None:
-    """The curve of a training, from its log."""
+    """Plots the learning curve from the log."""
     rows = [tuple(map(float, line.split(","))) for line in log.read_text().splitlines()[1:]]
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     axes.plot(*zip(*rows, strict=True))
@@ -69,13 +69,13 @@ def draw(log: Path) -> None:
 def main() -> None:
     """Trains, then scores the policy for the benchmark's table."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--total-steps", type=int, default=500_000, help="moves")
+    parser.add_argument("--total-steps", type=int, default=500_000, help="training moves")
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--grid", type=int, default=16, help="height and width, cells")
+    parser.add_argument("--grid", type=int, default=16, help="height and width in cells")
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("sb3"), help="folder of what comes out")
-    parser.add_argument("--evaluate", default="5000..5008", help="seeds; below 1000: test worlds")
-    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--out", type=Path, default=Path("sb3"), help="output folder")
+    parser.add_argument("--evaluate", default="5000..5008", help="seeds; test worlds: below 1000")
+    parser.add_argument("--steps", type=int, default=100, help="evaluated paths per world")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
 
@@ -115,7 +115,7 @@ def main() -> None:
     rows = evaluate(
         model,
         name="sb3_ppo",
-        deterministic=False,  # the most probable moves alone may run in circles
+        deterministic=False,  # the most probable moves may run in circles
         seeds=range(first, end),
         steps=args.steps,
         csv=args.out / "rows.csv",

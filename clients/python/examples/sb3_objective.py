@@ -1,15 +1,14 @@
-r"""Stable-Baselines3's DQN in place of the paper's high-level decision.
+r"""Replaces the paper's high-level decision by Stable-Baselines3's DQN.
 
-Belief and plans stay in Rust; the DQN sees what each of eight plans promises and chooses the one
-that is flown. One small network scores every plan by its own features, so that plans share what is
-learned. Its choice pays where fires are rare and hidden, on the belief of a learned filter:
+Belief and plans stay in Rust. The DQN sees the features of eight plans and chooses the plan to fly.
+One small network scores every plan from its features, so that all plans share the weights. The
+choice matters most where fires are rare and hidden, on the belief of a learned filter:
 
     emberwatch-agent train --learner filter --steps 12000 --model wildfire-latent --moves 12 \
         --burn-in 6000 --out filter
     python sb3_objective.py --checkpoint filter/checkpoint.safetensors
 
-`emberwatch-agent compare --policies options` has every plan alone, on the worlds that this ends
-with.
+`emberwatch-agent compare --policies options` scores every plan alone on the same test worlds.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from torch import nn
 
 from emberwatch.sb3 import make_vec_env
 
-#: Rewards are learned in units of about one.
+#: Scales rewards to about one for the learner.
 REWARD_SCALE = 0.1
 
 
 class Scores(nn.Module):
-    """A value for each plan, by one network of its features."""
+    """Scores each plan by the same network over its features."""
 
     def __init__(self, n_plans: int, n_features: int, width: int = 64) -> None:
         super().__init__()
@@ -56,7 +55,7 @@ class ScoringPolicy(DQNPolicy):
 
 
 class ScaledRewards(VecEnvWrapper):
-    """Small rewards for the learner."""
+    """Multiplies rewards by `REWARD_SCALE` for the learner."""
 
     def reset(self) -> Any:
         return self.venv.reset()
@@ -87,7 +86,7 @@ class Progress(BaseCallback):
 
 
 def mean_rewards(envs: VecEnv, choose: Any, seed: int, n_steps: int) -> NDArray[np.float64]:
-    """The mean reward per step of each world, from a seed on."""
+    """Returns the mean reward per step of each world, whose first episode has `seed`."""
     envs.seed(seed)
     observations, total = envs.reset(), np.zeros(envs.num_envs)
     for _ in range(n_steps):
@@ -97,7 +96,7 @@ def mean_rewards(envs: VecEnv, choose: Any, seed: int, n_steps: int) -> NDArray[
 
 
 def compare(envs: VecEnv, model: DQN, n_steps: int) -> None:
-    """Scores the learned choice, a random one and exploiting, on the same worlds."""
+    """Scores the learned choice, a random choice, and always exploiting, on the same worlds."""
     n_plans, rng = envs.action_space.n, np.random.default_rng(0)
     policies: dict[str, Any] = {
         "DQN": lambda seen: model.predict(seen, deterministic=True)[0],
@@ -115,7 +114,7 @@ def compare(envs: VecEnv, model: DQN, n_steps: int) -> None:
 
 
 def learner(envs: VecEnv, seed: int) -> DQN:
-    """A DQN on these worlds whose step size and exploration fall; an update for 8 decisions."""
+    """Returns a DQN with falling learning rate and exploration, and one update per 8 decisions."""
     updates = max(1, envs.num_envs // 8)
     return DQN(
         ScoringPolicy,
@@ -137,17 +136,17 @@ def learner(envs: VecEnv, seed: int) -> DQN:
 
 
 def main() -> None:
-    """Trains, then compares with constant choices on worlds that were not trained on."""
+    """Trains a DQN, then compares it with simple choices on test worlds."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--checkpoint", help="of a learned filter; the known model's without")
+    parser.add_argument("--checkpoint", help="of a learned filter; default: the known model")
     parser.add_argument("--model", default="wildfire-latent")
     parser.add_argument("--moves", type=int, default=12)
     parser.add_argument("--burn-in", type=int, default=6_000)
     parser.add_argument("--worlds", type=int, default=32)
-    parser.add_argument("--total-steps", type=int, default=64_000, help="decisions of the training")
-    parser.add_argument("--out", help="file for the model that was learned")
+    parser.add_argument("--total-steps", type=int, default=64_000, help="training decisions")
+    parser.add_argument("--out", help="file for the trained model")
     parser.add_argument("--test-worlds", type=int, default=64)
-    parser.add_argument("--test-steps", type=int, default=300, help="of each world")
+    parser.add_argument("--test-steps", type=int, default=300, help="steps per test world")
     parser.add_argument("--seed", type=int, default=1_000_000)
     args = parser.parse_args()
 
@@ -156,18 +155,18 @@ def main() -> None:
         "model": args.model,
         "n_moves": args.moves,
         "burn_in": args.burn_in,
-        "timeout": 60.0,  # of a busy machine
+        "timeout": 60.0,  # long, for busy machines
         "checkpoint": args.checkpoint,
     }
     name = "emberwatch/WildfireObjective-v1"
-    # A burn-in costs as much as hundreds of steps: long episodes.
+    # Episodes are long because a burn-in costs as much as hundreds of steps.
     envs = make_vec_env(name, args.worlds, max_episode_steps=1_000, **world)
     model = learner(envs, args.seed)
     model.learn(args.total_steps, callback=Progress(), log_interval=None)
     envs.close()
     if args.out is not None:
         model.save(args.out)
-    # Seeds below 1000 are for tests.
+    # Test worlds have seeds below 1000.
     test = make_vec_env(name, args.test_worlds, max_episode_steps=args.test_steps + 1, **world)
     compare(test, model, args.test_steps)
     test.close()

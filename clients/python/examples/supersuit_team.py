@@ -2,8 +2,8 @@
 
     python supersuit_team.py --total-steps 500000 --robots 4 --out team
 
-Natively, `emberwatch.sb3.make_vec_env("emberwatch/WildfireMoves-v0", 64, robots=4)` has the same
-rows for learners, and one server for all worlds.
+Without SuperSuit, `emberwatch.sb3.make_vec_env("emberwatch/WildfireMoves-v0", 64, robots=4)` gives
+learners the same rows, and simulates all worlds together.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecTransposeImage
 import emberwatch
 from emberwatch.benchmark import evaluate, summary
 
-with warnings.catch_warnings(action="ignore"):  # it imports Gymnasium's old wrappers
+with warnings.catch_warnings(action="ignore"):  # SuperSuit imports deprecated wrappers
     import supersuit
 
 
@@ -31,12 +31,12 @@ def main() -> None:
     parser.add_argument("--total-steps", type=int, default=500_000, help="moves of all robots")
     parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--worlds", type=int, default=8)
-    parser.add_argument("--grid", type=int, default=24, help="height and width, cells")
+    parser.add_argument("--grid", type=int, default=24, help="height and width in cells")
     parser.add_argument("--reward", default="marginal", choices=("share", "team", "marginal"))
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("team"), help="folder of what comes out")
-    parser.add_argument("--evaluate", default="5000..5008", help="seeds; below 1000: test worlds")
-    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--out", type=Path, default=Path("team"), help="output folder")
+    parser.add_argument("--evaluate", default="5000..5008", help="seeds; test worlds: below 1000")
+    parser.add_argument("--steps", type=int, default=100, help="evaluated paths per world")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
 
@@ -52,7 +52,7 @@ def main() -> None:
     team = emberwatch.parallel_env(reward=args.reward, max_episode_steps=800, **world)
     rows = supersuit.pettingzoo_env_to_vec_env_v1(team)
     envs = supersuit.concat_vec_envs_v1(rows, args.worlds, base_class="stable_baselines3")
-    set_random_seed(args.seed)  # SuperSuit's environments draw their worlds by themselves
+    set_random_seed(args.seed)  # SuperSuit's environments draw their own seeds
     model = PPO(
         "CnnPolicy",
         VecMonitor(VecTransposeImage(envs)),
@@ -75,7 +75,7 @@ def main() -> None:
     scores = evaluate(
         model,
         name=f"ppo_{args.reward}",
-        deterministic=False,  # the most probable moves alone may run in circles
+        deterministic=False,  # the most probable moves may run in circles
         seeds=range(first, end),
         steps=args.steps,
         csv=args.out / "rows.csv",

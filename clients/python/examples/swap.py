@@ -19,7 +19,7 @@ def main() -> None:
     """Runs the three agents one after another and prints where each begins and ends."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--steps", type=int, default=200, help="steps of the Python agent")
-    parser.add_argument("--instance", default="swap", help="name of the server that is started")
+    parser.add_argument("--instance", default="swap", help="instance of the server to start")
     args = parser.parse_args()
     instance = args.instance
     server = subprocess.Popen(["emberwatch-server", "--instance", instance])

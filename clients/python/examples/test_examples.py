@@ -1,4 +1,4 @@
-"""Runs every example in short form. `scripts/test --all` installs what they need."""
+"""Runs every example in short form. `scripts/test --all` installs their dependencies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 FOLDER = Path(__file__).parent
 
-#: Each example, short arguments, and a line that it must print.
+#: Each example, short arguments, and a pattern that its output must match.
 EXAMPLES = [
     ("dqn.py", "--total-steps 3000 --report-every 1000", r"3000  reward per path (?!0\.00)\d"),
     (
@@ -68,7 +68,7 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    # Programs that pip has installed next to Python.
+    # Finds programs that pip installed next to Python.
     env = os.environ | {"PATH": f"{os.environ['PATH']}:{Path(sys.executable).parent}"}
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=900, cwd=tmp_path, env=env

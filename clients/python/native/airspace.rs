@@ -1,4 +1,4 @@
-//! Where robots may fly and what they see, as Python's `Airspace` says it.
+//! The airspace of a grid, built from Python's `Airspace`: where robots may fly, and what they see.
 
 use crate::refusal::invalid;
 use emberwatch_model::{Airspace, Shape};
@@ -19,7 +19,7 @@ pub struct Given<'py> {
 }
 
 impl Given<'_> {
-    /// The airspace of a grid.
+    /// Builds the airspace of a grid. The no-fly map must have the grid's shape.
     pub fn on_grid(&self, py: Python<'_>, shape: Shape) -> PyResult<Airspace> {
         let no_fly = self.no_fly.as_ref().map(|map| map.as_array().to_owned());
         let dim = no_fly.as_ref().map_or(shape.dim(), |map| map.dim());
@@ -28,11 +28,12 @@ impl Given<'_> {
             return Err(invalid(py, "airspace: no_fly", expected, got));
         }
         let no_fly = no_fly.map(Arc::new);
-        // Paths do not depend on what differs from ring to ring.
+        // One ring is enough: paths do not depend on the sensor's rings.
         Ok(Airspace::new(shape, no_fly, self.radius, 1, self.pays()))
     }
 
-    /// All that is known of worlds whose model is hidden: that so many values are seen, each taken for a state.
+    /// Describes worlds whose model is hidden, from the number of their observation values alone. Treats each value as
+    /// a state that the sensor shows exactly.
     pub fn seen(&self, n_observations: usize) -> Description {
         let n_values = n_observations / self.n_rings.max(1);
         let shown = |value: usize| {

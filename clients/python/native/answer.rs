@@ -24,11 +24,11 @@ const MAX_ROBOTS: u32 = 1 << 16;
 
 type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
 
-/// Numbers of one robot's step: reward, whether the episode terminated and was truncated, step, distinct cells visited;
-/// row and column, `[1, 2]`.
+/// Results of one robot's step: reward, terminated, truncated, step, number of distinct cells visited, and the robot's
+/// row and column as `[1, 2]`.
 type Numbers<'py> = (f64, bool, bool, u64, u32, Bound<'py, PyArray2<i64>>);
 
-/// The numbers of many robots' steps, column by column; `_native.pyi` explains them.
+/// Results of many robots' steps, one array per column; `_native.pyi` documents the columns.
 type Columns<'py> = (
     Bound<'py, PyArray1<f64>>,
     Bound<'py, PyArray1<bool>>,
@@ -39,15 +39,15 @@ type Columns<'py> = (
     bool,
 );
 
-/// The answer to a step or an observation, of consecutive robots.
+/// The answer to a step or observe request for consecutive robots.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Answer {
-    /// Robots of each world.
+    /// Number of robots per world.
     team: u32,
     #[pyo3(get)]
     first_robot: u32,
     n_robots: u32,
-    /// Time that the simulation took, nanoseconds.
+    /// Duration of the simulation, in nanoseconds.
     #[pyo3(get)]
     simulation_nanos: u64,
     /// Number of frames, height, width.
@@ -75,7 +75,7 @@ impl Answer {
         let is_small = height <= MAX_SIDE && width <= MAX_SIDE && n_robots <= MAX_ROBOTS;
         if !is_small || n_robots == 0 || team == 0 {
             let expected =
-                format!("at most {MAX_ROBOTS} robots, on at most {MAX_SIDE} rows and columns");
+                format!("1 to {MAX_ROBOTS} robots, on at most {MAX_SIDE} rows and columns");
             let got = format!("{n_robots} robots, {team} in a world, {height} x {width} cells");
             return Err(invalid(py, "answer", expected, got));
         }
@@ -116,26 +116,26 @@ impl Answer {
         )
     }
 
-    /// What each robot saw, or each world's team, `(n, H, W)`: a view of the answer's own memory.
+    /// The frames, one per robot or one per world's team, `[n, H, W]`: a view of the answer's own memory.
     #[getter]
     fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let frames = self.slice(py, self.head()..self.n_bytes())?;
         frames.reshape(self.dim)
     }
 
-    /// The results of the worlds, bytes.
+    /// The worlds' results as bytes.
     #[getter]
     fn worlds<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
         self.slice(py, 0..self.n_worlds() * WORLD_BYTES)
     }
 
-    /// The results of the robots, bytes.
+    /// The robots' results as bytes.
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
         self.slice(py, self.n_worlds() * WORLD_BYTES..self.head())
     }
 
-    /// A world's result and a robot's result for each robot, bytes; a new array.
+    /// For each robot, its world's result and then its own, as bytes; a new array.
     #[getter]
     fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let payload = self.bytes(py)?;
@@ -148,20 +148,21 @@ impl Answer {
         Ok(PyArray1::from_vec(py, results))
     }
 
-    /// The position of each robot's world among the worlds.
+    /// The index of each robot's world among the worlds of this answer.
     #[getter]
     fn world_of_robots<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
         let worlds = (0..self.n_robots as usize).map(|index| self.world_of(index) as i64);
         PyArray1::from_iter(py, worlds)
     }
 
-    /// The fields of one robot's `WorldResult` and `RobotResult`.
+    /// Returns the fields of one robot's `WorldResult` and `RobotResult`.
     fn result(&self, py: Python<'_>, index: usize) -> PyResult<(WorldRow, Robot)> {
         let (world, robot) = self.results_of(py, index)?;
         Ok((of_world(&world), of_robot(&robot)))
     }
 
-    /// The numbers of the first robot's step; `pays`: which reward, 0 the share, 1 the team's, 2 the marginal one.
+    /// Returns the results of the first robot's step. `pays` selects its reward: 0 the robot's share, 1 the team's
+    /// reward, 2 the marginal reward.
     fn numbers<'py>(&self, py: Python<'py>, pays: u8) -> Numbers<'py> {
         let (world, robot) = self.first;
         (
@@ -176,7 +177,7 @@ impl Answer {
 }
 
 impl Answer {
-    /// An answer that came with this header.
+    /// Builds an answer from a reply's header and its payload.
     pub fn of(
         py: Python<'_>,
         team: u32,
@@ -203,7 +204,7 @@ impl Answer {
         }
     }
 
-    /// The step of its first world.
+    /// Returns the step of the first world.
     pub fn step(&self) -> u64 {
         self.first.0.step
     }
@@ -216,7 +217,7 @@ impl Answer {
         self.n_worlds() * WORLD_BYTES
     }
 
-    /// Number of bytes before the frames.
+    /// Returns the number of bytes before the frames.
     fn head(&self) -> usize {
         self.worlds_end() + self.n_robots as usize * ROBOT_BYTES
     }
@@ -225,7 +226,7 @@ impl Answer {
         self.head() + self.dim.iter().product::<usize>()
     }
 
-    /// The position of a robot's world; `index` counts robots from the first.
+    /// Returns the index of a robot's world. `index` counts from the first robot of this answer.
     fn world_of(&self, index: usize) -> usize {
         let first = self.first_robot / self.team;
         ((self.first_robot + index as u32) / self.team - first) as usize
@@ -260,7 +261,7 @@ impl Answer {
     }
 }
 
-/// The numbers of all robots' steps, from bytes of `wire.RESULT_DTYPE`; `pays` as of `Answer.numbers`.
+/// Decodes the results of all robots' steps from bytes of `wire.RESULT_DTYPE`. `pays`: see `Answer.numbers`.
 #[pyfunction]
 pub fn columns<'py>(
     py: Python<'py>,
@@ -295,7 +296,7 @@ pub fn columns<'py>(
     ))
 }
 
-/// Number of frames of robots: robots of each world, the first robot, number of robots, flags.
+/// Returns the number of frames, given the robots per world, the first robot, the number of robots and the flags.
 fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize {
     match flags & FLAG_TEAM_FRAMES {
         0 => n_robots as usize,
@@ -303,7 +304,7 @@ fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize
     }
 }
 
-/// What a step pays a robot.
+/// Returns the reward of a robot's step. `pays`: see `Answer.numbers`.
 fn paid(pays: u8, world: &WorldResult, robot: &RobotResult) -> f64 {
     match pays {
         0 => robot.reward,

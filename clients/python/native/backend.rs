@@ -13,7 +13,7 @@ use serde_json::{Map, Value};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-/// How long it may take to read settings and their files.
+/// Maximum time to read settings and the files that they name.
 const LONGEST_READ: Duration = Duration::from_secs(20);
 
 pub enum Worlds {
@@ -30,7 +30,8 @@ impl Worlds {
     }
 }
 
-/// Makes worlds in this process. `settings` is JSON with the names of `config/server.toml`.
+/// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. With `warns`, warns of
+/// robots whose start cells are enclosed by no-fly cells.
 pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
     let checked = checked(py, settings)?;
     if warns {
@@ -47,7 +48,7 @@ pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedde
     })
 }
 
-/// Checks settings; returns them with all defaults. JSON from JSON.
+/// Checks settings, given as JSON. Returns them as JSON with every default filled in.
 #[pyfunction]
 pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
     let checked = checked(py, settings)?;
@@ -56,7 +57,7 @@ pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
     Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
 }
 
-/// Identifies the worlds of these settings, which are not simulated.
+/// Returns the fingerprint of the worlds with these settings, without simulating them.
 #[pyfunction]
 pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
     Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
@@ -85,7 +86,7 @@ fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
     checked.map_err(|problem| refused(py, &problem.to_string()))
 }
 
-/// Whether a setting names a pipe, a device or the like, whose reader may wait.
+/// Returns whether a setting names a pipe, device or other special file, which can keep its reader waiting.
 fn may_block(given: &Map<String, Value>) -> bool {
     let paths = given.values().filter_map(Value::as_str);
     let kinds = paths.filter_map(|path| std::fs::metadata(path).ok());
@@ -93,13 +94,13 @@ fn may_block(given: &Map<String, Value>) -> bool {
     others.next().is_some()
 }
 
-/// Warns of robots that begin where no-fly cells close them in.
+/// Warns of robots whose start cells are enclosed by no-fly cells.
 fn warn_of_starts(py: Python<'_>, checked: &Checked) -> PyResult<()> {
     let mut starts = checked.reach.closed_in.iter();
     starts.try_for_each(|closed_in| warn(py, closed_in))
 }
 
-/// Refuses settings that only a server can have.
+/// Refuses settings that apply only to a server.
 fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
     let of_servers = |settings: &ServerConfig| {
         [

@@ -45,7 +45,7 @@ impl Transition {
     #[new]
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
-        // Two beliefs, and a third with margins in the work space.
+        // Memory for two beliefs, and for a third one with margins in the work space.
         let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
         check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
@@ -116,18 +116,13 @@ impl Transition {
     }
 }
 
-/// Makes the error of a model whose weights can all be 0, or lose their precision.
+/// Makes the error of a model whose transition weights can all be 0, or can lose their precision.
 pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     match error {
         ModelError::ZeroWeight { cell, .. } => {
             let subject = format!("model: transition weights of cell {cell}");
             let got = "weights that can all be 0";
-            invalid(
-                py,
-                subject,
-                "a positive sum whatever its neighbourhood",
-                got,
-            )
+            invalid(py, subject, "a positive sum for every neighbourhood", got)
         }
         ModelError::Value {
             what,
@@ -149,8 +144,8 @@ pub fn correct<'py>(
     frames: PyReadonlyArray3<'py, u8>,
 ) -> PyResult<()> {
     let beliefs = beliefs.try_readwrite();
-    let expected = "an array to write to, which no other thread uses";
-    let got = "one that is read-only or in use";
+    let expected = "a writable array that no other thread uses";
+    let got = "a read-only array, or one in use";
     let mut beliefs = beliefs.map_err(|_| invalid(py, "belief", expected, got))?;
     let (likelihood, frames) = (likelihood.as_array(), frames.as_array());
     let (n_worlds, height, width) = frames.dim();
@@ -189,7 +184,7 @@ fn shown(frames: ArrayView3<'_, u8>) -> Vec<(usize, u8)> {
     values.filter(|&(_, value)| value != UNOBSERVED).collect()
 }
 
-/// Returns how often each cell of 64 simulated worlds is in each state after the burn-in, `[S, H, W]`.
+/// Simulates 64 worlds. Returns the share of them in which each cell is in each state after the burn-in, `[S, H, W]`.
 #[pyfunction]
 pub fn simulated_prior<'py>(
     py: Python<'py>,
@@ -205,7 +200,7 @@ pub fn simulated_prior<'py>(
     Ok(belief.probabilities().to_pyarray(py))
 }
 
-/// Returns the belief before the first frame. Keeps a simulated one in a file, for later processes.
+/// Returns the belief before the first frame. Caches a simulated belief in a file for later processes.
 pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let is_simulated = matches!(prior, Prior::Simulated { .. });
     let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
@@ -214,12 +209,12 @@ pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -
         return Ok(belief);
     }
     let belief = simulated(py, prior, model, shape)?;
-    // If it cannot be written, a later process simulates it again.
+    // If the file cannot be written, a later process simulates the belief again.
     let _ = kept.map(|kept| kept.write(&belief));
     Ok(belief)
 }
 
-/// Simulates a prior on new threads, as a global pool is unusable after a fork. Ctrl-C ends it.
+/// Simulates a prior on new threads, because a global pool is unusable after a fork. Ctrl-C ends the simulation.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -1,4 +1,4 @@
-//! Connections, to a server or to embedded worlds.
+//! Connections to a server or to embedded worlds.
 
 use crate::answer::Answer;
 use crate::backend::{Worlds, embedded};
@@ -22,14 +22,14 @@ use pyo3::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Maximum duration of a step that keeps the interpreter, nanoseconds: 1 ms.
+/// Steps that are expected to be shorter than this keep the interpreter locked: 1 ms, in nanoseconds.
 const BRIEF_NANOS: u64 = 1_000_000;
 
 /// A connection to a server, or worlds in this process. Threads may share it: they take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Server {
     pub worlds: Owned<Worlds>,
-    /// What the server said of itself.
+    /// The server's description of itself, from its answer to `hello`.
     pub info: ServerInfo,
     /// Height and width of the grid.
     shape: Shape,
@@ -48,8 +48,8 @@ impl Server {
         Self::of(py, instance, Worlds::Served(Box::new(wire)))
     }
 
-    /// Worlds in this process, of these settings of `config/server.toml`, as JSON. `warns`: of starts that no-fly cells
-    /// close in.
+    /// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. With `warns`, warns of
+    /// robots whose start cells are enclosed by no-fly cells.
     #[staticmethod]
     #[pyo3(name = "embedded")]
     fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
@@ -57,13 +57,14 @@ impl Server {
         Self::of(py, INSTANCE, worlds)
     }
 
-    /// What the server said of itself, as JSON.
+    /// The server's description of itself, as JSON.
     #[getter]
     fn info(&self) -> String {
         serde_json::to_string(&self.info).expect("invariant: replies serialise")
     }
 
-    /// Hidden states of consecutive embedded worlds that publish them, as the fields of `Truth`.
+    /// Returns the hidden states of consecutive embedded worlds, as the fields of `Truth`. The worlds must publish
+    /// them.
     fn truths<'py>(
         &self,
         py: Python<'py>,
@@ -82,7 +83,7 @@ impl Server {
         let found = found.map_err(|error| raise(py, error, "truths", 0.0))?;
         let Some(found) = found else {
             let expected = "embedded worlds with publish_truth that are not in a reset";
-            let got = format!("{n_worlds} from {first_world} on");
+            let got = format!("{n_worlds} worlds from world {first_world}");
             return Err(invalid(py, "truths", expected, got));
         };
         let truths = found.into_iter();
@@ -90,14 +91,14 @@ impl Server {
         Ok(truths.map(of).collect())
     }
 
-    /// Sends JSON text, `what` in errors; returns that of the answer.
+    /// Sends a control request as JSON text. Returns the text of the answer. `what` names the request in errors.
     fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
         let ask = |to: &mut Worlds| to.backend().control_text(text, duration(seconds));
         let answer = self.worlds.with(py, ask)?;
         decoded(answer).map_err(|error| raise(py, error, what, seconds))
     }
 
-    /// Sends a request on `step` as it is.
+    /// Sends a request to the `step` service with exactly these header fields and this body.
     #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
     fn step(
         &self,
@@ -142,7 +143,7 @@ impl Server {
         })
     }
 
-    /// Presents an answer to Python, or raises its error.
+    /// Converts an answer for Python, or makes the exception for its error.
     pub fn answered(
         &self,
         py: Python<'_>,
@@ -154,21 +155,22 @@ impl Server {
         Ok(Answer::of(py, team, self.shape, &reply, payload))
     }
 
-    /// Whether a step of this number of robots ends so soon that other Python threads need not get the interpreter: to
-    /// get it back from a busy thread takes 5 ms. Unknown before the first step.
+    /// Returns whether a step of this number of robots should be so short that it can keep the interpreter locked.
+    /// Taking the interpreter back from a busy thread costs 5 ms. Returns `false` before the first step, whose duration
+    /// is unknown.
     pub fn is_brief(&self, n_robots: u32) -> bool {
         let nanos = self.nanos_of_robot.load(Ordering::Relaxed);
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
     }
 
-    /// Remembers how long a step of this number of robots took.
+    /// Records the duration of a step of this number of robots.
     pub fn took(&self, nanos: u64, n_robots: u32) {
         let nanos = nanos / u64::from(n_robots.max(1));
         self.nanos_of_robot.store(nanos.max(1), Ordering::Relaxed);
     }
 }
 
-/// A world's present, without the interpreter.
+/// Copies a world's latest result and hidden states, which needs no interpreter.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
     (
         world,
@@ -182,7 +184,7 @@ pub fn checked(py: Python<'_>, instance: &str) -> PyResult<Instance> {
     Instance::new(instance).map_err(|error| raise_of_channel(py, error))
 }
 
-/// A timeout; "not a number" has passed at once.
+/// Converts a timeout. Negative numbers and NaN become 0.
 pub fn duration(seconds: f64) -> Duration {
     Duration::try_from_secs_f64(seconds.clamp(0.0, 1e9)).unwrap_or_default()
 }

@@ -1,11 +1,11 @@
-//! Work that leaves the interpreter to other threads.
+//! Computations that unlock the interpreter for other threads.
 
 use pyo3::prelude::*;
 
-/// Fewest numbers for which that is worth it: getting the interpreter back may take 5 ms.
+/// Minimum number of values for which unlocking is worth it: getting the interpreter back may take 5 ms.
 const MANY: usize = 1 << 14;
 
-/// Works on so many numbers: without the interpreter if they are many.
+/// Runs `work`, which processes `n_numbers` values. If they are many, unlocks the interpreter meanwhile.
 pub fn detached<R: Send>(py: Python<'_>, n_numbers: usize, work: impl FnOnce() -> R + Send) -> R {
     if n_numbers < MANY {
         work()

@@ -1,4 +1,4 @@
-//! From errors of the wire to those of Python, which `emberwatch/errors.py` defines; and Ctrl-C.
+//! Conversion of Rust errors to the exceptions of `emberwatch/errors.py`, and the handling of Ctrl-C.
 
 use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::errors::ConnectionError;
@@ -13,13 +13,13 @@ use std::ffi::CString;
 use std::fmt::Display;
 
 thread_local! {
-    /// What Python raised during a wait of this thread, such as in a signal's handler.
+    /// The exception that Python raised while this thread waited, for example in a signal handler.
     static RAISED: RefCell<Option<PyErr>> = const { RefCell::new(None) };
 }
 
 /// Runs Python's signal handlers; returns whether one raised.
 pub fn interrupted() -> bool {
-    // Python runs them on its main thread only, and others may be kept waiting for the interpreter.
+    // Python runs handlers only on its main thread; any other thread might wait for the interpreter in vain.
     #[cfg(target_os = "linux")]
     let may_be_main = rustix::thread::gettid() == rustix::process::getpid();
     #[cfg(not(target_os = "linux"))]
@@ -34,51 +34,51 @@ pub fn interrupted() -> bool {
         })
 }
 
-/// An exception as the end of a wait; [`raise`] raises it.
+/// Turns an exception into the error of an interrupted wait, for which [`raise`] raises the exception.
 pub fn interruption(raised: PyErr) -> ConnectionError {
     RAISED.set(Some(raised));
     ChannelError::Interrupted.into()
 }
 
-/// An error of the class of this name in `emberwatch/errors.py`, or made by its function.
+/// Makes an exception by calling the class or function of this name in `emberwatch/errors.py`.
 pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) -> PyErr {
     let module = py.import("emberwatch.errors");
     let made = module.and_then(|module| module.getattr(name)?.call1(arguments));
     made.map_or_else(|error| error, PyErr::from_value)
 }
 
-/// The error of memory that there is not.
+/// Makes the error of insufficient memory.
 pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
     error(py, "NotEnoughMemoryError", (short.to_string(),))
 }
 
-/// Checks that there is memory for what arguments make large.
+/// Checks that there is enough memory for data whose size depends on arguments.
 pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyResult<()> {
-    // Reading the limits takes some 0.1 ms, and so much less is there or nothing is.
+    // Reading the limits takes about 0.1 ms, which is not worth it for less than 16 MiB.
     if n_bytes < 16 << 20 {
         return Ok(());
     }
     memory::check(what, n_bytes as u64).map_err(|short| no_memory(py, &short))
 }
 
-/// The error of threads that the system does not start.
+/// Makes the error of threads that the system did not start.
 pub fn no_threads(py: Python<'_>, short: &NoThreads) -> PyErr {
     error(py, "EmberwatchError", (short.to_string(), "threads"))
 }
 
-/// Warns the caller of this package's function.
+/// Issues a `UserWarning` to the caller of the package's function.
 pub fn warn(py: Python<'_>, words: impl Display) -> PyResult<()> {
     let words = CString::new(words.to_string())?;
     PyErr::warn(py, &py.get_type::<PyUserWarning>(), &words, 1)
 }
 
-/// The error of a request, `what`, that was waited for so many seconds.
+/// Makes the exception for a request that failed. `what` names the request; `seconds` was its timeout.
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
         ConnectionError::Memory(short) => no_memory(py, &short),
         ConnectionError::ServerGone { instance, .. } if instance == INSTANCE => {
-            let text = "these worlds were ended by shutdown: make others";
+            let text = "these worlds were ended by shutdown: make new ones";
             error(py, "ServerGoneError", (text,))
         }
         ConnectionError::Timeout { instance, .. } if instance == INSTANCE => {
@@ -103,7 +103,7 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
     }
 }
 
-/// The error of a channel that could not be opened or used.
+/// Makes the exception for a channel that could not be opened or used.
 pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
     let text = problem.to_string();
     match problem {
@@ -111,7 +111,7 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
             .take()
             .unwrap_or_else(|| PyKeyboardInterrupt::new_err(())),
         ChannelError::InstanceName(name) => {
-            let expected = "1 to 64 characters out of A-Z a-z 0-9 - _";
+            let expected = "1 to 64 characters from A-Z a-z 0-9 - _";
             error(py, "invalid", ("instance", expected, format!("'{name}'")))
         }
         ChannelError::NoServer { instance } => {

@@ -1,4 +1,4 @@
-//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which frames correct.
+//! The agent's estimators for Python: beliefs of one kind about `n` worlds, corrected with frames.
 
 use crate::detached::detached;
 use crate::model::{model_of, shape_of};
@@ -35,7 +35,7 @@ pub struct Estimators {
     kind: &'static str,
     #[pyo3(get)]
     state_names: Vec<String>,
-    /// The state that pays most; states are numbered from 0.
+    /// The number, from 0, of the state with the largest reward.
     #[pyo3(get)]
     target_state: usize,
     #[pyo3(get)]
@@ -52,7 +52,7 @@ struct State {
     threads: Pool,
 }
 
-/// Copies what a spatial filter has learned about how cells vary together; does nothing for other kinds.
+/// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
     let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
@@ -63,7 +63,7 @@ fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
 
 #[pymethods]
 impl Estimators {
-    /// Builds beliefs of a known model. `prior`: the first belief about each world, `[S, H, W]`.
+    /// Builds beliefs from a known model. `prior` is the first belief about each world, `[S, H, W]`.
     #[staticmethod]
     fn known(
         py: Python<'_>,
@@ -92,8 +92,8 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Loads beliefs from a checkpoint: of `kind`, or of the kind that the checkpoint is for. With a model, checks that
-    /// the checkpoint fits its worlds.
+    /// Loads beliefs from a checkpoint. `kind` defaults to the kind that the checkpoint was trained for. With a model,
+    /// checks that the checkpoint fits its worlds.
     #[staticmethod]
     fn load(
         py: Python<'_>,
@@ -235,8 +235,8 @@ impl Estimators {
         Ok(())
     }
 
-    /// Scores the beliefs against hidden states `[n, H, W]`. Returns the log loss, the Brier score for the state
-    /// `target`, and the share of cells whose most probable state is right.
+    /// Scores the beliefs against hidden states `[n, H, W]`. Returns one array each of log losses, Brier scores for the
+    /// state `target`, and shares of cells whose most probable state is right.
     fn scores<'py>(
         &self,
         py: Python<'py>,
@@ -363,7 +363,7 @@ impl Estimators {
     }
 }
 
-/// Predicts all worlds, together where the kind can.
+/// Predicts all worlds, in one batch if their kind supports it.
 fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     match worlds.first().and_then(|first| first.predict_together()) {
         Some(together) => together(worlds),
@@ -373,7 +373,7 @@ fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     }
 }
 
-/// Makes the error of a belief that could not be built, or not be corrected with a frame.
+/// Makes the error of a belief that could not be built, or could not be corrected with a frame.
 pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     let is_impossible = matches!(
         error.downcast_ref::<EstimatorError>(),

@@ -1,4 +1,4 @@
-//! Paths flown move by move by many robots, in rows: where they are, what they have visited.
+//! Paths that many robots fly move by move, one row per robot: cells, visited cells and rewards.
 
 use crate::airspace::Given;
 use crate::errors::check_memory;
@@ -25,17 +25,18 @@ type Arguments = (
     Option<Py<PyAny>>,
 );
 
-/// The present path of each robot, as far as it is flown.
+/// The current path of each robot, up to its latest move.
 ///
-/// No method leaves the interpreter to other threads: one that reads meanwhile would find it borrowed.
+/// No method unlocks the interpreter: another thread that reads this object meanwhile would find it borrowed.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
     airspace: Airspace,
-    /// Python's, which it was made of.
+    /// The Python `Airspace` that this was built from.
     given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// What each hidden state pays when its cell is first visited, or seen where that pays; `None`: nothing.
+    /// The reward of each hidden state, paid when its cell is first visited, or first seen if the sensor pays for seen
+    /// cells. `None`: no rewards.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -43,7 +44,7 @@ pub struct Flights {
     states: Vec<u8>,
     moves: Vec<u8>,
     paid: Vec<f64>,
-    /// Which cells have paid.
+    /// Whether each cell's reward has been paid.
     has_paid: Vec<bool>,
     /// Work space.
     sight: (Vec<SeenCell>, Vec<u8>),
@@ -90,7 +91,7 @@ impl Flights {
         })
     }
 
-    /// A copy has no paths.
+    /// Returns the class and its arguments, for copies and pickles. A copy starts without paths.
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, Arguments) {
         let this = slf.borrow();
         let (height, width) = this.shape.dim();
@@ -100,7 +101,7 @@ impl Flights {
         (slf.get_type(), arguments)
     }
 
-    /// Row and column of each robot.
+    /// Row and column of each robot, `[n_rows, 2]`.
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i64>>> {
         let cells = self.cells.iter();
@@ -108,26 +109,27 @@ impl Flights {
         PyArray1::from_iter(py, flat).reshape([self.cells.len(), 2])
     }
 
-    /// Number of moves made.
+    /// Number of moves that each robot has made.
     #[getter]
     fn n_made<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|&n| n as i64))
     }
 
-    /// 255 in the cells visited, else 0.
+    /// 255 in visited cells, otherwise 0, `[n_rows, H, W]`.
     #[getter]
     fn visited<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let (height, width) = self.shape.dim();
         PyArray1::from_slice(py, &self.visited).reshape([self.cells.len(), height, width])
     }
 
-    /// What the moves have been paid.
+    /// The reward of each path so far.
     #[getter]
     fn paid<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_slice(py, &self.paid)
     }
 
-    /// 1 for each move that takes a robot to another cell, else 0, `[n_rows, 4]`; all 1 where no move does.
+    /// The action masks, `[n_rows, 4]`: 1 for each move that takes a robot to another cell, otherwise 0. All 1 if no
+    /// move does.
     #[getter]
     fn masks<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i8>>> {
         let mut masks = Vec::with_capacity(self.cells.len() * Move::ALL.len());
@@ -139,7 +141,8 @@ impl Flights {
         PyArray1::from_vec(py, masks).reshape([self.cells.len(), Move::ALL.len()])
     }
 
-    /// Begins some paths; `robots` and hidden `states` are those of all rows.
+    /// Begins the paths of the rows marked in `begun`. `robots`, `[n_rows, 2]`, and the hidden `states`,
+    /// `[n_rows, H, W]`, cover all rows.
     fn begin(
         &mut self,
         py: Python<'_>,
@@ -156,7 +159,7 @@ impl Flights {
             return Err(invalid(py, "states", expected, got));
         }
         if begun.len() != self.cells.len() || robots.dim() != (self.cells.len(), 2) {
-            return Err(PyValueError::new_err("begin: expected one of each row"));
+            return Err(PyValueError::new_err("begin: expected one entry per row"));
         }
         for row in (0..begun.len()).filter(|&row| begun[row]) {
             let cell = [robots[[row, 0]], robots[[row, 1]]].map(|at| usize::try_from(at).ok());
@@ -172,12 +175,12 @@ impl Flights {
         Ok(())
     }
 
-    /// Of which rows the next move is the last of its path.
+    /// Returns, for each row, whether its next move is the last of its path.
     fn completes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|n| n + 1 == self.n_moves))
     }
 
-    /// The paths that these moves would complete.
+    /// Returns the paths, `[n_rows, n_moves]`, with `actions` as their last moves.
     fn paths<'py>(
         &self,
         py: Python<'py>,
@@ -185,7 +188,7 @@ impl Flights {
     ) -> PyResult<Bound<'py, PyArray2<u8>>> {
         let actions = actions.as_array();
         if actions.len() != self.cells.len() {
-            return Err(PyValueError::new_err("paths: expected one of each row"));
+            return Err(PyValueError::new_err("paths: expected one action per row"));
         }
         let mut paths = self.moves.clone();
         let last = paths
@@ -196,16 +199,16 @@ impl Flights {
         PyArray1::from_vec(py, paths).reshape([self.cells.len(), self.n_moves])
     }
 
-    /// The moves made by one robot.
+    /// Returns the moves that one robot has made.
     fn made<'py>(&self, py: Python<'py>, row: usize) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let n_rows = self.cells.len();
-        let expected = || invalid(py, "row", format!("one below {n_rows}"), row);
+        let expected = || invalid(py, "row", format!("a row below {n_rows}"), row);
         let n_made = *self.n_made.get(row).ok_or_else(expected)?;
         let made = &self.moves[row * self.n_moves..][..n_made];
         Ok(PyArray1::from_slice(py, made))
     }
 
-    /// One move of the rows `moved`, below 4; returns what it pays each row.
+    /// Makes one move in each row marked in `moved`. `actions` are below 4. Returns the reward of each row.
     fn r#move<'py>(
         &mut self,
         py: Python<'py>,
@@ -214,11 +217,13 @@ impl Flights {
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let (moved, actions) = (moved.as_array(), actions.as_array());
         if moved.len() != self.cells.len() || actions.len() != self.cells.len() {
-            return Err(PyValueError::new_err("move: expected one of each row"));
+            return Err(PyValueError::new_err("move: expected one action per row"));
         }
         let is_over = |(&moves, &n_made): (&bool, &usize)| moves && n_made >= self.n_moves;
         if moved.iter().zip(&self.n_made).any(is_over) {
-            return Err(PyValueError::new_err("move: expected a path that goes on"));
+            return Err(PyValueError::new_err(
+                "move: expected a path with moves left",
+            ));
         }
         let rows = moved.iter().zip(actions).enumerate();
         let paid =
@@ -229,18 +234,18 @@ impl Flights {
 }
 
 impl Flights {
-    /// Where the robots are.
+    /// Returns the cell of each robot.
     pub fn cells(&self) -> &[Cell] {
         &self.cells
     }
 
-    /// The share of a path's moves that are left, times 255.
+    /// Returns the share of a path's moves that are left, times 255.
     pub fn share_left(&self, row: usize) -> u8 {
         let made = self.n_made[row] as f64 / self.n_moves as f64;
         (255.0 * (1.0 - made)).round_ties_even() as u8
     }
 
-    /// Forgets what was visited, and keeps the hidden states, of the rows `begun`.
+    /// Clears the visited cells of the rows marked in `begun`, and stores their hidden states.
     fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
         let n_cells = self.shape.n_cells();
         for row in (0..begun.len()).filter(|&row| begun[row]) {
@@ -268,7 +273,7 @@ impl Flights {
         paid
     }
 
-    /// What the first visit of a cell pays; `first` is the first cell of its row.
+    /// Returns the reward of the first visit to cell `index`. `first` is the offset of the robot's grid in the arrays.
     fn pay(&mut self, first: usize, index: usize) -> f64 {
         let Some(reward) = &self.reward else {
             return 0.0;

@@ -1,4 +1,4 @@
-//! A lease: the right to fly consecutive robots, and the step k for which each world's next path is.
+//! A lease: the right to fly consecutive robots. Remembers the step k of each world, which its next path is for.
 
 use crate::answer::Answer;
 use crate::backend::Worlds;
@@ -28,7 +28,7 @@ impl Lease {
         Self { server, lease }
     }
 
-    /// Flies a path with each robot; `None` if the paths must be converted first, see `moves::paths`.
+    /// Flies a path with each robot. Returns `None` if the paths must be converted first, see `moves::paths`.
     fn step(
         &self,
         py: Python<'_>,
@@ -46,9 +46,9 @@ impl Lease {
         self.server.get().answered(py, answer, seconds).map(Some)
     }
 
-    /// Flies a path with each robot, and sends it again until the worlds have moved. Returns how the worlds stand, and
-    /// how many of their steps passed unseen before that; `None` as of `step`. `accepts_late`: where a world moved on
-    /// without these paths, that is no error.
+    /// Flies a path with each robot, and resends the paths until the worlds have moved. Returns the latest results, and
+    /// the number of steps missed before them; `None` as in `step`. With `accepts_late`, a world that moved on without
+    /// these paths is not an error.
     fn fly(
         &self,
         py: Python<'_>,
@@ -75,7 +75,7 @@ impl Lease {
         Ok(Some((answer, n_skipped)))
     }
 
-    /// The last results and frames again; steps go on from there.
+    /// Requests the latest results and frames again. The next paths are for the steps after these.
     fn observe(
         &self,
         py: Python<'_>,
@@ -89,7 +89,7 @@ impl Lease {
         self.server.get().answered(py, answer, seconds)
     }
 
-    /// From here on a world of the lease is at this step.
+    /// Records that a world of the lease is at this step.
     fn note(&self, world: u32, step: u64) {
         self.lease.note(world, step);
     }
@@ -114,7 +114,7 @@ impl Lease {
         Call::new(request, moves, duration(seconds))
     }
 
-    /// Checks paths of robots of the lease.
+    /// Checks that the lease holds these robots. Returns their paths as bytes; `None` as in `moves::paths`.
     fn moves(
         &self,
         paths: &Bound<'_, PyAny>,
@@ -125,13 +125,13 @@ impl Lease {
         let worlds = worlds_of(first_robot, n_robots, info.n_robots);
         if worlds.start < own.start || worlds.end > own.end {
             let expected = format!("robots of worlds {own:?}");
-            let got = format!("{n_robots} from {first_robot} on");
+            let got = format!("{n_robots} robots from robot {first_robot}");
             return Err(invalid(paths.py(), "step", expected, got));
         }
         Ok(moves::paths(paths, n_robots as usize, info.n_moves))
     }
 
-    /// Sends a request while no other thread uses the connection: each thread's path is for a step of its own.
+    /// Sends a request while no other thread uses the connection, so that threads send paths for different steps.
     fn ask(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
         let (server, request) = (self.server.get(), *call.request());
         let send = |worlds: &mut Worlds| self.lease.send(worlds.backend(), call);
@@ -154,8 +154,8 @@ impl Lease {
     fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
         let world = worlds_of(first_robot, 1, self.server.get().info.n_robots).start;
         let text = format!(
-            "world {world} waits for the paths of other robots that are held; environments of one world need a thread or \
-             a process each"
+            "world {world} waits for the paths of its other leased robots; environments of one world need a thread or \
+             process each"
         );
         let logger = py
             .import("logging")?

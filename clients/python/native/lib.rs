@@ -1,4 +1,4 @@
-//! What Python calls of Rust: the module `emberwatch._native`, whose types are in `_native.pyi`.
+//! The Rust half of the Python package: the module `emberwatch._native`, whose types are in `_native.pyi`.
 
 mod airspace;
 mod answer;

@@ -1,4 +1,4 @@
-//! The figures of merit of some worlds' runs.
+//! Figures of merit of the runs of several worlds.
 
 use crate::errors::check_memory;
 use crate::model::shape_of;
@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 /// The fields of Python's `Merit`.
 type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
 
-/// The figures of some worlds while they go on, together.
+/// The running figures of several worlds, which step together.
 #[pyclass(module = "emberwatch._native")]
 pub struct MeritTally {
     shape: Shape,
@@ -46,7 +46,7 @@ impl MeritTally {
         })
     }
 
-    /// One step of all worlds; see `MeritTally.update` of Python.
+    /// Adds one step of all worlds; see Python's `MeritTally.update`.
     fn update(
         &mut self,
         py: Python<'_>,
@@ -74,7 +74,7 @@ impl MeritTally {
         Ok(())
     }
 
-    /// The figures of one world's steps so far.
+    /// Returns the figures of one world over its steps so far.
     fn merit(&self, world: usize) -> PyResult<Figures> {
         let tally = self.worlds.get(world);
         let tally = tally.ok_or_else(|| PyIndexError::new_err("no such world"))?;
@@ -90,7 +90,7 @@ impl MeritTally {
 }
 
 impl MeritTally {
-    /// Refuses arrays that do not fit each other, and robots off the grid.
+    /// Refuses arrays whose shapes do not fit each other, and robots off the grid.
     fn check(
         &self,
         py: Python<'_>,
@@ -111,8 +111,8 @@ impl MeritTally {
         fits("visited", visited.dim())?;
         fits("states", states.map_or(grids, |states| states.dim()))?;
         if counts.iter().any(|counts| counts.len() != grids.0) {
-            let expected = format!("one of each of {} worlds", grids.0);
-            return Err(invalid(py, "n_hits, n_burning", expected, "others"));
+            let expected = format!("one entry for each of {} worlds", grids.0);
+            return Err(invalid(py, "n_hits, n_burning", expected, "other lengths"));
         }
         let (n_worlds, n_robots, n_axes) = robots.dim();
         if n_worlds != grids.0 || n_robots == 0 || n_axes != 2 {
@@ -139,7 +139,7 @@ impl MeritTally {
     }
 }
 
-/// Where each robot ended; the first has visited all cells, which count for all of them together.
+/// Returns each robot's flight to its end cell. The first flight holds all visited cells, which count for the team.
 fn flights(visited: ArrayView2<'_, bool>, robots: ArrayView2<'_, i64>) -> Vec<Flight> {
     let cells = visited.iter().enumerate().filter(|(_, visited)| **visited);
     let mut all: Vec<usize> = cells.map(|(index, _)| index).collect();

@@ -1,4 +1,4 @@
-//! Model files: what Python's `Model` and `Description` hold.
+//! Model files and descriptions, read for Python's `Model` and `Description`.
 
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
@@ -13,7 +13,8 @@ use pyo3::types::{PyDict, PyTuple};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// The built-in files of a kind by name: `"models"`, `"tasks"`, or `"states"`, the descriptions of recorded states.
+/// Returns the text of each built-in file of a kind, by name. Kinds: `"models"`, `"tasks"`, and `"states"`, which are
+/// descriptions of recorded states.
 #[pyfunction]
 pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &'static str>> {
     match kind {
@@ -24,13 +25,13 @@ pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &
     }
 }
 
-/// The fields of a model file's model by name.
+/// Returns the fields of a model, read from a model file's text, by name.
 #[pyfunction]
 pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = model_of(text)?;
     let fields = described(py, &model)?;
     let views: Vec<_> = model.kernels().iter().map(|kernel| kernel.view()).collect();
-    let kernels = stack(Axis(0), &views).expect("invariant: kernels of one size");
+    let kernels = stack(Axis(0), &views).expect("invariant: kernels have one size");
     fields.set_item("kernels", kernels.to_pyarray(py))?;
     fields.set_item("bias", model.bias().to_pyarray(py))?;
     fields.set_item("initial", model.initial().to_pyarray(py))?;
@@ -43,7 +44,7 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     Ok(fields)
 }
 
-/// Height and width of the grid that a model file's maps are of; `None` if it has none, or is wrong.
+/// Returns the height and width of a model file's maps; `None` if the file has no maps, or is invalid.
 #[pyfunction]
 pub fn grid_of_maps(path: PathBuf) -> Option<(usize, usize)> {
     let model = Model::read(&path).ok()?;
@@ -52,21 +53,21 @@ pub fn grid_of_maps(path: PathBuf) -> Option<(usize, usize)> {
     map.grid().ok().map(|map| map.dim())
 }
 
-/// The text of a model file with the maps that stand beside it.
+/// Returns the text of a model file, with the maps from separate files included.
 #[pyfunction]
 pub fn model_text(path: PathBuf) -> PyResult<String> {
     let file = ModelFile::read(&path).map_err(refused)?;
     toml::to_string(&file).map_err(refused)
 }
 
-/// The text of a model file whose sensor sees so many rows and columns beyond the path.
+/// Returns the text of a model file with another sensor radius, in rows and columns beyond the path.
 #[pyfunction]
 pub fn model_with_radius(text: &str, radius: usize) -> PyResult<String> {
     let model = model_of(text)?.with_radius(radius).map_err(refused)?;
     toml::to_string(model.file()).map_err(refused)
 }
 
-/// The same of a description.
+/// Returns the text of a description with another sensor radius.
 #[pyfunction]
 pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
     let mut description: Description = toml::from_str(text).map_err(refused)?;
@@ -76,19 +77,19 @@ pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
     toml::to_string(&description).map_err(refused)
 }
 
-/// The fields of a description of recorded worlds by name.
+/// Returns the fields of a description of recorded worlds, by name.
 #[pyfunction]
 pub fn read_description<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = Description::model_of(text).map_err(refused)?;
     described(py, &model)
 }
 
-/// The model of a file's text.
+/// Parses a model from the text of a model file.
 pub fn model_of(text: &str) -> PyResult<Model> {
     Model::from_toml(text).map_err(refused)
 }
 
-/// The shape of a grid.
+/// Returns the shape of a grid, or the error of a side out of range.
 pub fn shape_of(py: Python<'_>, height: usize, width: usize) -> PyResult<Shape> {
     let expected = format!("height and width within 1 to {MAX_SIDE}");
     let got = format!("{height} x {width}");
@@ -121,7 +122,7 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     Ok(fields)
 }
 
-/// The fields of Python's `Airspace`.
+/// Returns the fields of Python's `Airspace`.
 fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
     let sensor = model.file().sensor.clone().unwrap_or_default();
     let fields = PyDict::new(py);

@@ -1,4 +1,4 @@
-//! Moves that a caller hands in: arrays of integers, which become bytes.
+//! Conversion of a caller's moves, which are arrays of integers, to bytes.
 
 use emberwatch_model::path::check_moves;
 use numpy::{
@@ -8,8 +8,8 @@ use numpy::{
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
-/// Paths of `n_moves` moves for `n_robots` robots as bytes; `None` if they are no plain array of usual integers, or wrong:
-/// `emberwatch/common/arguments.py` converts them, or says what is wrong.
+/// Returns paths of `n_moves` moves for `n_robots` robots as bytes. Returns `None` unless they are valid moves in a
+/// plain array of `int64` or `uint8`; then `emberwatch/common/arguments.py` converts them or raises an error.
 pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Option<Vec<u8>> {
     let expected = (n_robots, n_moves);
     let fast = read::<i64>(given, expected, |value| {
@@ -19,7 +19,7 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Optio
     check_moves(&moves).is_ok().then_some(moves)
 }
 
-/// As [`paths`], an array `[n_robots, n_moves]`.
+/// Like [`paths`], but returns an array `[n_robots, n_moves]`.
 #[pyfunction]
 pub fn moves<'py>(
     given: &Bound<'py, PyAny>,
@@ -33,7 +33,8 @@ pub fn moves<'py>(
     moves.transpose()
 }
 
-/// Integers below `n_choices`, one for each row, as bytes; `None` if they are no plain array of that.
+/// Returns integers below `n_choices`, one per row, as bytes; `None` unless they are valid and in a plain array of
+/// `int64`.
 #[pyfunction]
 pub fn choices<'py>(
     given: &Bound<'py, PyAny>,
@@ -54,7 +55,7 @@ fn read<T: Element + Copy>(
     (n_robots, n_moves): (usize, usize),
     byte: impl Fn(T) -> u8,
 ) -> Option<Vec<u8>> {
-    // Not of a subclass, which may mask values.
+    // Subclasses are not plain: they may mask values.
     let is_plain = given.get_type().is(PyUntypedArray::type_object(given.py()));
     let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
     let array = array?.ok()?;

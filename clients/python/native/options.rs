@@ -56,7 +56,7 @@ pub struct Spec<'py> {
     airspace: Given<'py>,
 }
 
-/// A model or a description.
+/// A Python `Model` or `Description`, as text.
 #[derive(FromPyObject)]
 struct Text {
     toml: String,
@@ -68,7 +68,7 @@ pub struct Options {
     /// Name of the estimator that keeps the beliefs.
     #[pyo3(get)]
     estimator: String,
-    /// What `prior` is computed from.
+    /// The kind and the model that `prior` is computed from.
     first: (Prior, Model),
     prior: OnceLock<Belief>,
     worlds: Owned<PlannedWorlds>,
@@ -146,7 +146,7 @@ impl Options {
         begun?.map_err(|error| raise(py, &error))
     }
 
-    /// Continues in a world with the belief that another agent left for the present step. Returns whether it fits.
+    /// Resumes in a world with the belief that another agent left for the present step. Returns whether it fits.
     fn take_over(&self, py: Python<'_>, world: usize, kind: &str, data: &[u8]) -> PyResult<bool> {
         self.worlds.with(py, |worlds| {
             let planned = worlds.world(world);
@@ -222,7 +222,7 @@ fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Mo
             None => "a server that hides its own",
         };
         let expected = format!(
-            "one for the estimator '{}', or a checkpoint of a learned belief",
+            "a model for the estimator '{}', or a checkpoint of a learned belief",
             estimator.label
         );
         return Err(invalid(py, "model", expected, got));

@@ -1,4 +1,4 @@
-//! Values that belong to the process that made them, and that one thread at a time uses.
+//! Values that belong to the process that made them, and that only one thread may use at a time.
 
 use crate::errors::{error, interrupted, raise_of_channel};
 use emberwatch_messages::errors::ChannelError;
@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// How often a thread that waits for another looks whether it was interrupted.
+/// Interval at which a thread that waits for another one checks for an interrupt.
 const INTERVAL: Duration = Duration::from_millis(5);
 
 /// A value that does not survive a fork: a server's channels, or worlds and their threads. A forked child gets an error
@@ -72,7 +72,7 @@ impl<T: Send> Owned<T> {
     /// forks by Python's hooks alone: call [`Self::check`] before work that other threads share.
     ///
     /// # Errors
-    /// As [`Self::with`].
+    /// Like [`Self::with`].
     pub fn with_briefly<R: Send>(
         &self,
         py: Python<'_>,
@@ -125,7 +125,7 @@ impl<T: Send> Owned<T> {
         Err(error(py, "EmberwatchError", (text, "forked")))
     }
 
-    /// The beginning of an error: what this is, and the verb in the singular or plural.
+    /// Returns the beginning of an error message: the subject, and its verb in the singular or plural.
     fn subject(&self, singular: &str, plural: &str) -> String {
         if self.instance == INSTANCE {
             format!("these worlds {plural}")
@@ -134,7 +134,7 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits for other threads; `None` if a signal handler raised.
+    /// Waits for other threads, then takes the value. Returns `None` if a signal handler raised an exception.
     fn take(&self) -> Option<Taken<'_, T>> {
         let mut slot = self.lock();
         loop {
@@ -163,7 +163,7 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits for a thread that uses the value, and drops it; `false` if `stops` ended the wait.
+    /// Waits for a thread that uses the value, then drops the value. Returns `false` if `stops` ended the wait.
     fn end(&self, stops: fn() -> bool) -> bool {
         let mut slot = self.lock();
         loop {
@@ -187,7 +187,8 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits until it is free, or for an interval: threads that give up may leave others unnotified.
+    /// Waits until the value is free, but at most one interval: a thread that gave up may have used up the
+    /// notification.
     fn wait(&self, slot: MutexGuard<'_, Slot<T>>) {
         let waited = self.freed.wait_timeout(slot, INTERVAL);
         drop(waited.unwrap_or_else(PoisonError::into_inner));
@@ -210,7 +211,7 @@ impl<T: Send> Drop for Taken<'_, T> {
 impl<T: Send> Drop for Owned<T> {
     fn drop(&mut self) {
         if self.pid == pid() {
-            // Not attached: what ends here may wait for another thread that needs the interpreter.
+            // Detached, because dropping the value may wait for another thread that needs the interpreter.
             let end = || self.end(|| false);
             if Python::try_attach(|py| py.detach(end)).is_none() {
                 end();
@@ -219,15 +220,15 @@ impl<T: Send> Drop for Owned<T> {
     }
 }
 
-/// This process's number; 0 until it is asked for.
+/// The cached id of this process; 0 before the first use.
 static PID: AtomicU32 = AtomicU32::new(0);
 
 fn pid() -> u32 {
     std::process::id()
 }
 
-/// This process's number, without a system call after the first one. A fork that does not run Python's hooks is not
-/// noticed: for what no thread of the parent takes part in.
+/// Returns the id of this process, with a system call only on the first use. Misses a fork that does not run Python's
+/// hooks, so it is only for work in which no other thread of the parent takes part.
 fn known_pid() -> u32 {
     match PID.load(Ordering::Relaxed) {
         0 => {
@@ -239,7 +240,7 @@ fn known_pid() -> u32 {
     }
 }
 
-/// Has a forked child ask for its number again.
+/// Clears the cached process id in a forked child.
 pub fn forget_pid() {
     PID.store(0, Ordering::Relaxed);
 }

@@ -1,4 +1,4 @@
-//! Worlds of one robot each with their beliefs and plans: updates them with frames, plans, and publishes beliefs.
+//! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
 
 use crate::answer::RESULT_BYTES;
 use crate::threads::{Pool, Threads};
@@ -82,15 +82,15 @@ impl PlannedWorlds {
         }
     }
 
-    /// The world with this number, if an episode has begun there.
+    /// Returns the world with this number, if an episode has begun there.
     pub fn world(&mut self, world: usize) -> Option<&mut Planned> {
         self.worlds.get_mut(world)?.as_mut()
     }
 
-    /// Begins episodes, given as world and seed, with a first belief.
+    /// Begins episodes with a first belief. `seeds` holds pairs of a world and its seed.
     ///
     /// # Errors
-    /// If a number is not of a world here, or a belief cannot be built.
+    /// If a world's number is out of range, or a belief cannot be built.
     pub fn begin(
         &mut self,
         seeds: impl Iterator<Item = (usize, u64)>,
@@ -115,7 +115,7 @@ impl PlannedWorlds {
     /// Updates beliefs with frames, and plans all options if `plans`.
     ///
     /// # Errors
-    /// If the arrays differ in length, a number is not of a world here, or a belief refuses its frame.
+    /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
     pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
         let n_cells = self.crew.shape().n_cells();
         observed.check(n_cells)?;
@@ -222,7 +222,7 @@ impl<'a> Observed<'a> {
             self.results.len() == n_worlds * RESULT_BYTES
                 && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells)
                 && self.flown.is_none_or(|it| it.len() == n_worlds),
-            "options: expected a result, a frame and an option for each of {n_worlds} worlds, got others"
+            "options: expected a result, a frame and an option for each of {n_worlds} worlds, got other lengths"
         );
         Ok(())
     }
@@ -289,8 +289,8 @@ impl WorldWork<'_> {
     }
 }
 
-/// Whether the work is too short to share between threads: that on a single world. Networks start threads themselves,
-/// which must be the pool's.
+/// Returns whether the work is too short to share between threads, as it is for a single world. Networks start threads
+/// themselves, which must be the pool's.
 fn is_short(crew: &Crew, n_worlds: usize) -> bool {
     n_worlds == 1 && *crew.estimator() != NEURAL
 }

@@ -15,17 +15,17 @@ use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonl
 use pyo3::prelude::*;
 use std::time::{Duration, Instant};
 
-/// Widest beam.
+/// Maximum width of a beam.
 const MAX_WIDTH: usize = 1 << 16;
 
-/// Most memory of a beam, bytes.
+/// Maximum memory of a beam, in bytes.
 const MAX_BYTES: usize = 1 << 32;
 
-/// How often a search looks for Ctrl-C.
+/// Interval at which a search checks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// A path for each world: `values` are finite, `[n, H, W]`, `robots` cells of the grid, `[n, 2]`; `keys`, `[n]`, break
-/// ties.
+/// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots`, `[n, 2]`, are cells of the grid; `keys`,
+/// `[n]`, break ties.
 #[pyfunction]
 #[pyo3(signature = (values, robots, keys, n_moves, width, airspace=None))]
 pub fn beam_search<'py>(
@@ -44,7 +44,7 @@ pub fn beam_search<'py>(
         None => Airspace::open(shape),
         Some(given) => given.on_grid(py, shape)?,
     };
-    // More states than there are beginnings of paths are never kept.
+    // A beam never keeps more states than there are paths.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
     check(py, &airspace, n_moves, (width, width.min(n_paths)))?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
@@ -79,7 +79,7 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Values of the cells on the path, or of those in sight of it where these pay.
+/// Returns the values of the cells on a path, or of all cells in sight of it if the sensor pays for seen cells.
 fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
     match airspace.pays() {
         Pays::Seen => CellValues::in_sight_of(airspace, values),
@@ -87,14 +87,14 @@ fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
     }
 }
 
-/// Refuses what takes more memory than there may be.
+/// Refuses arguments out of range, and beams that need more memory than allowed or available.
 fn check(
     py: Python<'_>,
     airspace: &Airspace,
     n_moves: usize,
     (width, n_kept): (usize, usize),
 ) -> PyResult<()> {
-    let within = |most: usize| format!("an integer within 1 to {most}");
+    let within = |max: usize| format!("an integer within 1 to {max}");
     if !(1..=MAX_MOVES).contains(&n_moves) {
         return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
     }
@@ -105,7 +105,7 @@ fn check(
         Pays::Visited => 0,
         Pays::Seen => set_bytes(airspace.radius()),
     };
-    // Sets of cells before and after a move, and where the state after each move came from.
+    // Each state has sets of cells, before and after a move, and a link to its predecessor for each move.
     let state_bytes = 2 * (set_bytes(0) + sight_bytes) + n_moves * 8;
     let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
     if !(1..=widest).contains(&width) {

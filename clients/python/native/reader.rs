@@ -1,4 +1,4 @@
-//! Readers of what servers and agents publish.
+//! Subscribers to the channels on which servers and agents publish.
 
 use crate::connection::{checked, duration};
 use crate::errors::{error, raise_of_channel};
@@ -13,16 +13,16 @@ use pyo3::prelude::*;
 use std::collections::HashMap;
 use std::time::Instant;
 
-/// A reader of one channel.
+/// A subscription to one channel.
 struct Reading<H: Header> {
     observer: Observer<H>,
-    /// Samples of others are left out; `None`: of all worlds.
+    /// The only world whose samples are returned; `None` for all worlds.
     world: Option<u32>,
     /// The next sequence number of each publisher.
     next: HashMap<u32, u64>,
 }
 
-/// A sample, and how many were lost before it.
+/// A sample, and the number of samples lost before it.
 type Read<H> = Result<Option<(Sample<H>, u64)>, ChannelError>;
 
 impl<H: Header + Published> Reading<H> {
@@ -53,7 +53,7 @@ impl<H: Header + Published> Reading<H> {
             };
             let header = &sample.header;
             let next = self.next.insert(header.publisher(), header.sequence() + 1);
-            // A smaller number than expected is a new server's.
+            // A number smaller than expected means that the server is new.
             n_lost += next.map_or(0, |next| header.sequence().saturating_sub(next));
             if self.world.is_none_or(|world| world == header.world()) {
                 return Ok(Some((sample, n_lost)));
@@ -82,7 +82,7 @@ fn wrong(py: Python<'_>, problem: &str) -> PyErr {
 
 macro_rules! reader {
     ($name:ident, $header:ty, $open:expr, $decode:expr) => {
-        #[doc = "A subscriber of one channel; see `_native.pyi`."]
+        #[doc = "A subscriber to one channel; see `_native.pyi`."]
         #[pyclass(frozen, module = "emberwatch._native")]
         pub struct $name(Owned<Reading<$header>>);
 

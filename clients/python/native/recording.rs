@@ -10,7 +10,7 @@ use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-/// What is known of a record: nanoseconds, its kind, and JSON or the fields of a sample.
+/// A record: its time in nanoseconds, its kind, and its JSON text or the fields of its sample.
 type Item<'py> = (u64, &'static str, Bound<'py, PyAny>);
 
 /// An open recording.
@@ -25,7 +25,7 @@ impl Recording {
     #[new]
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let name = path.display().to_string();
-        // Opening a FIFO waits for its writer, and no signal ends that.
+        // Opening a FIFO would wait for its writer, and no signal would end the wait.
         if !py.detach(|| std::fs::metadata(&path))?.is_file() {
             return Err(invalid(py, "recording", "a regular file", name));
         }
@@ -37,7 +37,7 @@ impl Recording {
         })
     }
 
-    /// The next record; `None` at the end.
+    /// Returns the next record; `None` at the end.
     fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<Item<'py>>> {
         let record = py.detach(|| {
             let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
@@ -69,7 +69,8 @@ fn item(py: Python<'_>, record: Record) -> PyResult<Item<'_>> {
     Ok((record.nanos, kind, value))
 }
 
-/// The error of a file that is no recording, or ends with a `problem`: then its code is "cut" or "damaged".
+/// Makes the error of a file that could not be read. Its code is "cut" for a recording that ends early, "damaged" for a
+/// damaged one, and "recording" for any other file.
 fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
     let text = format!("{name}: {problem}");
     let code = match problem {

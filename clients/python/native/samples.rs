@@ -1,4 +1,4 @@
-//! What servers and agents publish, as the fields of `Frame`, `Truth` and `Outlook` in `emberwatch/client/observer.py`.
+//! Conversion of published samples to the fields of `Frame`, `Truth` and `Outlook` in `emberwatch/client/observer.py`.
 
 use emberwatch_messages::agent_belief::AgentBelief;
 use emberwatch_messages::message::{
@@ -13,7 +13,7 @@ use pyo3::prelude::*;
 pub type WorldRow = (u64, u64, u64, f64, u64, u64, u32, u32, u32, u16, u16);
 pub type Robot = (f64, f64, u32, u32, u32, u32, u32, u32, u32, u32);
 
-/// Its result, what it saw, and the path that it flew.
+/// A robot's result, its frame, and the path that it flew.
 type RobotFrame<'py> = (Robot, Bound<'py, PyArray2<u8>>, Bound<'py, PyArray1<u8>>);
 
 #[derive(IntoPyObject)]
@@ -51,12 +51,12 @@ pub struct Outlook<'py> {
     n_lost: u64,
 }
 
-/// What all samples' headers have.
+/// The fields that the headers of all samples share.
 pub trait Published {
     fn version(&self) -> u32;
     fn world(&self) -> u32;
     fn sequence(&self) -> u64;
-    /// The number of the process that counts them, if there may be several.
+    /// The id of the process that numbers the samples; 0 where only the server does.
     fn publisher(&self) -> u32;
 }
 
@@ -87,7 +87,7 @@ published!(FrameHeader, |_| 0);
 published!(TruthHeader, |_| 0);
 published!(AgentHeader, |header| header.pid);
 
-/// Refuses a sample of another version.
+/// Refuses a sample of another protocol version.
 pub fn check_version(header: &impl Published) -> Result<(), String> {
     match header.version() {
         VERSION => Ok(()),
@@ -139,7 +139,7 @@ pub fn truth<'py>(
     })
 }
 
-/// The hidden states of a world in this process.
+/// Returns the hidden states of a world in this process.
 pub fn truth_of<'py>(
     py: Python<'py>,
     world: usize,
@@ -180,7 +180,7 @@ pub fn outlook<'py>(
     })
 }
 
-/// The fields of `WorldResult`.
+/// Returns the fields of `WorldResult`.
 pub fn of_world(it: &WorldResult) -> WorldRow {
     (
         it.step,
@@ -197,7 +197,7 @@ pub fn of_world(it: &WorldResult) -> WorldRow {
     )
 }
 
-/// The fields of `RobotResult`.
+/// Returns the fields of `RobotResult`.
 pub fn of_robot(it: &RobotResult) -> Robot {
     (
         it.reward,

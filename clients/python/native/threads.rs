@@ -20,7 +20,7 @@ pub enum Threads {
 
 impl Pool {
     /// Runs `work` on the threads of the pool, which the first call in a process starts. With `is_short`, runs it on
-    /// this thread: handing it to another would cost more than it gains.
+    /// this thread: sharing such short work would cost more time than it saves.
     pub fn work<R: Send>(&mut self, is_short: bool, work: impl FnOnce(Threads) -> R + Send) -> R {
         if is_short {
             return work(Threads::One);

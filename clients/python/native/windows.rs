@@ -13,20 +13,22 @@ use pyo3::types::PyType;
 
 type Arguments = (usize, usize, usize, usize, usize, Py<PyAny>);
 
-/// The last channels, after those about the world: visited by this path; off the grid or no-fly; share of the path left.
+/// Number of channels about the path, which follow the channels about the world: cells that this path has visited,
+/// cells off the grid or no-fly, and the share of the path that is left.
 const N_OF_PATH: usize = 3;
 
-/// Maps of many robots, in rows, each with a margin around the grid so that every window is a part of it.
+/// Maps of many robots, one row per robot. Each map has a margin around the grid, so that every window is a part of the
+/// map.
 #[pyclass(module = "emberwatch._native")]
 pub struct Windows {
     shape: Shape,
     side: usize,
     n_channels: usize,
     n_rows: usize,
-    /// Rows and columns from a robot to the cells that its visit has pay.
+    /// Radius, in rows and columns, of the cells that pay when a robot visits a cell.
     reach: usize,
     maps: Vec<u8>,
-    /// Python's, which it was made of.
+    /// The Python `Airspace` that this was built from.
     given: Py<PyAny>,
 }
 
@@ -64,7 +66,7 @@ impl Windows {
         Ok(windows)
     }
 
-    /// A copy shows nothing.
+    /// Returns the class and its arguments, for copies and pickles. A copy starts with empty maps.
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, Arguments) {
         let this = slf.borrow();
         let (height, width) = this.shape.dim();
@@ -74,7 +76,8 @@ impl Windows {
         (slf.get_type(), arguments)
     }
 
-    /// Shows the world, `[n_begun, H, W, n_of_world]`, to robots that have visited nothing.
+    /// Begins the paths of the rows marked in `begun`: sets their world channels to `shown`,
+    /// `[n_begun, H, W, n_of_world]`, and clears their visited cells.
     fn begin(
         &mut self,
         begun: PyReadonlyArray1<'_, bool>,
@@ -85,7 +88,7 @@ impl Windows {
         let n_of_world = self.n_channels - N_OF_PATH;
         let n_begun = begun.iter().filter(|it| **it).count();
         if begun.len() != self.n_rows || shown.dim() != (n_begun, height, width, n_of_world) {
-            let words = "begin: expected one of each row, and the world of those that begin";
+            let words = "begin: expected one flag per row, and a world for each row that begins";
             return Err(PyValueError::new_err(words));
         }
         let rows = (0..self.n_rows).filter(|&row| begun[row]);
@@ -103,11 +106,12 @@ impl Windows {
         Ok(())
     }
 
-    /// Some robots have made a move: nothing is left to be found where a path has been, or has seen where that pays.
+    /// Updates the maps of the rows marked in `moved`: marks each robot's cell as visited, and clears the world
+    /// channels of all cells that have paid, as nothing is left to be found there.
     fn visit(&mut self, flights: &Flights, moved: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let moved = moved.as_array();
         if moved.len() != self.n_rows || flights.cells().len() != self.n_rows {
-            return Err(PyValueError::new_err("visit: expected one of each row"));
+            return Err(PyValueError::new_err("visit: expected one flag per row"));
         }
         let (height, width) = self.shape.dim();
         let (reach, n_of_world) = (self.reach, self.n_channels - N_OF_PATH);
@@ -125,14 +129,14 @@ impl Windows {
         Ok(())
     }
 
-    /// The windows of all robots, `[n_rows, side, side, channels]`; a new array.
+    /// Returns the windows of all robots, `[n_rows, side, side, channels]`, as a new array.
     fn around<'py>(
         &self,
         py: Python<'py>,
         flights: &Flights,
     ) -> PyResult<Bound<'py, PyArray4<u8>>> {
         if flights.cells().len() != self.n_rows {
-            let (expected, got) = (self.n_rows, flights.cells().len());
+            let (expected, got) = (format!("{} rows", self.n_rows), flights.cells().len());
             return Err(invalid(py, "flights", expected, got));
         }
         let n_bytes = self.side * self.n_channels;
@@ -155,7 +159,7 @@ impl Windows {
 }
 
 impl Windows {
-    /// Marks the margin and the no-fly cells.
+    /// Marks the margin and the no-fly cells as off limits.
     fn mark_off(&mut self, airspace: &Airspace) {
         let off = self.n_channels - 2;
         let cells = self.maps.iter_mut().skip(off).step_by(self.n_channels);
@@ -169,13 +173,13 @@ impl Windows {
         }
     }
 
-    /// Where the maps have a cell of the grid.
+    /// Returns the index in the maps of a cell of the grid.
     fn index(&self, row: usize, cell: Cell) -> usize {
         let margin = self.side / 2;
         self.padded(row, cell.row + margin, cell.col + margin)
     }
 
-    /// Where the maps have a cell, counted from the margin's corner.
+    /// Returns the index in the maps of a cell whose row and column count from the margin's corner.
     fn padded(&self, row: usize, y: usize, x: usize) -> usize {
         let (height, width) = self.shape.dim();
         let (height, width) = (height + self.side - 1, width + self.side - 1);

@@ -1,4 +1,5 @@
-//! What needs a server's shared memory: connections, observers, and the channel on which beliefs are shown.
+//! The parts that need a server's shared memory: connections, observers, and the channel on which beliefs are
+//! published.
 
 #[cfg(not(target_os = "linux"))]
 mod without;

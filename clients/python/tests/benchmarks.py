@@ -1,4 +1,4 @@
-"""Worlds of the tests of `emberwatch.benchmark`."""
+"""Worlds for the tests of `emberwatch.benchmark`."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 4, "model": LIVELY
 
 
 def wall(folder: Path) -> Path:
-    """A model with a wall in which there is one gap, so that masks matter."""
+    """Returns a model whose no-fly cells form a wall with one gap, so that masks matter."""
     closed = np.zeros((7, 9), int)
     closed[:, 4], closed[3, 4] = 1, 0
     path = folder / "wall.toml"

@@ -1,4 +1,4 @@
-"""A deadline for each test, and the end of what it opened."""
+"""Gives each test a deadline, and closes what the test opened."""
 
 import os
 import signal
@@ -11,30 +11,30 @@ import pytest
 from hypothesis import settings
 from processes import at_the_end
 
-# A busy machine is no bug: the deadline below is enough.
+# A busy machine is not a bug: only the deadline below applies.
 settings.register_profile("emberwatch", deadline=None)
 settings.load_profile("emberwatch")
 
-# A shell may start this with signals ignored, which children would inherit.
+# A shell may start pytest with signals ignored, and children would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-# Programs that pip has installed next to Python.
+# Finds programs that pip installed next to Python.
 os.environ["PATH"] += os.pathsep + str(Path(sys.executable).parent)
 
-# Not the user's; here nothing can be kept.
+# Replaces the user's cache folder by one that cannot be written.
 os.environ["XDG_CACHE_HOME"] = "/dev/null"
 
-# More threads would wait for each other in PyTorch's networks as small as those here.
+# PyTorch's networks are so small here that more threads would only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-#: A whole test, seconds.
+#: Deadline of a whole test, in seconds.
 DEADLINE = 300
 
 
 @pytest.fixture(autouse=True)
 def deadline() -> Iterator[None]:
-    """A test that hangs fails; what it opened is closed."""
+    """Fails a test that hangs, and closes what the test opened."""
 
     def late(_number: int, _frame: FrameType | None) -> None:
         raise TimeoutError(f"still running after {DEADLINE} s")
@@ -51,6 +51,6 @@ def deadline() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows open in memory."""
+    """Opens windows in memory instead of on a screen."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")

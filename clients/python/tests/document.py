@@ -28,7 +28,7 @@ class Layout(NamedTuple):
 
 
 def layouts() -> dict[str, Layout]:
-    """Every struct of section 3 by name."""
+    """Returns every struct of section 3 by name."""
     heading = r"^### (\w+): `(.+?)`, (\d+) bytes, alignment (\d+), struct `(.+?)`$"
     found: dict[str, Layout] = {}
     for match in re.finditer(heading, PROTOCOL, re.MULTILINE):
@@ -40,7 +40,7 @@ def layouts() -> dict[str, Layout]:
 
 
 def table(header: str) -> list[list[str]]:
-    """The cells of each row of the one table whose header line begins like this."""
+    """Returns the cells of each row of the only table whose header line begins with `header`."""
     assert PROTOCOL.count(f"\n{header}") == 1
     return _rows(PROTOCOL, header)
 
@@ -55,7 +55,7 @@ def examples() -> list[dict[str, Any]]:
 
 
 def worked_example(name: str) -> tuple[bytes, list[tuple[str, str]]]:
-    """A message of section 12: its bytes, and the names and values that stand beside them."""
+    """Returns a message of section 12: its bytes, and the names and values next to them."""
     found = re.search(rf"^```hex {name}\n(.*?)^```", PROTOCOL, re.MULTILINE | re.DOTALL)
     assert found
     message, values = b"", list[tuple[str, str]]()

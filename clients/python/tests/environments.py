@@ -1,4 +1,4 @@
-"""What the tests of the environments share: small worlds, servers, comparisons."""
+"""Helpers for the tests of the environments: small worlds, servers, comparisons."""
 
 import contextlib
 import dataclasses
@@ -15,22 +15,22 @@ WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
 OBJECTIVE = "emberwatch/WildfireObjective-v1"
 
-#: Of its worlds every seed and every step looks different.
+#: A model whose worlds look different at every seed and every step.
 LIVELY = str(Path(__file__).with_name("lively.toml"))
 
 #: A description of recorded worlds.
 RECORDED = Path(__file__).with_name("recorded.toml")
 
-#: Keywords of a small world.
+#: Keyword arguments of a small world.
 SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "model": LIVELY}
 
-#: The same as a server names them.
+#: The same settings by the names of a server's flags.
 FLAGS: dict[str, Any] = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY}
 
 
 @contextlib.contextmanager
 def serving(**flags: object) -> Iterator[str]:
-    """The instance name of a server of `SMALL` worlds; `flags` as on its command line."""
+    """Starts a server of `SMALL` worlds with `flags`. Returns its instance name."""
     with contextlib.closing(Server(**{**FLAGS, **flags}, ready=False)) as started:
         yield started.instance
 
@@ -45,18 +45,18 @@ def closed_later(env: Any) -> Any:
 
 
 def make(name: str = WILDFIRE, **keywords: Any) -> Any:
-    """`gymnasium.make` of a small world, or with `instance` of a running server's."""
+    """Calls `gymnasium.make` for a small world, or with `instance` for a server's world."""
     return closed_later(gymnasium.make(name, **_usual(name, keywords)))
 
 
 def make_vec(n_worlds: int, name: str = WILDFIRE, **keywords: Any) -> Any:
-    """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
+    """Calls `gymnasium.make_vec` for small worlds, or with `instance` for a server's worlds."""
     return closed_later(gymnasium.make_vec(name, num_envs=n_worlds, **_usual(name, keywords)))
 
 
 @contextlib.contextmanager
 def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
-    """Calls of an environment wait no longer than that."""
+    """Limits the time that calls of an environment wait."""
     session = env.unwrapped._session
     kept = session.settings
     session.settings = dataclasses.replace(kept, timeout=seconds)
@@ -71,30 +71,30 @@ def _usual(name: str, keywords: dict[str, Any]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def no_warnings() -> Iterator[None]:
-    """Warnings are errors; Gymnasium's logger warns that way too."""
+    """Turns warnings into errors, including those of Gymnasium's logger."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Not what these tests are about: the smallest worlds may hold nothing to find.
+        # Irrelevant to these tests: the smallest worlds may hold nothing to find.
         warnings.filterwarnings("ignore", "no cell of world")
-        # Rewards, and so features of plans, have no bounds; plans side by side are no picture.
+        # Rewards and features of plans are unbounded, and a table of plans is not an image.
         warnings.filterwarnings("ignore", ".*Box observation space (min|max)imum value is")
         warnings.filterwarnings("ignore", "Your observation  has an unconventional shape")
         yield
 
 
 def actions(env: Any, n_steps: int, seed: int = 0) -> list[Any]:
-    """Random actions of an environment, the same for the same seed."""
+    """Yields random actions of an environment, which depend only on the seed."""
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(n_steps)]
 
 
 def rollout(env: Any, n_steps: int, *, seed: int | None, actions_seed: int = 0) -> list[Any]:
-    """What a reset and so many random steps return."""
+    """Returns the results of a reset and `n_steps` random steps."""
     return [env.reset(seed=seed), *map(env.step, actions(env, n_steps, actions_seed))]
 
 
 def assert_same(left: object, right: object, where: str = "") -> None:
-    """Equal in every field: types, keys, dtypes, shapes and values."""
+    """Asserts that two values have the same types, keys, dtypes, shapes and values."""
     assert type(left) is type(right), f"{where}: {type(left)} and {type(right)}"
     if isinstance(left, Mapping) and isinstance(right, Mapping):
         assert set(left) == set(right), f"{where}: {sorted(left)} and {sorted(right)}"

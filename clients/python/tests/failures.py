@@ -1,4 +1,4 @@
-"""What the tests expect to fail, by the error's code."""
+"""Context managers that expect an error, by its code or its message."""
 
 import pytest
 

@@ -1,7 +1,7 @@
-"""Episodes of `WildfireObjective-v1` that were recorded when a process of its own planned them.
+"""Recorded episodes of `WildfireObjective-v1`, which were planned by a separate process.
 
-`data/options.npz` has them, and the checkpoints of the learned beliefs: two filters and a network,
-which learned 80 steps of such worlds; the network's weights are rounded to 16 bits.
+`data/options.npz` holds the episodes, and the checkpoints of the learned beliefs: two filters and a
+network, trained for 80 steps in these worlds. The network's weights are rounded to 16 bits.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 FILE = Path(__file__).with_name("data") / "options.npz"
 
-#: Of all of them.
+#: Settings of all worlds.
 WORLD: dict[str, Any] = {
     "model": "wildfire-small",
     "height": 16,
@@ -23,7 +23,7 @@ WORLD: dict[str, Any] = {
     "burn_in": 100,
 }
 
-#: What keeps the belief, and how it begins.
+#: The estimator of each belief, and its prior.
 BELIEFS: dict[str, dict[str, Any]] = {
     "known_model": {"estimator": "known_model"},
     "known_model, initial": {"estimator": "known_model", "prior": "initial"},
@@ -43,7 +43,7 @@ N_WORLDS = 3
 
 
 def episode(env: Any) -> dict[str, NDArray[Any]]:
-    """What one environment shows: a reset and some steps."""
+    """Returns what one environment shows over a reset and some steps."""
     choices = np.random.default_rng(46).integers(0, 8, N_STEPS)
     observation, info = env.reset(seed=1000)
     seen, told = [observation], [[info["step"], info["n_visited"], 0]]
@@ -55,7 +55,10 @@ def episode(env: Any) -> dict[str, NDArray[Any]]:
 
 
 def episodes(envs: Any) -> dict[str, NDArray[Any]]:
-    """What many show whose episodes last four steps, in mode `DISABLED`, with resets of some."""
+    """Returns what a vector environment shows in mode `DISABLED`, with resets of some worlds.
+
+    Episodes last four steps.
+    """
     choices = np.random.default_rng(47).integers(0, 8, (N_STEPS, N_WORLDS))
     observations, infos = envs.reset(seed=[7, 1000, 12])
     seen, told = [observations], [[infos["step"], infos["n_visited"], np.zeros(N_WORLDS)]]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Cells = NDArray[np.bool_]
 
-#: Robots see exactly, and know by how far away a cell is seen.
+#: A ring whose observations are exact, and differ from the observations of other rings.
 RING = {"observed_as": np.eye(3).tolist()}
 
 #: Cells of a 7 x 5 grid where no robot may be; the corner (0, 4) has no way out.
@@ -37,7 +37,7 @@ def model(
     no_fly: Cells | str | None = None,
     zone_map: NDArray[np.uint8] | str | None = None,
 ) -> str:
-    """The text of a model whose sensor sees exactly; maps may be names of files beside it."""
+    """Returns the text of a model with an exact sensor. Maps may be names of files next to it."""
     keys = [f'sensor = {{ radius = {radius}, pays = "{pays}", rings = [']
     keys += [f"{{ observed_as = {RING['observed_as']} }}," for _ in range(1, n_rings)]
     keys += ["] }"]
@@ -76,7 +76,7 @@ def cells_of(start: Sequence[int], moves: Sequence[int], no_fly: Cells) -> list[
 def rings_of(
     cells: Sequence[tuple[int, int]], shape: tuple[int, int], radius: int, n_rings: int
 ) -> dict[tuple[int, int], int]:
-    """The matrix by which each cell in sight of some is seen."""
+    """Returns the ring (index of the observation matrix) of each cell in sight of `cells`."""
     seen: dict[tuple[int, int], int] = {}
     for at in np.ndindex(shape):
         distance = min(max(abs(at[0] - row), abs(at[1] - col)) for row, col in cells)
@@ -86,7 +86,7 @@ def rings_of(
 
 
 def legal_moves(cell: tuple[int, int], no_fly: Cells) -> list[bool]:
-    """Which moves leave a cell; all, if none does."""
+    """Returns which moves leave a cell; all moves if none does."""
     leaves = [cells_of(cell, [move], no_fly)[1] != cell for move in range(4)]
     return leaves if any(leaves) else [True] * 4
 

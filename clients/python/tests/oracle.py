@@ -1,4 +1,4 @@
-"""A model's mathematics in NumPy as the paper has it: what the tests compare the filter with."""
+"""The paper's equations in NumPy, with which the tests compare the filter."""
 
 import tomllib
 from typing import Any, NamedTuple
@@ -10,13 +10,13 @@ Array = NDArray[np.float64]
 
 
 class Parameters(NamedTuple):
-    #: ``w[own, to, from, row, col]``; one kernel, or one by the cell's own state; as many by zone.
+    #: ``w[own, to, from, row, col]``: one kernel, or one per state of the cell itself, per zone.
     kernels: Array
     bias: Array
-    #: ``P(observed value | state)``, a row for each state, ring by ring.
+    #: ``P(observed value | state)``: a row per state; the columns of the rings follow each other.
     observed: Array
     initial: Array
-    #: The zone of each cell, if there are several.
+    #: The zone of each cell, if the model has zones.
     zones: NDArray[np.uint8] | None
 
 
@@ -47,7 +47,7 @@ def parameters(text: str) -> Parameters:
 
 
 def phi(model: Parameters, belief: Array) -> Array:
-    """Eqs. 2-4; where the kernel is by the cell's own state, the mean over its belief."""
+    """Predicts (eqs. 2-4). Kernels by the cell's own state are averaged over its belief."""
     if model.zones is not None:
         of_zones = np.split(model.kernels, int(model.zones.max()) + 1)
         parts = [phi(model._replace(kernels=of, zones=None), belief) for of in of_zones]
@@ -73,7 +73,7 @@ def _phi_of(kernel: Array, bias: Array, belief: Array, own: int | None = None) -
 
 
 def bayes(model: Parameters, belief: Array, frame: NDArray[np.uint8]) -> Array:
-    """Eq. 5 in the cells that were observed; 255 stands for none."""
+    """Corrects the observed cells (eq. 5); 255 marks the other cells."""
     posterior = belief.copy()
     for row, col in np.argwhere(frame != 255):
         joint = model.observed[:, frame[row, col]] * belief[:, row, col]

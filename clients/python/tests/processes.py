@@ -1,4 +1,4 @@
-"""Servers and scripts as child processes: on instances of their own, with deadlines."""
+"""Servers and scripts as child processes, each on its own instance and with a deadline."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from emberwatch.client.client import Client, connect
 from emberwatch.client.replies import ServerStatus
 from emberwatch.errors import EmberwatchError, NoServerError
 
-#: How long anything may take that should take milliseconds, seconds.
+#: Maximum time, in seconds, of operations that should take milliseconds.
 PATIENCE = 20.0
 
-#: The timeout of a wait that ends for another reason, seconds.
+#: Timeout, in seconds, of a wait that should end for another reason.
 LONG = 5 * PATIENCE
 
 #: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 
-#: Where iceoryx2 keeps files of nodes and services.
+#: Where iceoryx2 keeps the files of nodes and services.
 CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
-#: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
+#: Closes what a test has opened, in reverse order; `conftest.py` calls it.
 at_the_end = ExitStack()
 
 
@@ -50,7 +50,7 @@ def unused_instance() -> str:
 
 
 class Program:
-    """One of our programs in a process of its own, which ends with this process at the latest."""
+    """One of our programs in a child process, which ends with this process at the latest."""
 
     def __init__(self, name: str, *arguments: str) -> None:
         self._output = tempfile.TemporaryFile()
@@ -65,12 +65,12 @@ class Program:
         self.pid = self.process.pid
 
     def output(self) -> str:
-        """Everything that it has printed, without times and levels."""
+        """Returns everything that the program has printed, without times and levels."""
         self._output.seek(0)
         return re.sub(r"(?m)^\S+Z +[A-Z]+ ", "", self._output.read().decode()).strip()
 
     def ended(self) -> str:
-        """What it has printed, once it has ended by itself."""
+        """Waits until the program ends by itself. Returns what it has printed."""
         self.process.wait(PATIENCE)
         return self.output()
 
@@ -93,7 +93,7 @@ class Server:
     """A running server and the connections to it."""
 
     def __init__(self, instance: str | None = None, *, ready: bool = True, **flags: object) -> None:
-        """Waits until it answers and its worlds are ready; flags of None are left out."""
+        """Waits until the server answers and its worlds are ready. Omits flags that are None."""
         self.instance = instance or unused_instance()
         arguments: list[str] = []
         for name, value in {"instance": self.instance, **flags}.items():
@@ -118,7 +118,7 @@ class Server:
             raise
 
     def _shut_down(self) -> None:
-        """Asks it to stop: quicker than a signal, which it hears when it next looks around."""
+        """Asks the server to stop. This is quicker than a signal, which it notices only later."""
         with suppress(EmberwatchError):
             self._client.shutdown(timeout=1.0)
 
@@ -136,7 +136,7 @@ class Server:
         assert eventually(lambda: _state(self.program.pid) == "T")
 
     def wake_up(self) -> None:
-        """Lets it go on, if it still runs."""
+        """Continues a stopped server, if it is still alive."""
         if self.program.process.poll() is None:
             self.signal(signal.SIGCONT)
 
@@ -149,10 +149,10 @@ class Server:
 
 
 class Script:
-    """A Python process that runs some code; killed at the end."""
+    """A Python process that runs some code, and is killed at the end of the test."""
 
     def __init__(self, code: str, *arguments: object) -> None:
-        """Starts it; `sys.argv[1:]` are the arguments."""
+        """Starts the process, with the arguments in `sys.argv[1:]`."""
         self._process = subprocess.Popen(
             [sys.executable, "-c", code, *map(str, arguments)],
             stdin=subprocess.PIPE,
@@ -164,7 +164,7 @@ class Script:
         self.pid = self._process.pid
 
     def line(self) -> str:
-        """The next line that it prints."""
+        """Returns the next line that the process prints."""
         late = threading.Timer(3 * PATIENCE, self._process.kill)
         late.start()
         line = self._process.stdout.readline()
@@ -180,7 +180,7 @@ class Script:
         os.killpg(self.pid, number)
 
     def end(self) -> tuple[int, str, str]:
-        """Waits for its end: exit code, and what else it printed."""
+        """Waits for the end. Returns the exit code and the rest of the output."""
         out, err = self._process.communicate(timeout=3 * PATIENCE)
         return self._process.returncode, out, err
 
@@ -189,12 +189,12 @@ class Script:
         self._process.communicate()
 
 
-#: Runs a command; returns how it ended.
+#: A function that runs a command and returns its completed process.
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def isolated(options: str, *, pids: bool = False) -> Run:
-    """Runs commands with a `/dev/shm` of their own; skips the test where none may be made."""
+    """Runs commands with a private `/dev/shm`; skips the test if mounts are not allowed."""
     unshare = ["unshare", "-m", *([] if os.getuid() == 0 else ["-r"]), "sh", "-c"]
 
     def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -209,7 +209,7 @@ def isolated(options: str, *, pids: bool = False) -> Run:
 
 
 def eventually(holds: Callable[[], bool], limit: float = PATIENCE) -> bool:
-    """Looks every millisecond until something holds; whether it did in time."""
+    """Checks a condition every millisecond. Returns whether it held in time."""
     end = time.monotonic() + limit
     while not holds():
         if time.monotonic() > end:
@@ -227,7 +227,7 @@ def _state(pid: int) -> str:
 
 
 def asleep(thread: threading.Thread | int | None = None) -> None:
-    """Waits until the main thread, another, or a process sleeps, as on an answer."""
+    """Waits until a thread or process (default: the main thread) sleeps, as when it waits."""
     thread = thread or threading.main_thread()
     number = thread if isinstance(thread, int) else thread.native_id
     place = Path(f"/proc/{number}/task/{number}/stat")
@@ -244,10 +244,10 @@ def asleep(thread: threading.Thread | int | None = None) -> None:
 
 @contextmanager
 def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo[BaseException]]:
-    """Interrupts what the main thread does in this context, once `wait` has returned."""
+    """Sends Ctrl-C to the main thread inside this context, once `wait` has returned."""
 
     def interrupt() -> None:
-        # Otherwise there is no Ctrl-C, and the main thread's own timeout fails the test.
+        # If this fails, no Ctrl-C is sent, and the main thread's timeout fails the test.
         assert wait() is not False
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -261,14 +261,14 @@ def ctrl_c(wait: Callable[[], object] = asleep) -> Iterator[pytest.ExceptionInfo
 def services(instance: str) -> list[Path]:
     found = []
     for path in (CHANNELS / "services").iterdir():
-        with suppress(FileNotFoundError):  # of a program that ends now
+        with suppress(FileNotFoundError):  # removed by a program that ends now
             if f"/{instance}/" in path.read_text(errors="replace"):
                 found.append(path)
     return found
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:
-    """What calls return that wait for each other, each on a thread of its own."""
+    """Runs calls that wait for each other on one thread each. Returns their results."""
     results: list[Any] = [None] * len(calls)
 
     def run(index: int) -> None:

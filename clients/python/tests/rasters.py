@@ -1,4 +1,4 @@
-"""Small rasters of fires for the tests of the importer, in each format it reads."""
+"""Small rasters of fires for the tests of the importer, in each format that it reads."""
 
 import math
 import tomllib
@@ -17,7 +17,7 @@ NEVER = -9999.0
 #: Minutes until each cell of a 3 x 4 grid begins to burn.
 ARRIVAL = np.array([[0, 10, 20, NEVER], [10, 20, 35, NEVER], [NEVER, 30, 40, 50]])
 UTM = "EPSG:32610"
-#: Metres: on cells of 30 m, 10 degrees up to the east.
+#: Elevation in metres that rises by 10 degrees to the east on cells of 30 m.
 EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
 
 
@@ -69,7 +69,7 @@ def netcdf(
     over: tuple[str, str, str] = ("time", "y", "x"),
     **variables: ArrayLike,
 ) -> Path:
-    """A NetCDF file of variables over rows and columns, or what stands in `over`."""
+    """Writes a NetCDF file of variables over rows and columns, or over the dimensions `over`."""
     file = netCDF4.Dataset(path, "w")
     arrays = {name: np.asarray(values, "f4") for name, values in variables.items()}
     height, width = next(iter(arrays.values())).shape[-2:]
@@ -100,6 +100,6 @@ def netcdf(
 
 
 def masks(n_layers: int = 4) -> NDArray[np.uint8]:
-    """What has burnt so far, every 10 minutes."""
+    """Returns masks of the cells that have burnt so far, every 10 minutes."""
     burnt = [(ARRIVAL != NEVER) & (ARRIVAL <= 10 * k) for k in range(n_layers)]
     return np.array(burnt, np.uint8)

@@ -1,4 +1,4 @@
-"""Sensors that see beyond the path, no-fly cells and zones, against loops over all cells."""
+"""Sensors that see beyond the path, no-fly cells and zones, checked by loops over all cells."""
 
 import copy
 import warnings
@@ -42,7 +42,7 @@ ALL_MOVES = (
 
 @pytest.fixture
 def seeing(tmp_path: Path) -> Any:
-    """Writes a model file of `land.model`; returns keywords of its worlds."""
+    """Writes a model file of `land.model`. Returns the keyword arguments of its worlds."""
 
     def written(**keys: Any) -> dict[str, Any]:
         path = tmp_path / "model.toml"
@@ -144,7 +144,7 @@ def test_a_radius_may_be_given_beside_a_model() -> None:
             env = make(instance=instance, sensor_radius=radius)
             assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
             assert env.unwrapped.model.sensor_radius == 2
-        with refuses("sensor_radius: expected 2, as the server has, or None, got 1"):
+        with refuses("sensor_radius: expected the server's 2, or None, got 1"):
             make(instance=instance, sensor_radius=1)
     with serving(sensor_radius=2, reveal_model=False) as instance:
         env = make(instance=instance, model=LIVELY)
@@ -199,7 +199,7 @@ def test_a_model_says_what_its_file_does(tmp_path: Path) -> None:
     expected = oracle.parameters(whole.toml)
     assert np.array_equal(whole.kernels, expected.kernels)
     assert np.array_equal(whole.observation_matrix, expected.observed)
-    # Maps beside the file are those in it.
+    # Maps in files next to the model file equal maps in it.
     path = tmp_path / "model.toml"
     path.write_text(land.model(**keys, no_fly="no_fly.npy", zone_map="zones.npy"))
     np.save(tmp_path / "no_fly.npy", land.NO_FLY)
@@ -254,7 +254,7 @@ def test_beams_are_planned_within_the_airspace() -> None:
 
         best = max(worth(every) for every in product(range(4), repeat=5))
         assert worth(paths[0]) == pytest.approx(best, abs=1e-5)
-        # The other has no way out.
+        # The other robot has no way out.
         assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
 
 
@@ -279,7 +279,7 @@ def test_a_start_in_a_pocket_is_warned_of(tmp_path: Path) -> None:
     path = tmp_path / "pocket.toml"
     path.write_text(f"no_fly = {no_fly.tolist()}\n" + Model.named("wildfire-small").toml)
     pocket = {"model": path, "height": 12, "width": 9, "n_moves": 4, "burn_in": 0}
-    words = r"start: no-fly cells close in \(4, 4\): .* reach 2 of 98 free cells"
+    words = r"start: no-fly cells enclose \(4, 4\): .* reach 2 of 98 free cells"
     with pytest.warns(UserWarning, match=words):
         env = make(**pocket, start="4,4")
     with warnings.catch_warnings(record=True) as found:

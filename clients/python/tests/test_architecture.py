@@ -1,4 +1,4 @@
-"""Which module imports which: no circles, and rooms use only those below them."""
+"""Imports between modules: there are no cycles, and layers import only from lower layers."""
 
 import ast
 from functools import cache
@@ -9,7 +9,7 @@ import emberwatch
 
 PACKAGE = Path(emberwatch.__file__).parent
 
-#: The rooms of the package: each imports only from those before it.
+#: The layers of the package. Each imports only from the layers before it.
 ROOMS = (
     "errors common model belief planning client render envs wrappers sb3 landscape benchmark"
 ).split()
@@ -26,7 +26,7 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(path: Path) -> set[str]:
-    """The modules that a file names in imports, wherever in it they stand."""
+    """Returns the modules that a file imports, at any place in the file."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):

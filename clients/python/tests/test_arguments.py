@@ -1,4 +1,4 @@
-"""What callers hand in: arrays of any library, seeds, options; and keywords as JSON has them."""
+"""Callers' arguments: arrays of any library, seeds, options, and keywords as in JSON."""
 
 import os
 from collections.abc import Callable
@@ -51,7 +51,7 @@ ELSEWHERE = [
     OSError("the cluster is gone"),
 ]
 
-#: Environments, with a path or a move of each.
+#: Environments, each with an action: a path or a move.
 ENVIRONMENTS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Any]] = {
     "path": (make, lambda path: path, PATH),
     "move": (lambda: make(MOVES), lambda move: move, PATH[0]),
@@ -66,7 +66,7 @@ ENVIRONMENTS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Any]] = {
     "options": (lambda: make_vec(2, OBJECTIVE), lambda option: [option, option], PATH[0]),
 }
 
-#: Wrong actions by kind of environment, and a pattern of the error.
+#: Wrong actions by kind of environment, each with a pattern of its error.
 WRONG: dict[str, list[tuple[Any, str]]] = {
     "path": [
         ([0, 1, 2], r"expected shape \(1, 4\) or \(4,\), got \(3,\)"),
@@ -142,7 +142,7 @@ def test_seeds_of_a_lease_are_one_for_each_world() -> None:
     assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
 
 
-#: Wrong arguments of `reset`, and a pattern of the error: of any environment, and of a vector.
+#: Wrong arguments of `reset`, with error patterns: of any environment, and of a vector.
 WRONG_RESETS: list[tuple[dict[str, Any], str]] = [
     *(({"seed": it}, rf"seed: expected an integer.*, got {it}") for it in (-1, 2**64)),
     *(
@@ -152,7 +152,7 @@ WRONG_RESETS: list[tuple[dict[str, Any], str]] = [
 ]
 WRONG_SINGLE: list[tuple[dict[str, Any], str]] = [
     ({"options": {"rewind": True}}, "options: expected 'resume', got 'rewind'"),
-    ({"seed": 3, "options": {"resume": True}}, "expected no seed with resume=True"),
+    ({"seed": 3, "options": {"resume": True}}, "resume=True continues an episode, so it cannot"),
 ]
 WRONG_VECTOR: list[tuple[dict[str, Any], str]] = [
     *(({"seed": [1] * n}, "seed: expected an integer, None or 2 of them, got") for n in (0, 1, 3)),
@@ -190,7 +190,7 @@ def test_what_does_not_show_itself_is_refused_in_its_own_words() -> None:
             team.step({"robot_0": Elsewhere(error)})
 
 
-#: Keywords of a specification, as callers write them.
+#: Keyword arguments of a specification, as callers write them.
 KEYWORDS: list[dict[str, Any]] = [
     {"model": Path(LIVELY)},
     {"height": np.int64(7), "width": np.uint8(5), "burn_in": np.array(50)[()]},

@@ -1,4 +1,4 @@
-"""Beliefs from Python: against the authors' numbers, and the oracle for any model."""
+"""Beliefs from Python, compared with the authors' numbers, and with the oracle for any model."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ WILDFIRE = Model.wildfire()
 
 
 def golden(name: str) -> dict[str, NDArray[np.generic]]:
-    """Numbers of the authors' unmodified PyTorch code, where the Rust tests keep them."""
+    """Reads numbers of the authors' unmodified PyTorch code from the Rust tests' data."""
     folders = *REPOSITORY.glob("protocol/*/tests/data"), *REPOSITORY.glob("agent/*/tests/data")
     (path,) = (folder / f"{name}.npz" for folder in folders if (folder / f"{name}.npz").exists())
     with np.load(path) as file:
@@ -34,7 +34,7 @@ def golden(name: str) -> dict[str, NDArray[np.generic]]:
 
 
 def model_of(*, kernel: NDArray, bias: NDArray, matrix: NDArray) -> Model:
-    """A model of any shape, by way of a model file; a kernel of five axes is by own state."""
+    """Makes a model of any shape through a model file. Kernels of five axes are by own state."""
     n_states, n_observations = matrix.shape
     lines = ['name = "test"', f"kernel_size = {list(kernel.shape[-2:])}"]
     for s in range(n_states):
@@ -75,7 +75,7 @@ def test_beliefs_are_the_authors() -> None:
 
 @st.composite
 def any_model(draw: st.DrawFn) -> Model:
-    """Random weights, a third of them zero, random biases, any S, O and kernel, or one by state."""
+    """Draws a model: any S, O, kernel size and biases; a third of the weights are zero."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     n_states, n_observations = draw(st.integers(2, 6)), draw(st.integers(1, 5))
     size = 2 * draw(st.integers(0, 3)) + 1, 2 * draw(st.integers(0, 3)) + 1

@@ -23,7 +23,7 @@ GRID = {"height": 4, "width": 6}
 
 
 class Stub(gymnasium.Env[Any, Any]):
-    """Frames at random; ``parts`` makes them part of a Dict."""
+    """An environment with random frames, which ``parts`` makes part of a Dict."""
 
     def __init__(self, *, parts: bool = False, model: Model | None = WILDFIRE, burn_in: int = 0):
         self.model, self.burn_in, self.parts = model, burn_in, parts
@@ -143,7 +143,7 @@ def test_priors_by_name_and_by_array() -> None:
 
 
 def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="the server hides it .* Pass model="):
+    with pytest.raises(ValueError, match="the server does not reveal .* Pass model="):
         BeliefObservation(Stub(model=None))
     file = tmp_path / "model.toml"
     file.write_text(WILDFIRE.toml)

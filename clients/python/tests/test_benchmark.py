@@ -1,4 +1,4 @@
-"""`emberwatch.benchmark` against `emberwatch-agent compare`."""
+"""`emberwatch.benchmark`, compared with `emberwatch-agent compare`."""
 
 import io
 import subprocess
@@ -52,7 +52,7 @@ def score(path: Path | None = None, name: str = "mine", **changes: Any) -> list[
 
 @pytest.fixture
 def states(tmp_path: Path) -> Path:
-    """Recorded worlds of 12 and 15 steps, in which the second of three states pays most."""
+    """Writes recorded worlds of 12 and 15 steps, in which the second of three states pays most."""
     path = tmp_path / "lab.npz"
     random = np.random.default_rng(5)
     sequences = [random.integers(0, 3, (length, 7, 9), np.uint8) for length in (13, 16)]
@@ -182,12 +182,12 @@ def test_a_summary_says_which_worlds_are_for_tests() -> None:
         summary([])
 
 
-#: Arguments of `evaluate`, and words of their refusals.
+#: Wrong arguments of `evaluate`, each with words of its error.
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"name": ""}, "name: expected a name for the table, got ''"),
-    ({"estimator": "a\nb"}, r"estimator: expected a word for the table, or None, got 'a\\nb'"),
-    *(({"seeds": it}, "seeds: expected some, each once") for it in ([], [4, 4])),
-    ({"seeds": 8}, r"seeds: expected some, such as range\(8\), got 8"),
+    ({"estimator": "a\nb"}, r"estimator: expected a name for the table, or None, got 'a\\nb'"),
+    *(({"seeds": it}, "seeds: expected at least one seed, without dup") for it in ([], [4, 4])),
+    ({"seeds": 8}, r"seeds: expected several seeds, such as range\(8\), got 8"),
     *(
         ({name: value}, f"{name}: expected to be left out, as evaluate sets it")
         for name, value in {

@@ -1,4 +1,4 @@
-"""Which policies have one digest: the rows of a file are of the same policy only then."""
+"""Digests of policies: rows of a file belong to the same policy only if its digest is equal."""
 
 import functools
 import logging
@@ -47,7 +47,7 @@ class Slotted:
 
 
 class Learned:
-    """As a model of Stable-Baselines3."""
+    """Imitates a model of Stable-Baselines3."""
 
     exploration_rate = 0.1
 
@@ -61,7 +61,7 @@ class Learned:
 
 
 class Broken:
-    """Nothing about it can be read."""
+    """An object whose attributes cannot be read."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -109,7 +109,7 @@ def circle(value: Any) -> Any:
 
 
 def compiled(text: str, **names: Any) -> Any:
-    """A function as a script of the user defines it."""
+    """Returns a function as if the user's script defined it."""
     exec(text, names)
     return names["act"]
 

@@ -1,4 +1,4 @@
-"""CSV files of rows that several processes write to, and those that cannot be written."""
+"""CSV files of rows: written by several processes, and files that cannot be written."""
 
 import fcntl
 import itertools
@@ -47,7 +47,7 @@ MARK = Mark.of(row("mine", 0))
 
 
 def opened(path: Path, policy: str = "mine", mark: Mark = MARK) -> RowFile:
-    """A file after it was looked through for a policy."""
+    """Opens a file and searches it for the rows of a policy."""
     file = RowFile(path)
     with file:
         file.find(Kind(policy, 1, "alone"), mark)
@@ -55,7 +55,7 @@ def opened(path: Path, policy: str = "mine", mark: Mark = MARK) -> RowFile:
 
 
 def calls_of(csv: object) -> int:
-    """How often a policy acts before a file is refused."""
+    """Returns how often a policy acts before a file is refused."""
     calls = itertools.count()
 
     def still(frames: Any) -> Any:
@@ -81,7 +81,7 @@ def test_rows_that_come_meanwhile_are_kept_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     first, second = opened(path), opened(path, mark=MARK._replace(policy_fingerprint="ef" * 8))
     first.add([row("mine", 0)])
-    with refuses("csv: another process has written rows of 'mine' to .*, of another policy or"):
+    with refuses("csv: another process has written rows of 'mine' to .*, from another policy or"):
         second.add([row("mine", 0, policy_fingerprint="ef" * 8)])
     first.add([row("mine", 1)])
     assert read(path) == [row("mine", 0), row("mine", 1)]
@@ -160,7 +160,7 @@ def test_a_run_without_rows_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         evaluate(lambda _: 1 / 0, name="mine", csv=path, **keywords)
     assert not path.exists()
-    # An empty file that was there before has no rows, and stays.
+    # An empty file that existed before has no rows, and is kept.
     path.touch()
     assert read(path) == []
     with pytest.raises(ZeroDivisionError):

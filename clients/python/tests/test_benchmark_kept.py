@@ -1,4 +1,4 @@
-"""Which rows of a file `evaluate` and `suite` keep, run again, or refuse."""
+"""The rows of a file that `evaluate` and `suite` keep, run again, or refuse."""
 
 import contextvars
 import io
@@ -28,7 +28,7 @@ max_steps = {steps}
 test_seeds = {{ start = 3, end = 6 }}
 """
 
-#: Of the actions of a world; no digest of a policy looks into it.
+#: Draws the actions of a world; digests of policies do not look into it.
 SHAPE: contextvars.ContextVar[tuple[int, ...]] = contextvars.ContextVar("SHAPE", default=())
 
 
@@ -37,7 +37,7 @@ def always(move: int) -> Callable[[Any], NDArray[np.int64]]:
 
 
 def go(path: Path, move: int = 3, *, name: str = "mine", **changes: Any) -> tuple[list[Row], str]:
-    """The rows of a short evaluation, and what it said."""
+    """Returns the rows and the messages of a short evaluation."""
     said = io.StringIO()
     keywords = {**WORLDS, "observation": "frame", "seeds": range(3, 6), "steps": 5, **changes}
     rows = evaluate(always(move), name=name, csv=path, progress=said, **keywords)
@@ -60,7 +60,7 @@ def test_rows_of_other_worlds_are_refused_by_name(file: Path) -> None:
     assert file.read_bytes() == kept
 
 
-#: Settings of another policy, with which its rows run again.
+#: Settings that make another policy, whose rows run again.
 CHANGED: list[dict[str, Any]] = [
     {"move": 1},
     {"deterministic": False},
@@ -78,8 +78,8 @@ def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
         first, (rows, said) = rows, go(file, **change)
         _, again = go(file, **change)
         SHAPE.reset(token)
-        assert f"mine: 3 rows kept in {file}, not run again. What a policy reads" in again, change
-        assert f"mine: 3 rows already in {file} run again: of another policy or other set" in said
+        assert f"mine: 3 rows kept in {file}, not run again. Data that the policy" in again, change
+        assert f"mine: 3 rows already in {file} run again: from another policy or other s" in said
         for one, other in zip(rows, first, strict=True):
             assert one.policy_fingerprint != other.policy_fingerprint, change
             assert one.worlds_fingerprint == other.worlds_fingerprint, change
@@ -118,13 +118,13 @@ def test_rows_of_other_steps_are_refused_by_name(file: Path) -> None:
         go(file, steps=6)
     with refuses("has recent_steps 10 of 'mine' on world 3, expected 2: choose"):
         go(file, recent_steps=2)
-    # Those of another policy may have other steps.
+    # Rows of another policy may have other steps.
     go(file, name="other", steps=6)
     assert len(read(file)) == 6
 
 
 def without_fingerprints(path: Path) -> None:
-    """Makes a file one of an older release."""
+    """Turns a file into a file of an older release."""
     lines = path.read_text().splitlines()
     path.write_text("".join(",".join(line.split(",")[:-3]) + "\n" for line in lines))
 
@@ -133,11 +133,11 @@ def test_own_rows_of_an_older_release_are_refused_and_others_stay(file: Path) ->
     go(file)
     without_fingerprints(file)
     assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
-    with refuses("has rows of 'mine' without a fingerprint of their worlds, as older releases"):
+    with refuses("has rows of 'mine' from an older release, without a fingerprint of their worlds"):
         go(file)
-    # Those of others stay if worlds burn alike.
+    # Rows of other policies stay if their worlds burn alike.
     old = read(file)
-    with refuses(r"burning cells of world 3 \('mine'\), got"):
+    with refuses(r"burning cells in world 3 \('mine'\), got"):
         go(file, name="other", burn_in=61)
     assert read(file) == old
     rows, _ = go(file, name="other")
@@ -171,7 +171,7 @@ def test_a_row_of_other_values_is_refused(file: Path) -> None:
 
 
 def run_suite(folder: Path, move: int = 3, **changes: Any) -> tuple[list[Row], str]:
-    """The rows of a suite of one task, and what it said."""
+    """Returns the rows and the messages of a suite of one task."""
     values = {"model": LIVELY, "burn_in": 60, "steps": 5, **changes}
     name = values.pop("name", "mine")
     source = folder / "task.toml"
@@ -209,7 +209,7 @@ def test_a_suite_leaves_rows_of_other_policies_on_older_worlds(tmp_path: Path) -
 
 
 def test_a_suite_has_one_task_of_each_name(tmp_path: Path) -> None:
-    with refuses("tasks: expected tasks of different names, got small, small"):
+    with refuses("tasks: expected tasks with different names, got small, small"):
         suite(always(3), name="mine", folder=tmp_path, tasks=["small", "small"])
     assert list(tmp_path.iterdir()) == []
 
@@ -224,6 +224,6 @@ def test_worlds_that_change_meanwhile_are_refused(file: Path, tmp_path: Path) ->
         return np.zeros(len(frames), np.int64)
 
     keywords = {**WORLDS, "model": model, "observation": "frame", "steps": 2, "progress": None}
-    with refuses("worlds: they have changed since the evaluation began"):
+    with refuses("worlds: changed since the evaluation began"):
         evaluate(rewrites, name="mine", seeds=range(3, 5), batch=1, csv=file, **keywords)
     assert [row.world_seed for row in read(file)] == [3]

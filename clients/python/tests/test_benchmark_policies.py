@@ -1,4 +1,4 @@
-"""What `evaluate` gives to a policy, and takes from it."""
+"""The arguments that `evaluate` passes to a policy, and the results that it accepts."""
 
 import sys
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def go(policy: Any, **changes: Any) -> list[Row]:
 
 
 class Counter:
-    """A model with a memory: it counts its moves in each world, and flies in circles."""
+    """A model with a state: it counts its moves in each world, and flies in circles."""
 
     def __init__(self) -> None:
         self.counts: list[list[int]] = []
@@ -49,7 +49,7 @@ class Recurrent(Counter):
 
 
 class Older(Counter):
-    """As Stable-Baselines3 before 1.4."""
+    """Imitates Stable-Baselines3 before 1.4."""
 
     def predict(
         self, seen: Any, state: Any = None, mask: Any = None, deterministic: Any = 0
@@ -72,7 +72,7 @@ def test_models_and_functions_get_their_state_back() -> None:
     for kind in (Recurrent, Older, Short, Forwarding):
         model = kind()
         go(model, batch=2)
-        # Worlds 3 and 4 together, then world 5 from the start.
+        # Worlds 3 and 4 run together, then world 5 from the start.
         counts = list(range(3 * N_MOVES))
         assert model.counts == [[n, n] for n in counts] + [[n] for n in counts], kind
         if kind is not Short:
@@ -135,7 +135,7 @@ def walled(tmp_path: Path) -> Path:
 
 
 class Masked:
-    """As MaskablePPO."""
+    """Imitates MaskablePPO."""
 
     def __init__(self) -> None:
         self.masks: list[NDArray[np.bool_]] = []
@@ -166,18 +166,18 @@ def test_models_and_functions_get_masks(walled: Path) -> None:
     assert all(mask.shape == (3, 4) and mask.dtype == np.bool_ for mask in masks)
     assert np.array_equal(masks, model.masks) and not np.all(masks)
     assert [row.mean_reward for row in rows] == [row.mean_reward for row in others]
-    # A mask takes every robot to another cell.
+    # Every masked move takes its robot to another cell.
     assert all(row.mean_distinct_cells > 1 for row in rows)
     masks.clear()
     go(act, model=walled, robots=2)
     assert {mask.shape for mask in masks} == {(6, 4)}
     go(Masked(), env=WILDFIRE)
-    with refuses("env: expected one with action masks, which the policy takes, got one without"):
+    with refuses("env: expected an environment with action masks, .* got one without"):
         go(lambda frames, action_masks: 0, env=WILDFIRE)
 
 
 class Statistics:
-    """As VecNormalize."""
+    """Imitates VecNormalize."""
 
     obs_rms, clip_obs = {"mean": 3.0}, 10.0
 
@@ -218,11 +218,11 @@ def test_a_model_of_other_observations_is_refused() -> None:
         (spaces.Box(0, 255, (7, 9, 4), np.uint8), r"wrap=, such as lambda worlds: VecFrameStack\("),
         (spaces.Box(-10, 10, (7, 9, 1), np.float32), r"wrap=.*: VecNormalize.load\('stat"),
         (spaces.Dict({"frame": FRAME}), "pass the observation= of"),
-        (spaces.Discrete(4), "on which it was trained, got Box"),
+        (spaces.Discrete(4), r"that it was trained on, Discrete\(4\), got Box"),
     ):
         model.observation_space = space
         for policy in (model, model.predict):
-            with refuses("policy: expected observations .*" + words):
+            with refuses("policy: expected the observations .*" + words):
                 go(policy)
     assert model.counts == []
     for space in (FRAME, spaces.Box(0, 255, (1, 7, 9), np.uint8)):  # channels first

@@ -1,4 +1,4 @@
-"""Models of Stable-Baselines3 score in `evaluate` what they score in their own evaluation."""
+"""Models of Stable-Baselines3 score the same in `evaluate` as in their own evaluation."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -40,7 +40,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes: Any) -> Any:
-    """Worlds from this seed on, as a training or an evaluation has them."""
+    """Makes worlds with seeds from `seed`, as for training or evaluation."""
     keywords = {"observation": "local", "max_episode_steps": N_MOVES * N_STEPS, **changes}
     made = make_vec_env(MOVES, N_WORLDS, **world, **keywords)
     made.seed(seed)
@@ -61,7 +61,7 @@ def trained(
 
 
 def remembering(world: dict[str, Any]) -> Any:
-    """A model whose memory matters, which it hardly does after so short a training alone."""
+    """Makes a model whose state affects its actions; short training alone would not suffice."""
     small = {"lstm_hidden_size": 16, "net_arch": []}
     model = trained(sb3_contrib.RecurrentPPO, "MlpLstmPolicy", world, policy_kwargs=small)
     model.policy.lstm_actor.weight_hh_l0.data *= 20.0
@@ -71,7 +71,7 @@ def remembering(world: dict[str, Any]) -> Any:
 
 
 def own(model: Any, worlds: Any, *, deterministic: bool, evaluation: Any = evaluate_policy) -> Any:
-    """The model's own evaluation: the mean reward of a step, of each world."""
+    """Evaluates with the trainer's own function. Returns each world's mean reward per step."""
     rewards, lengths = evaluation(
         model,
         worlds,
@@ -109,7 +109,7 @@ def test_recurrent_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) ->
     model = remembering(world)
     expected = own(model, vector(world, FIRST), deterministic=True)
     check(model, expected, world)
-    # Without its memory it acts otherwise, so that the memory is what the test is about.
+    # Without its state, the model acts differently, so the test does depend on the state.
     assert ours(lambda seen: model.predict(seen, deterministic=True)[0], world) != expected
     with refuses("policy: it returns a state with its actions, but has no parameter `state`"):
         ours(lambda seen: model.predict(seen), world)
@@ -141,7 +141,7 @@ def test_a_model_behind_vec_normalize_scores_as_in_its_own(
     check(model, expected, world, observation=parts)
     model.save(tmp_path / "model.zip")
     loaded = stable_baselines3.PPO.load(tmp_path / "model.zip", device="cpu")
-    with refuses(r"policy: expected observations .*VecNormalize.load\('statistics.pkl', worlds\)"):
+    with refuses(r"policy: expected the .*VecNormalize.load\('statistics.pkl', worlds\)"):
         ours(loaded, world, observation=parts)
     for policy in (model, loaded):
         kept: list[Any] = []
@@ -160,7 +160,7 @@ def test_a_model_behind_vec_normalize_scores_as_in_its_own(
     assert file.read_bytes() == before
     with refuses("wrap: VecNormalize has no statistics: save those of the training"):
         ours(model, world, observation=parts, wrap=normalized)
-    with refuses("wrap: expected VecNormalize in it, as the policy was trained behind one"):
+    with refuses("wrap: expected a VecNormalize among the wrappers, as the policy was"):
         ours(model, world, observation=parts, wrap=VecMonitor)
 
 
@@ -189,5 +189,5 @@ def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
 
     ours(act, world, wrap=lambda worlds: VecFrameStack(worlds, 2))
     assert shapes == {(N_WORLDS, 15, 15, 10)}
-    with refuses("wrap: expected a function that returns its argument, a VecEnv of SB3, in wrap"):
+    with refuses("wrap: expected a function that returns its argument in VecEnvWrappers of SB3"):
         ours(act, world, wrap=lambda worlds: None)

@@ -1,4 +1,4 @@
-"""Calls that wait: timeouts, closing, fork and Ctrl-C."""
+"""Calls that wait: timeouts, closing, forks and Ctrl-C."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ def test_every_call_has_a_timeout() -> None:
         assert started.instance in str(raised.value)
     started.wake_up()
     assert client.observe().result().world.step == 0
-    started.stop()  # a timeout that is no time has passed already
+    started.stop()  # NaN and negative timeouts have already passed
     for timeout in (0, -1, float("nan"), -float("inf")):
         with pytest.raises(errors.RequestTimeoutError):
             client.observe(timeout=timeout)

@@ -81,7 +81,7 @@ def test_the_version_is_that_of_the_programs() -> None:
     assert said.stdout.split() == ["emberwatch-server", emberwatch.__version__]
 
 
-#: Steps of one robot, and words of their refusals.
+#: Wrong steps of one robot, each with words of its error.
 WRONG_ACTIONS = [
     *((action, "shape") for action in ([1] * 5, [], 3, None, "123456", np.zeros((2, 6), int))),
     ([[1, 2], [3]], "array"),

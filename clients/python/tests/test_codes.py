@@ -1,4 +1,4 @@
-"""The codes of errors in the package's README, in the docstring, and in the code."""
+"""The error codes in the package's README, in the docstring, and in the code are the same."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ def test_the_documented_codes_are_those_of_the_code() -> None:
     of_page = {code for cell in cells for code in re.findall(r'`"(\w+)"`', cell)}
     of_classes = {each.code for each in EmberwatchError.__subclasses__()}
     described = set(re.findall(r'``?"(\w+)"`', EmberwatchError.__doc__ or ""))
-    # Of the statuses, one is an example.
+    # The docstring names one status as an example.
     assert of_page == described - {"busy"}
     files = [*Path(emberwatch.__file__).parent.rglob("*.py"), *(PYTHON / "native").rglob("*.rs")]
     named = {code for file in files for code in re.findall(r'"(\w+)"', file.read_text("utf-8"))}

@@ -1,6 +1,6 @@
-"""Containers: a `/dev/shm` that fills, that is small, or that has room for few files.
+"""Containers: a `/dev/shm` that fills up, is small, or allows few files.
 
-Each in a mount namespace of its own; skipped where none may be made.
+Each test runs in its own mount namespace, and is skipped where none can be made.
 """
 
 import resource
@@ -13,10 +13,10 @@ import pytest
 from failures import fails
 from processes import isolated, server
 
-#: Runs Python code, its arguments behind, in a mount namespace with a `/dev/shm` of its own.
+#: Runs Python code, followed by its arguments, in a mount namespace with a private `/dev/shm`.
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
-#: Says what an error says: its code and its words.
+#: Prints an error's code and message.
 HEAD = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 import os, subprocess, time
@@ -123,4 +123,4 @@ print(Program("emberwatch-server", "--height=512", "--width=512", "--burn-in=0")
     for words in ("/dev/shm", "MiB", "free"):
         assert words in ended.stdout, ended
     ended = apart('tell("connect", lambda: emberwatch.connect("lab"))', "size=64m,nr_inodes=30")
-    assert "shared memory: expected room for 48 files in /dev/shm, got" in ended.stdout, ended
+    assert "shared memory: expected 48 free files in /dev/shm, got" in ended.stdout, ended

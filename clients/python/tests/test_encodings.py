@@ -1,4 +1,4 @@
-"""Files in TOML as editors on Windows save them: with a byte order mark, or in UTF-16."""
+"""TOML files as editors on Windows save them: with a byte order mark, or in UTF-16."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +31,7 @@ def of_states(file: Path) -> Any:
     return closed_later(gymnasium.make(WILDFIRE, states=file.with_suffix(".npz"), n_moves=4))
 
 
-#: What reads a file, and the file's text in UTF-8.
+#: A function that reads a file, and the file's text in UTF-8.
 READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "task": (Task.named, TASK),
     "model": (Model.named, Path(LIVELY).read_text("utf-8")),

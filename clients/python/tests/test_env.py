@@ -77,7 +77,7 @@ def test_gymnasium_finds_no_fault(name: str, keywords: dict[str, Any]) -> None:
 def test_gymnasium_finds_no_fault_in_an_attached_one() -> None:
     with serving() as instance, no_warnings():
         env = make(instance=instance)
-        # Its check keeps several environments of one id; a running server's world has one holder.
+        # The check keeps several environments of one id, but a server's world has one holder.
         env.unwrapped.spec = None
         check_env(env.unwrapped, skip_render_check=True)
 
@@ -117,7 +117,7 @@ def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPa
 
         def step_and_be_late(moves: Any) -> Any:
             answer = step(moves)
-            for _ in range(5):  # 200 samples, of which a reader keeps 128
+            for _ in range(5):  # 200 samples, more than the 128 that a reader keeps
                 neighbours.step(np.zeros((40, 4), int))
             return answer
 
@@ -179,14 +179,14 @@ def test_resume_goes_on_where_another_agent_stopped() -> None:
         assert tuple(observation["robot"]) == left.result().robot.cell
         seen = observation["frame"] != 255
         assert (observation["age"] == np.where(seen, 0, 255)).all()
-        # The time limit counts the environment's own steps.
+        # The time limit counts only the environment's own steps.
         steps = [env.step(action) for action in actions(env, 3)]
         assert [step[4]["step"] for step in steps] == [6, 7, 8]
         assert [step[3] for step in steps] == [False, False, True]
         assert env.reset(seed=1)[1]["step"] == 0
 
 
-#: Keywords of `make`, and words of their refusals.
+#: Wrong keyword arguments of `make`, each with words of its error.
 IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     ({"observation": ()}, r"expected one or several of frame, image, .*, others, got \(\)"),
     *(({"observation": it}, "observation") for it in (["frame", "frame"], ["frame", "visited"])),
@@ -224,7 +224,7 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     ),
 ]
 
-#: Keywords that `make_vec` refuses.
+#: Wrong keyword arguments of `make_vec`, each with words of its error.
 IMPOSSIBLE_VECTORS: list[tuple[dict[str, Any], str]] = [
     *(({"n_worlds": it}, f"^num_envs: expected 1 to 1024, got {it}$") for it in (0, 1025)),
     ({"n_worlds": 5120, "robots": 5}, "^num_envs: expected 1 to 4096, got 5120$"),
@@ -234,9 +234,9 @@ IMPOSSIBLE_VECTORS: list[tuple[dict[str, Any], str]] = [
     ({"world": 2}, "^world: applies only with instance="),
 ]
 
-#: Keywords beside `instance`, of a server of two worlds.
+#: Wrong keyword arguments together with `instance`, for a server of two worlds.
 OTHER_THAN_SERVED: list[tuple[dict[str, Any], str]] = [
-    ({"height": 8}, "height: expected 7, as the server has, or None, got 8"),
+    ({"height": 8}, "height: expected the server's 7, or None, got 8"),
     ({"width": 8}, "width: expected 5, .* got 8"),
     ({"n_moves": 5}, "n_moves: expected 4, .* got 5"),
     ({"burn_in": 51}, "burn_in: expected 50, .* got 51"),
@@ -276,7 +276,8 @@ def test_an_unknown_keyword_is_named() -> None:
         with pytest.raises(TypeError) as raised:
             make(name, **{keyword: 2})
         words = (
-            r"Wildfire\w*Env\(\) got an unexpected keyword argument '{}'{}; known are .*burn_in.*"
+            r"Wildfire\w*Env\(\) got an unexpected keyword argument '{}'{}; "
+            r"known keywords: .*burn_in.*"
         )
         assert re.fullmatch(words.format(keyword, hint), str(raised.value))
         assert ("checkpoint" in str(raised.value)) == (name == OBJECTIVE)
@@ -309,11 +310,11 @@ def test_worlds_without_rewards_are_warned_of(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match="no state pays: every reward will be 0") as caught:
             making(WILDFIRE, **SMALL | {"model": str(model)})
         assert caught[0].filename == __file__
-    # Worlds in which nothing burns are warned of once.
+    # A world in which nothing burns causes one warning.
     worlds = {"model": "wildfire-small", "burn_in": 0}
     env, envs = make(**worlds), gymnasium.make_vec(WILDFIRE, num_envs=2, **SMALL | worlds)
     for one in (env, envs):
-        with pytest.warns(UserWarning, match="no cell of world 0 .* give it a burn_in") as caught:
+        with pytest.warns(UserWarning, match="no cell of world 0 .*: use a longer burn_") as caught:
             one.reset(seed=1)
         assert caught[0].filename == __file__
         one.reset(seed=1)

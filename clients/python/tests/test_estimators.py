@@ -1,4 +1,4 @@
-"""Beliefs of every kind: equal to the Rust agent's, one world or many; refusals of bad input."""
+"""Beliefs of every kind equal the Rust agent's, for one world or many; bad input is refused."""
 
 import re
 import textwrap
@@ -27,7 +27,7 @@ N_WORLDS = 3
 KNOWN = [name for name in belief.kinds() if name.startswith("known")]
 LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
 
-#: Kinds, and for learned kinds a checkpoint.
+#: Kinds of belief, with a checkpoint for the learned kinds.
 CASES: list[tuple[str, str | None]] = [
     *((kind, None) for kind in KNOWN),
     *((kind, "learned_filter") for kind in LEARNED),
@@ -47,7 +47,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def flown() -> list[tuple[NDArray[np.void], NDArray[np.uint8], NDArray[np.uint8]]]:
-    """Results, frames and hidden states of some worlds: after a reset, and after each step."""
+    """Returns results, frames and hidden states of some worlds after a reset and each step."""
     rng, moves = np.random.default_rng(7), (N_WORLDS, 16)
     world = {**GRID, "model": "wildfire-small", "moves": 16, "burn_in": 100}
     with emberwatch.embed(worlds=N_WORLDS, publish_truth=True, **world) as client:
@@ -110,7 +110,7 @@ def test_beliefs_are_the_agents_to_the_bit(
             single.correct(frames[world])
             assert (many.belief[:, world] == single.belief).all()
             single.predict()
-            # Equal to the agent in every bit, signs of zeros included.
+            # Equal to the agent's belief in every bit, including signs of zeros.
             assert single.belief.tobytes() == expected[:, world].tobytes()
         many.predict()
         assert many.belief.tobytes() == expected.tobytes()
@@ -129,7 +129,7 @@ def test_some_worlds_move_and_begin_again(kind: str, flown: Any) -> None:
     assert (kept.belief[:, 0] != first[:, 0]).any()
     kept.reset([2])
     assert (kept.belief[:, 2] == first[:, 2]).all() and (kept.belief[:, 0] != first[:, 0]).any()
-    for _, frames, _ in flown[1:5]:  # nothing of the former episode is left
+    for _, frames, _ in flown[1:5]:  # nothing of the last episode remains
         kept.correct(frames, 2)
         fresh.correct(frames[2])
         assert (kept.belief[:, 2] == fresh.belief).all()
@@ -185,7 +185,7 @@ def test_certainty_that_is_wrong_costs_infinitely_much() -> None:
     assert belief.score(kept, nothing, np.array([[[0, 2]]], np.uint8), target=0).brier[0] == 0.5
 
 
-#: Arguments of `known`, of which one is wrong, and the errors.
+#: Arguments of `known` with one wrong value, and the errors.
 KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"model": 7}, "model: expected text or a path, got 7"),
     ({"kind": "learned"}, f"kind: expected one of {', '.join(KNOWN)}, got 'learned'"),
@@ -220,7 +220,7 @@ def of_frame(value: int) -> NDArray[np.uint8]:
     return frames
 
 
-#: Wrong calls of a belief about one world, or about three; the errors.
+#: Wrong calls of a belief about one world or about three, and the errors.
 REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
     (3, lambda it: it.correct(FRAME),
         "frame: expected shape (3, 16, 16) and type uint8, got (16, 16) and uint8"),
@@ -246,7 +246,7 @@ REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
     (None, lambda it: belief.score(it, FRAME[None], TRUTH[None].astype(int)),
         "states: expected shape (K, 16, 16) with K >= 1, and type uint8, got (1, 16, 16) and int"),
     (None, lambda it: belief.score(it, of_frame(255), TRUTH[None]),
-        "states: expected 2 steps, as observations, got 1"),
+        "states: expected 2 steps, as in observations, got 1"),
     (None, lambda it: belief.score(it, of_frame(3), np.stack([TRUTH, TRUTH])),
         "observations: step 1, cell (15, 15): expected a value below 3, or 255, got 3"),
     (None, lambda it: belief.score(it, FRAME[None], FRAME[None]),
@@ -271,16 +271,16 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
         made("known", checkpoints / "learned_filter")
     # No checkpoint, a checkpoint of another kind, and checkpoints of other worlds.
     (tmp_path / "text").write_text("no checkpoint")
-    with refuses("checkpoint .*text: expected a whole safetensors file"):
+    with refuses("checkpoint .*text: expected a complete safetensors file"):
         belief.load(tmp_path / "text", **GRID)
     with refuses("checkpoint .*missing: No such file"):
         belief.load(tmp_path / "missing", **GRID)
-    with refuses("checkpoint.*of `train --learner neural`, got none|expected one of a neural"):
+    with refuses("checkpoint.*of `train --learner neural`, got none|expected a learned neural"):
         belief.load(checkpoints / "learned_filter", **GRID, kind="neural")
     rings = "[{ observed_as = [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]] }]"
     ringed = Model.from_toml(f"{MODEL.toml}\n[sensor]\nradius = 1\nrings = {rings}\n")
     for name in ("learned_filter", "neural_belief"):
-        with refuses("checkpoint: expected 6 observations as the world's, got 3"):
+        with refuses("checkpoint: expected the world's 6 observations, got 3"):
             belief.load(checkpoints / name, **GRID, model=ringed)
 
 
@@ -290,7 +290,7 @@ def test_a_neural_belief_with_a_known_sensor_weighs_what_it_sees(checkpoints: Pa
 
     plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
     shows = MODEL.observation_matrix.T
-    # Except where the inverse of the sensor gives a negative probability, which is cut off.
+    # Except where the inverse of the sensor returns a negative probability, which is clamped.
     possible = (noisy.belief > 1e-5).all(0)
     shown = np.tensordot(shows, noisy.belief, 1)
     assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)
@@ -307,7 +307,7 @@ def test_a_neural_belief_with_a_known_sensor_weighs_what_it_sees(checkpoints: Pa
     alike = MODEL.toml.replace(
         str(MODEL.observation_matrix[0].tolist()), str(MODEL.observation_matrix[1].tolist()), 1
     )
-    with refuses("the sensor: expected states that look different, got some that look alike"):
+    with refuses("sensor: expected an invertible observation matrix, got states that look alike"):
         neural(kind="neural+sensor", model=Model.from_toml(alike))
 
 

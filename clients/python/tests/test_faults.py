@@ -1,4 +1,4 @@
-"""Faults: processes killed and stopped at the worst moment."""
+"""Faults: processes that are killed or stopped at the worst moment."""
 
 import signal
 import threading
@@ -11,7 +11,7 @@ from processes import CHANNELS, LONG, Server, asleep, eventually, script, server
 from emberwatch import errors
 from emberwatch.client.client import connect
 
-#: A learner on worlds in its process, or at a server that its argument names.
+#: A learner on worlds in its process, or on the server that its argument names.
 LEARNER = """
 import os, sys, time
 from emberwatch.envs.path_env import WildfireEnv
@@ -26,7 +26,7 @@ def fly():
         env.step([3] * 6)
 """
 
-#: How it may end by itself, or by a signal while it steps, and the exit code.
+#: Ways to end the learner, by itself or by a signal while it steps, and its exit code.
 ENDS: dict[str | signal.Signals, int] = {
     "": 0,
     "raise ValueError('unhandled')": 1,
@@ -39,7 +39,7 @@ ENDS: dict[str | signal.Signals, int] = {
 
 
 def check_kill(started: Server, call: Callable[[], object]) -> None:
-    """Kills the server while a call waits for it, which says so."""
+    """Kills the server while a call waits for it, and checks the call's error."""
     started.stop()
 
     def kill() -> None:
@@ -75,7 +75,7 @@ class Remains:
         assert len(self._files) > 5
 
     def left(self) -> list[str]:
-        """What is left. iceoryx2 keeps one file of 16 bytes for all processes."""
+        """Returns leftover files. iceoryx2 itself keeps one file of 16 bytes for all processes."""
         found = [path for path in self._files if path.exists() and path.stat().st_size > 16]
         nodes = (path for path in (CHANNELS / "nodes").iterdir() if path.name.isdecimal())
         pids = (int(path.name) >> 64 & 0xFFFFFFFF for path in nodes)
@@ -92,7 +92,7 @@ def test_a_learner_ends_in_any_way_and_leaves_nothing(end: str | signal.Signals)
         remains = Remains(learner.pid) if instance else None
         learner.say() if by_itself else learner.signal(end)
         assert learner.end()[0] == ENDS[end]
-    # The server's world is free; once it has ended, the next server removes what is left.
+    # The server's world is free. Once the server has ended, the next one removes leftovers.
     assert eventually(lambda: started.status().n_clients == 1)
     started.connect().acquire()
     started.close()

@@ -1,4 +1,4 @@
-"""Films of recordings: what they show, and what they say is missing."""
+"""Films of recordings: their pictures, and their messages about missing records."""
 
 import json
 import sys
@@ -21,7 +21,7 @@ from emberwatch.render.palette import ROBOTS
 
 MODEL = Model.wildfire()
 HEIGHT, WIDTH, SCALE = 3, 5, 10
-#: Left and upper edges of the four panels, pixels: they are 150 wide, with 16 between.
+#: Left and upper edges of the four panels in pixels: they are 150 wide and 16 apart.
 LEFTS, TOP = [14, 180, 346, 512], 68
 INFO = document.examples()[1] | {"height": HEIGHT, "width": WIDTH, "n_moves": 2, "n_worlds": 2}
 INFO |= {"n_robots": 1, "deadline_millis": 0, "recorded_world": None}
@@ -37,7 +37,7 @@ def server(**changes: Any) -> bytes:
 
 
 def frame(step: int, *, world: int = 0, robots: int = 1, **told: int) -> bytes:
-    """Robot r flies right and down from column r of the first row; they see `SEEN`."""
+    """Makes a frame: robot r flies right and down from column r of row 0, and sees `SEEN`."""
     episode, hovered, late = (told.get(name, 0) for name in ("episode", "hovered", "late"))
     result = wire.WORLD.pack(step, 7, episode, 2.0, hovered, late, 0, 3, 0, 0, 0)
     sizes = {"n_robots": robots, "height": HEIGHT, "width": WIDTH}
@@ -78,7 +78,7 @@ class Studio:
         self.gif, self.png = folder / "new/lab.gif", folder / "new/lab.png"
 
     def film(self, records: list[bytes], *flags: object, cut: bool = False) -> str:
-        """What it says to the standard error."""
+        """Makes a film. Returns the text on standard error."""
         content = FILE_HEADER + b"".join(records) + end(records)
         self._file.write_bytes(content[: -len(end(records)) - 5] if cut else content)
         out = self.png if "--step" in flags else self.gif
@@ -110,7 +110,7 @@ def studio(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Studio:
 
 
 def cells(image: NDArray[np.uint8], panel: int) -> NDArray[np.uint8]:
-    """The colour in the upper left corner of each cell of a panel, `(H, W, 3)`."""
+    """Returns the colour in the upper left corner of each cell of a panel, `(H, W, 3)`."""
     rows = TOP + SCALE * np.arange(HEIGHT)
     cols = LEFTS[panel] + SCALE * np.arange(WIDTH)
     return image[np.ix_(rows, cols)]
@@ -149,7 +149,7 @@ def test_a_film_shows_each_step_and_a_still_one_of_them(studio: Studio) -> None:
     assert studio.millis() == [100, 1000]
     still = studio.still(records)
     assert still.shape == first.shape
-    for panel in range(4):  # texts have fewer greys in a film
+    for panel in range(4):  # text has fewer greys in a film
         assert np.abs(cells(still, panel).astype(int) - cells(first, panel)).max() <= 4
 
 
@@ -228,7 +228,7 @@ def test_cut_changed_and_repeated_records_are_shown_once(studio: Studio) -> None
     assert len(studio.millis()) == 3, "published again"
 
 
-#: Flags, and words about them.
+#: Wrong flags, each with words of its error.
 WRONG: list[tuple[list[object], str]] = [
     (["--world", 7], "--world: expected one of those recorded, [0, 1], got 7"),
     (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
@@ -280,7 +280,7 @@ def test_a_team_is_drawn_with_its_paths_and_who_stayed_is_told(studio: Studio) -
         for image, (row, col) in ((blank, middles[0]), (flown, middles[1])):
             at = TOP + SCALE * row + SCALE // 2, LEFTS[0] + SCALE * col + SCALE // 2
             assert tuple(image[at]) == color, (robot, row, col)
-    # One line of small print says who stayed.
+    # One line of small print names the robots that stayed.
     foot = {
         name: (image[-30:] != 255).sum()
         for name, image in (("flown", flown), ("some", some), ("blank", blank))

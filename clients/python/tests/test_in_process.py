@@ -1,4 +1,4 @@
-"""Worlds in this process: nothing outside is needed, forks are safe, `embed` is like a server."""
+"""Worlds in this process need nothing outside, survive forks, and behave like a server's."""
 
 import os
 import signal
@@ -74,7 +74,7 @@ def test_nothing_is_opened_before_the_first_reset(kind: str) -> None:
     assert (children, shared) == (before[0][0], before[0][2])
 
 
-#: All that needs no server.
+#: Uses everything that needs no server.
 ALONE = """
 import os, warnings
 import gymnasium, numpy as np
@@ -108,7 +108,7 @@ def test_neither_shared_memory_nor_programs_are_needed() -> None:
 
 
 def in_child(call: Callable[[], object]) -> Any:
-    """What a call returns, or the code of its error, in a forked child."""
+    """Runs a call in a forked child. Returns its result, or the code of its error."""
     context = get_context("fork")
     receiver, sender = context.Pipe()
 
@@ -240,7 +240,7 @@ def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
         assert client.status().worlds[2].resetting
 
 
-#: A burn-in of hours, which Ctrl-C ends; then short ones.
+#: A burn-in of hours, which Ctrl-C ends, then short burn-ins.
 INTERRUPTED = """
 import gymnasium, emberwatch, os
 env = gymnasium.make("emberwatch/Wildfire-v0", burn_in=10**9)

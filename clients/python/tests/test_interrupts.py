@@ -1,4 +1,4 @@
-"""Ctrl-C, and signal handlers that raise, at every moment of a call of an environment."""
+"""Ctrl-C and raising signal handlers, at every moment of an environment's call."""
 
 import gc
 import sys
@@ -26,8 +26,8 @@ from processes import at_once, ctrl_c, eventually, server
 import emberwatch
 from emberwatch.wrappers import BeliefObservation
 
-#: An interrupt within the end of a generator, or a callback of the garbage collector that a test's
-#: library brings, is reported and dropped by Python itself.
+#: Python itself reports and drops an interrupt while a generator ends, or in a callback of the
+#: garbage collector that a test library installs.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning"
 )
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.filterwarnings(
 PATH = ("frame", "robot", "age", "belief")
 MOVE = ("frame", "visited", "robot", "move", "age", "belief", "local", "recent")
 
-#: Environments of each kind: all that they remember is observed.
+#: Environments of each kind. Their observations show all that they remember.
 KINDS: dict[str, Callable[[], Any]] = {
     "attached": lambda: make(
         instance=small_server(publish_truth=True).instance, observation=PATH, truth=True
@@ -50,16 +50,16 @@ KINDS: dict[str, Callable[[], Any]] = {
     "objectives": lambda: make_vec(2, OBJECTIVE, max_episode_steps=3),
 }
 
-#: Of these a step may be refused, with these words.
+#: The errors that may refuse a step after an interrupt.
 REFUSALS = emberwatch.EmberwatchError, gymnasium.error.ResetNeeded
 
 
 class Alarm(Exception):
-    """What a signal's handler may raise instead of `KeyboardInterrupt`."""
+    """An exception that a signal handler may raise instead of `KeyboardInterrupt`."""
 
 
 class Signal:
-    """Raises where Python handles signals: the n-th begin of a function, or end of one in C."""
+    """Raises where Python handles signals: at the n-th start of a function or end of a C call."""
 
     def __init__(self, n: int, kind: type[BaseException]) -> None:
         self.n_seen, self._n, self._kind = 0, n, kind
@@ -83,7 +83,7 @@ def places(call: Callable[[], object]) -> int:
 
 
 def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
-    """Interrupts a call at a place; its error has a traceback, which notebooks keep."""
+    """Interrupts a call at a place. The error keeps its traceback, as in a notebook."""
     kind = (KeyboardInterrupt, Alarm)[n & 1]
     sys.setprofile(Signal(n, kind))
     try:
@@ -106,7 +106,7 @@ def action(env: Any, seed: int) -> Any:
 
 @pytest.fixture(autouse=True)
 def no_garbage() -> Generator[None]:
-    """Collects what interrupts left in errors with tracebacks, before another test is blamed."""
+    """Collects garbage in tracebacks of interrupts now, so that no other test is blamed."""
     yield
     gc.collect()
 
@@ -117,7 +117,7 @@ def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
 
 
 def begun(env: Any, n_steps: int = 3, seed: int = 1000) -> Any:
-    """An environment in an episode; a vector's has gone over into the next."""
+    """Returns an environment within an episode; for a vector, after an automatic reset."""
     env.reset(seed=seed)
     for k in range(n_steps):
         env.step(action(env, k))
@@ -143,7 +143,7 @@ def test_a_step_that_was_interrupted_is_never_taken_for_the_next(pair: tuple[Any
         else:
             assert_same(outcome, both if same(outcome, both) else lone)
         assert_same([env.reset(seed=5), env.step(first), env.step(second)], fresh)
-    assert n_refused > 4  # of up to 25: waits differ in how often they poll
+    assert n_refused > 4  # of up to 25: waits poll at different rates
 
 
 def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, Any]) -> None:
@@ -161,7 +161,7 @@ def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, 
         try:
             outcome = env.step(first)
         except REFUSALS:
-            step = resumed(env)  # as it was, or of the new episode
+            step = resumed(env)  # of the old episode, or of the new one
             n_refused += 1
             assert np.all((step == stood) | (step == 0))
         else:
@@ -171,7 +171,7 @@ def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, 
 
 
 def resumed(env: Any) -> Any:
-    """The step from which an environment goes on, or that of each world."""
+    """Returns the step at which an environment resumes, or one step per world."""
     _, info = env.reset(options={"resume": True})
     return np.asarray(info.get("robot_0", info)["step"])
 

@@ -1,4 +1,4 @@
-"""Rasters of fires become recorded worlds: the same fire from each format, kind and grid."""
+"""Rasters of fires become recorded worlds: each format, kind and grid yields the same fire."""
 
 import io
 import re
@@ -23,9 +23,9 @@ ARRIVALS = ("--kind", "arrival", *STEP, "--burning", "2")
 MINUTES = (*ARRIVALS, "--unit", "min")
 MASKS = ("--kind", "mask", *STEP, "--burning", "2")
 STATES = ("--kind", "states", *STEP)
-#: The steps of 10 minutes in which cells burn first: 35 minutes are over in step 4.
+#: The first step, of 10 minutes each, in which each cell burns: 35 minutes have passed in step 4.
 BEGIN = np.where(ARRIVAL == NEVER, 99, np.ceil(ARRIVAL / 10))
-#: The states of all six steps, where a cell burns for two.
+#: The states of all six steps, in which a cell burns for two steps.
 FIRE = np.array([(BEGIN <= k) + (BEGIN + 2 <= k).astype(int) for k in range(6)], np.uint8)
 
 
@@ -73,21 +73,21 @@ def same_arrivals(f: Path) -> list[tuple[object, ...]]:
         (netcdf(f / "hours.nc", at=with_never(NEVER, 1 / 60), unit="hours"),),
         (f / "fire.npy", *minutes),
         (changed(scaled, scales=[5.0], offsets=[-10.0]), *minutes),
-        # The first step is the earliest arrival's.
+        # The first step is that of the earliest arrival.
         (geotiff(f / "later.tif", with_never(NEVER) + 1234 * (ARRIVAL != NEVER)), *minutes),
         (geotiff(f / "none.tif", nodata=None), *minutes, "--nodata", -1, "--nodata", NEVER),
     ]
-    for number in ("-9999.9", "-3.4028235e+38", "-3.40282347e+38"):  # as the file rounds
+    for number in ("-9999.9", "-3.4028235e+38", "-3.40282347e+38"):  # as rounded by the file
         values = with_never(float(number)).astype(np.float32)
         np.save(f / f"{number}.npy", values)
         for file in (geotiff(f / f"{number}.tif", values, nodata=None), f / f"{number}.npy"):
             files.append((file, *minutes, f"--nodata={number}"))
-    for word in ("null", "*", "1.#QNAN", "nan", "-9999.00"):  # that mean no value
+    for word in ("null", "*", "1.#QNAN", "nan", "-9999.00"):  # all mean "no value"
         file = ascii_grid(f / f"{len(files)}.asc")
         text = file.read_text().replace("value -9999.0", f"value {word}")
         file.write_text(text if word == "-9999.00" else text.replace("-9999.0", word.lower()))
         files.append((file, *minutes))
-    for values, numbers in (  # rotations by rounding
+    for values, numbers in (  # rotations caused by rounding
         (ARRIVAL, (30, 6e-17, 500_000, 6e-17, -30, 4_000_000)),
         (ARRIVAL[::-1, ::-1], (-30, 4e-15, 500_000, 4e-15, 30, 4_000_000)),
     ):
@@ -140,7 +140,7 @@ def test_masks_are_the_same_from_files_bands_and_time(tmp_path: Path, out: Path)
     folder.mkdir()
     for k, layer in enumerate(layers):
         geotiff(folder / f"step_{k + 8}.tif", layer, nodata=None)  # step_10 comes after step_9
-    # Files about layers are none.
+    # Files that describe layers are not layers.
     with (
         rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False),
         rasterio.open(folder / "step_8.tif", "r+") as file,
@@ -201,7 +201,7 @@ def test_files_that_count_from_days_of_their_own_follow_each_other(
     np.testing.assert_array_equal(one(out, folder, *STATES, "--step", "12 h"), FIRE[:4])
 
 
-#: Units of times and their calendar, and when the first of 90 minutes later is.
+#: Units of time and their calendars, and the time 90 minutes after the first one.
 BEGINS: list[tuple[str, str | None, str | None]] = [
     ("minutes since 2020-08-01", None, "2020-08-01 01:30:00 UTC"),
     ("minutes since 2020-8-1 0:0:0.0", "gregorian", "2020-08-01 01:30:00 UTC"),

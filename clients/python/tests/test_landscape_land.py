@@ -17,7 +17,7 @@ from emberwatch.landscape.zoned import toml
 
 CONFIG = Path(__file__).parents[3] / "config"
 BURNOUT = tomllib.loads((CONFIG / "models/wildfire-burnout.toml").read_text("utf-8"))
-#: Of the base's burning neighbours: beside the cell, and at its corners.
+#: Mean weights of burning neighbours in the base model: at the cell's sides, and its corners.
 SIDE, CORNER = (0.04 + 0.10 + 0.02 + 0.04) / 4, (0.06 + 0.02 + 0.06 + 0.02) / 4
 SLOPE = "10 degrees up to the east, aspect W"
 WIND = ("--wind-speed", 5, "--wind-towards", 20)
@@ -29,7 +29,7 @@ def array(path: Path, values: Any) -> Path:
 
 
 def weights(model: dict[str, Any], zone: str, **states: str) -> np.ndarray:
-    """Of the one entry of these states; a key `from_` stands for `from`."""
+    """Returns the weights of the only entry with these states. The key `from_` means `from`."""
     wanted = {"zone": zone} | {key.strip("_"): name for key, name in states.items()}
     (entry,) = (e for e in model["kernel"] if wanted.items() <= e.items())
     return np.array(entry["weights"])
@@ -40,9 +40,10 @@ def spread(model: dict[str, Any], zone: str) -> np.ndarray:
 
 
 def by_hand(row: int, col: int, rise: tuple[float, float], speed: float, towards: float) -> float:
-    """The factor of a neighbour so many rows below and columns to the right of the cell."""
+    """Returns the factor of a neighbour `row` rows below the cell and `col` columns to its
+    right."""
     distance = math.hypot(row, col)
-    # The fire comes from there: so many columns to the west, so many rows to the north.
+    # The fire comes from the neighbour: `col` columns to the west, `row` rows to the north.
     east, north = -col / distance, row / distance
     slope = math.degrees(math.atan(east * rise[0] + north * rise[1]))
     angle = math.atan2(north, east) - math.radians(towards)
@@ -199,7 +200,7 @@ def test_the_shipped_land_has_all_kernels_of_each_zone() -> None:
     zone_map = np.array(model["zone_map"])
     assert zone_map.shape == (64, 64) and set(zone_map.flat) == set(range(len(names)))
     assert len(model["kernel"]) == len(names) * len(BURNOUT["kernel"])
-    # Level ground: the wind alone, as `flat` has a mean slope of less than a quarter degree.
+    # Level ground: only the wind counts, as the mean slope of `flat` is below a quarter degree.
     around = np.array([[CORNER, SIDE, CORNER], [SIDE, 0, SIDE], [CORNER, SIDE, CORNER]])
     expected = around * factors(np.zeros(2), 5, 20, (3, 3))
     np.testing.assert_allclose(spread(model, "flat"), expected, rtol=0.02)

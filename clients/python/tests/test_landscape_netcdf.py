@@ -1,4 +1,4 @@
-"""What CF says of NetCDF variables and their coordinates is applied, or refused by name."""
+"""CF attributes of NetCDF variables and coordinates are applied, or refused by name."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from rasters import geotiff
 
 from emberwatch.landscape.__main__ import main
 
-#: Seconds until each cell begins to burn: the fire begins in the north-west.
+#: Seconds until each cell begins to burn. The fire begins in the north-west.
 ARRIVAL = np.array([[0, 60, 120, 180], [60, 120, 180, 240], [120, 180, 240, 300]])
 MASKS = np.array([ARRIVAL <= 60 * k for k in range(4)], "u1")
 KIND = {2: ("--kind=arrival",), 3: ("--kind=mask",)}
@@ -39,7 +39,7 @@ ONE = Variable(ARRIVAL, "i2", ("y", "x"), {"units": "s"})
 
 
 def written(path: Path, group: str = "", /, **variables: Variable) -> Path:
-    """A file of these variables, in a group of it; dimensions are as large as they need."""
+    """Writes a file of these variables, in a group. Dimensions have the size of their variables."""
     with netCDF4.Dataset(path, "w") as root:
         file = root.createGroup(group) if group else root
         for name, (values, kind, over, given) in variables.items():
@@ -65,7 +65,7 @@ def imported(file: Path, n_dimensions: int, *flags: str) -> NDArray[np.uint8]:
 
 
 def steps(arrival: NDArray[Any]) -> NDArray[np.uint8]:
-    """The states of these times, of which -1 is never."""
+    """Returns the states for these arrival times, of which -1 means never."""
     n_steps = int(arrival.max()) // 60 + 1
     return np.array([(arrival >= 0) & (arrival <= 60 * k) for k in range(n_steps)], np.uint8)
 
@@ -98,7 +98,7 @@ def timed(kind: str, values: ArrayLike, **given: Any) -> Variables:
 
 
 def bounded(axis: Variable, name: str, half: float = 15.0) -> Variables:
-    """Coordinates at the first edges of cells, whose bounds tell the truth."""
+    """Returns coordinates at the first edges of cells. Only their bounds are correct."""
     values = np.asarray(axis.values)
     edges = np.stack([values - half, values + half], axis=1)
     (dimension,) = axis.over
@@ -106,7 +106,7 @@ def bounded(axis: Variable, name: str, half: float = 15.0) -> Variables:
     return {name: axis._replace(values=edges[:, 0]).told(bounds="edges"), "edges": bounds}
 
 
-#: What a file says, and the states of the fire in it.
+#: Contents of a file, and the states of its fire.
 APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "nothing": (grid(ONE), FIRE),
     # Numbers.
@@ -282,7 +282,7 @@ def test_a_grid_mapping_is_the_projection(tmp_path: Path) -> None:
 
 CURVED = Variable(np.zeros((3, 4)), "f8", ("y", "x"), {"units": "degrees_north"})
 
-#: Words of the refusal, what a file says, and flags.
+#: Words of the error, contents of the file, and flags.
 REFUSED: list[tuple[Any, ...]] = [
     ("a.nc, x: expected cells of one size side by side, got some of 30 and some of 90",
         grid(ONE, x=X._replace(values=[15, 45, 75, 165]))),

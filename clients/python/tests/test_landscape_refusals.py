@@ -1,4 +1,4 @@
-"""What the importer refuses: one line each that says what was expected and what was got."""
+"""Input that the importer refuses, each with one line about the expected and given values."""
 
 import io
 import sys
@@ -59,7 +59,7 @@ def folder_with(folder: Path, name: str) -> Path:
 
 
 def claim(path: Path, shape: tuple[int, ...]) -> Path:
-    """The header of an array of bytes that are not there."""
+    """Returns the header of an array whose bytes are missing."""
     with path.open("wb") as file:
         header = {"descr": "|u1", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
@@ -98,7 +98,7 @@ def layers(kind: Flags, *bands: object, flags: Flags = ()) -> Case:
 
 
 def ascii_file(old: str, new: str) -> Case:
-    """An ASCII grid of arrival times with something else at a place."""
+    """Writes an ASCII grid of arrival times with another text at one place."""
     return lambda f: (edited(ascii_grid(f / "a.asc"), old, new), *ARRIVALS)
 
 

@@ -1,4 +1,4 @@
-"""Land in any unit: what map units and heights are in metres on the ground, and what is assumed."""
+"""Land in any unit: conversion of map units and heights to metres, and the assumptions made."""
 
 import math
 import re
@@ -19,7 +19,7 @@ from emberwatch.landscape.ground import is_same
 from emberwatch.landscape.lengths import METRES, side, unit_named
 
 FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
-#: Of a degree, in metres; a sphere is near enough for 0.2 degrees of slope.
+#: Length of a degree in metres; a sphere is accurate to 0.2 degrees of slope.
 DEGREE = 111_200.0
 SECOND = 1 / 3600
 LAT_60 = math.cos(math.radians(60))
@@ -76,7 +76,7 @@ SLOPES: dict[str, Map] = {
     "Web Mercator at 60 N": Map("EPSG:3857", 60, MERCATOR_60, M30),
     "Mercator of an ellipsoid at 60 N": Map("EPSG:3395", 60, (1.6e6, 8.3625e6), M30),
     "equal areas at 30 N": Map("EPSG:6933", 30, (1e6, 3.66e6), M30),
-    # Widths shrink by cos(60) / cos(30) and heights grow as much.
+    # Widths shrink by cos(60) / cos(30), and heights grow by the same factor.
     "equal areas at 60 N": Map("EPSG:6933", 30, (1e6, 6.33e6),
         (30 / 3**-0.5 * 3**-1.0, 30 * 3**0.5), "--oblong"),
     "sinusoidal on its meridian": Map(SINUSOIDAL, 30, (0, 4e6), M30),
@@ -84,7 +84,7 @@ SLOPES: dict[str, Map] = {
 
 
 def raster(path: Path, place: Map) -> Path:
-    """Heights that rise by 10 degrees to the north-east."""
+    """Writes a raster of heights that rise by 10 degrees to the north-east."""
     rows, columns = np.indices((12, 12))
     east, north = columns * place.ground[0], -rows * place.ground[1]
     metres = (0.6 * east + 0.8 * north) * math.tan(math.radians(10))
@@ -148,7 +148,7 @@ def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert words in notes(capsys)
 
 
-#: Places of rasters, flags, and words of the refusal.
+#: Places of rasters, flags, and words of the error.
 NO_PLACE: list[tuple[dict[str, Any], str, str]] = [
     *(
         ({"crs": crs, "cell": (100, 100)}, flags, f"a unit of heights, as cells are in feet, {SAY}")
@@ -257,7 +257,7 @@ def test_one_projection_in_other_words_is_the_same() -> None:
 
 
 def world(folder: Path, file: Path, cell: float) -> tuple[int, ...]:
-    """The shape of a recorded world of this fire with cells of so many metres."""
+    """Returns the shape of a recorded world of this fire, with cells of `cell` metres."""
     out = folder / "fire.npz"
     flags = "--kind arrival --unit min --burning 2 --resample nearest --force --oblong".split()
     main([str(file), *flags, "--step=10 min", f"--cell={cell}", "--out", str(out)])
@@ -282,7 +282,7 @@ def test_cells_of_a_recorded_world_are_metres_on_the_ground(
 
 
 def mapped(path: Path, unit: str, factor: float, corner: tuple[float, float], **mapping: Any):
-    """Heights on cells of 60 units of the map, whose coordinates are in some unit."""
+    """Writes heights on cells of 60 map units, with coordinates in units of `factor` map units."""
     x, y = (corner[0] + np.arange(5) * 60) / factor, (corner[1] - np.arange(4) * 60) / factor
     x = Variable(x, "f8", ("x",), {"standard_name": "projection_x_coordinate", "units": unit})
     y = Variable(y, "f8", ("y",), {"standard_name": "projection_y_coordinate", "units": unit})

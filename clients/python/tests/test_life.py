@@ -1,4 +1,4 @@
-"""Lives of environments of one world and of many: closed, copied, and at servers that fail."""
+"""The life of environments of one world or many: closed, copied, and on servers that fail."""
 
 import copy
 import pickle
@@ -55,7 +55,7 @@ def attached(making: Make, started: Server) -> Any:
 
 
 def fly(env: Any) -> Any:
-    """Steps of zeros until the worlds have moved; returns k, of one world or of many."""
+    """Steps with zeros until the worlds have moved. Returns k of one world or many."""
     step = 0
     for _ in range(SMALL["n_moves"] if env.spec.id == MOVES else 1):
         step = env.step(np.zeros(env.action_space.shape, int))[4]["step"]
@@ -102,7 +102,7 @@ def test_a_stopped_server_times_out_and_resume_goes_on(attached: Any, started: S
         fly(attached)
     started.wake_up()
     with fails("closed", match="an earlier step or reset timed out"):
-        # The first move, as that which timed out was the last of its path.
+        # The first move of a new path: the move that timed out was the last of its path.
         attached.step(np.zeros(attached.action_space.shape, int))
     _, info = attached.reset(options={"resume": True})
     assert np.all(fly(attached) == info["step"] + 1)

@@ -1,6 +1,6 @@
 """Limits of the system: memory, threads, file descriptors, and calls that a container refuses.
 
-Each in a process of its own; what needs root or a kind of cgroup is skipped where there is none.
+Each test runs in its own process. Tests that need root or a kind of cgroup are skipped without it.
 """
 
 import errno
@@ -19,7 +19,7 @@ from processes import eventually, find, server, unused_instance
 import emberwatch
 from emberwatch.errors import EmberwatchError
 
-#: Says what an error says.
+#: Prints an error's type, code and message.
 HEAD = """
 import ctypes, os, resource, struct, sys
 import emberwatch, gymnasium
@@ -38,7 +38,7 @@ LARGE = {"worlds": 256, "height": 1024, "width": 1024, "burn_in": 0}
 
 LARGE = ["--worlds=64", "--height=1024", "--width=1024", "--burn-in=0"]
 
-#: Numbers of system calls of x86-64.
+#: Numbers of x86-64 system calls.
 CALLS = {"flock": 73, "fallocate": 285, "pidfd_open": 434, "socket": 41, "clone3": 435}
 
 as_root = pytest.mark.skipif(os.getuid() != 0, reason="needs root")
@@ -60,9 +60,9 @@ def python(code: str, *arguments: object, limit: str = "true") -> str:
 
 @contextmanager
 def cgroup(kind: str, names: list[str], value: str) -> Iterator[tuple[Path, str]]:
-    """A cgroup with a limit, by one of the names that versions of cgroups have for it.
+    """Makes a cgroup with a limit, by one of the names that versions of cgroups use for it.
 
-    Yields it, and what a shell runs to enter another group within it.
+    Yields the cgroup, and a shell command that enters another group within it.
     """
     versions = [Path("/sys/fs/cgroup", kind), Path("/sys/fs/cgroup")]
     base = next((it for it in versions if (it / "cgroup.procs").exists()), None)
@@ -179,7 +179,7 @@ def test_a_refused_call_is_named_and_not_taken_for_no_server() -> None:
 import logging
 refuse(int(sys.argv[2]), int(sys.argv[3]))
 tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire().robots)
-def waits(record): raise AssertionError(record.getMessage())  # "waiting up to 100 s for it"
+def waits(record): raise AssertionError(record.getMessage())  # "waiting up to 100 s for a server"
 logging.getLogger("emberwatch").addFilter(waits)
 tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
 """
@@ -218,7 +218,7 @@ tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
     assert f"--exit-with {os.getpid()}: pidfd_open: expected the system" in ended.stderr, ended
 
 
-#: Connects with ever more free file descriptors; says how many it takes.
+#: Connects with ever more free file descriptors. Prints how many a connection needs.
 DESCRIPTORS = """
 import gc
 def count():
@@ -233,7 +233,7 @@ for free in range(60):
     except emberwatch.EmberwatchError as error: one, said = None, str(error)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 4096))
     if one is not None: break
-    assert "file descriptors, got fewer of the limit of" in said, said
+    assert "file descriptors, got fewer (the limit is" in said, said
     assert count() == before, f"{count() - before} left behind with {free} free: {said}"
     needed = said.partition("expected ")[2].partition(" file")[0]
 one.close()

@@ -1,4 +1,4 @@
-"""Action masks where trainers look: in infos, observations, wrappers, vectors and teams."""
+"""Action masks where trainers look for them: infos, observations, wrappers, vectors, teams."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics
 import emberwatch
 from emberwatch.wrappers import BeliefObservation
 
-#: Of a robot in row 0, under a grid's edge, and with a no-fly cell to its right.
+#: The mask of a robot in row 0, below the grid's edge, with a no-fly cell to its right.
 EXPECTED = [0, 1, 1, 0]
 
 
 @pytest.fixture
 def world(tmp_path: Path) -> dict[str, Any]:
-    """Keywords of worlds with no-fly cells, in which robots start at row 0, column 2."""
+    """Returns keywords of worlds with no-fly cells, where robots start at row 0, column 2."""
     path = tmp_path / "model.toml"
     path.write_text(land.model(no_fly=land.NO_FLY))
     return {**SMALL, "model": path, "start": "0,2", "n_moves": 6}
@@ -31,7 +31,7 @@ def is_mask(mask: Any, expected: Any = EXPECTED) -> bool:
 
 
 def of(*cells: tuple[int, int]) -> list[list[int]]:
-    """The masks of robots in these cells, by the loop over no-fly cells."""
+    """Returns the masks of robots in these cells, from a loop over no-fly cells."""
     return [[int(legal) for legal in land.legal_moves(cell, land.NO_FLY)] for cell in cells]
 
 
@@ -40,7 +40,7 @@ def test_a_lone_robot_s_mask_is_in_infos_and_samples(world: dict[str, Any]) -> N
     with fails("closed"):
         env.unwrapped.action_masks()
     _, info = env.reset(seed=1000)
-    info["action_mask"][:] = 5  # the caller's own to write to
+    info["action_mask"][:] = 5  # the caller may write to it
     assert is_mask(env.step(0)[-1]["action_mask"]) and is_mask(env.unwrapped.action_masks())
     observation, info = env.reset(seed=1000)
     assert is_mask(info["action_mask"])
@@ -90,7 +90,7 @@ def test_vectors_have_a_mask_for_each_robot(world: dict[str, Any]) -> None:
         actions = envs.action_space.sample(tuple(infos["action_mask"]))
         seen, *_, infos = envs.step(actions)
         assert all(map(list.__ne__, seen["robot"].tolist(), before))
-    # Rows that a reset leaves alone have none.
+    # Rows that a partial reset skips have no mask.
     envs = make_vec(2, MOVES, autoreset_mode="Disabled", **world)
     envs.reset(seed=1000)
     _, infos = envs.reset(options={"reset_mask": np.array([False, True])})
@@ -123,7 +123,7 @@ def test_paths_have_no_mask(world: dict[str, Any]) -> None:
     with refuses("observation: expected one or several of"):
         make(observation=("frame", "action_mask"), **world)
     team = closed_later(emberwatch.parallel_env(action="path", **world))
-    with refuses("action_masks: expected an environment of action='move'"):
+    with refuses("action_masks: expected an environment with action='move'"):
         team.action_masks()
 
 

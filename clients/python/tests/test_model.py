@@ -1,4 +1,4 @@
-"""Model files: what the server accepts is read, what it refuses is told in its words."""
+"""Model files: Python reads what the server accepts, and refuses the rest in its words."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""`emberwatch/WildfireMoves-v0` against `Wildfire-v0` flown with the same moves."""
+"""`emberwatch/WildfireMoves-v0`, compared with `Wildfire-v0` flown by the same moves."""
 
 import gymnasium
 import numpy as np
@@ -31,7 +31,7 @@ def test_episodes_are_truncated_after_max_episode_steps_moves() -> None:
     env = make(MOVES, max_episode_steps=6)
     transitions = rollout(env, 6, seed=1)
     assert [transition[3] for transition in transitions[1:]] == [False] * 5 + [True]
-    # The path begun is forgotten.
+    # The unfinished path is forgotten.
     observation, info = env.reset(seed=1)
     assert_same((observation, info), transitions[0])
     env.close()

@@ -1,4 +1,4 @@
-"""What the Rust part is handed: refusals instead of panics, Ctrl-C, and threads beside it."""
+"""Arguments of the Rust module: refusals instead of panics, Ctrl-C, and concurrent threads."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ from emberwatch.model import Model
 
 WILDFIRE = Model.wildfire()
 
-#: One world whose search takes minutes, and a Ctrl-C in the middle.
+#: One world whose search takes minutes, with a Ctrl-C in the middle.
 WIDE = """
 import signal
 import numpy as np
@@ -48,7 +48,7 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         asleep()
         os.kill(os.getpid(), signal.SIGINT)
         asleep()
-        started.wake_up()  # Else nothing ends a close that is not interrupted.
+        started.wake_up()  # Ends the close in case the interrupt does not.
 
     thread = threading.Thread(target=interrupt)
     with pytest.raises(KeyboardInterrupt):
@@ -69,7 +69,7 @@ def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
         _native.correct(beliefs[:0], likelihood[:0], frames)
     frozen = beliefs.copy()
     frozen.flags.writeable = False
-    with refuses("belief: expected an array to write to"):
+    with refuses("belief: expected a writable array"):
         _native.correct(frozen, likelihood, frames)
     beliefs[0, 0, 1, 0] = np.nan
     with fails("impossible_frame", match=r"cell \(1, 0\): .* the belief \[NaN"):
@@ -116,7 +116,7 @@ def test_other_threads_run_beside_work_on_large_grids() -> None:
 
 
 def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None:
-    """Two threads do the same work, until one is refused while the other is in the midst of it."""
+    """Runs the same work on two threads, until one is refused while the other works."""
     refused = threading.Event()
 
     def is_refused() -> bool:
@@ -142,9 +142,9 @@ def test_flights_refuse_rows_and_states_of_others() -> None:
             flights(n_moves)
     with refuses("grid: expected height and width"):
         _native.Flights(2, 0, 5, 4, None)
-    with refuses("row: expected one below 2, got 2"):
+    with refuses("row: expected a row below 2, got 2"):
         flights().made(2)
-    with pytest.raises(ValueError, match="paths: expected one of each row"):
+    with pytest.raises(ValueError, match="paths: expected one action per row"):
         flights().paths(np.zeros(1, np.uint8))
     begun, robots = np.ones(2, np.bool_), np.zeros((2, 2), np.int64)
     for shape in ((1, 3, 5), (2, 3, 4)):

@@ -1,4 +1,4 @@
-"""`WildfireObjective-v1`: beliefs and plans in the process."""
+"""`WildfireObjective-v1`: beliefs and plans in this process."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def interrupted(*_: object) -> None:
 
 
 def decide(env: Any) -> Any:
-    """Steps for the first state; returns k, of one world or many."""
+    """Steps with the first option. Returns k of one world or many."""
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
 
 
@@ -128,7 +128,7 @@ def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> 
     found |= {f"vector {key}": value for key, value in golden_options.episodes(envs).items()}
     for key, value in found.items():
         expected = GOLDEN[f"{name} {key}"]
-        if name == "neural_belief":  # products of matrices add up in the processor's own order
+        if name == "neural_belief":  # the order of sums depends on the processor
             assert np.allclose(value, expected, rtol=1e-3, atol=1e-4), key
         else:
             assert_same(value, expected, key)
@@ -139,7 +139,7 @@ def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> 
 def test_the_next_one_goes_on_from_the_same_belief(
     name: str, is_left: bool, checkpoints: Path
 ) -> None:
-    """From the belief that was left, or from the frames that are kept."""
+    """Resumes from the belief that was left, or from the frames that the server keeps."""
     flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "burn_in": 100}
     started = server(worlds=3, **flags)
     keywords = {"prior": "initial", **believing(name, checkpoints)}
@@ -181,7 +181,7 @@ def test_beliefs_are_shown_to_those_who_watch() -> None:
 
 
 def ringed(folder: Path) -> Path:
-    """A model whose sensor sees further, by another matrix: twice as many observations."""
+    """Makes a model whose sensor has a second ring, and so twice as many observations."""
     matrix = "[[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]]"
     sensor = f"\n[sensor]\nradius = 1\nrings = [{{ observed_as = {matrix} }}]\n"
     model = folder / "ringed.toml"
@@ -192,9 +192,9 @@ def ringed(folder: Path) -> Path:
 def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Path) -> None:
     for name in ("learned_filter", "neural_belief"):
         for maker in (make, make_vec):
-            with refuses("checkpoint: expected 6 observations as the world's, got 3"):
+            with refuses("checkpoint: expected the world's 6 observations, got 3"):
                 maker(checkpoint=checkpoints / name, model=ringed(tmp_path))
-    # An estimator that knows the model ignores what was learned.
+    # An estimator that knows the model ignores learned filters.
     known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
 
@@ -208,7 +208,7 @@ def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> 
     env: Any = closed_later(gymnasium.make(OBJECTIVE, checkpoint=checkpoint, **world))
     env.reset(seed=1000)
     assert env.step(0)[4]["step"] == 1
-    with refuses("model: expected one for the estimator 'known_model'.*got recorded worlds"):
+    with refuses("model: expected a model for the estimator 'known_model'.*got recorded worlds"):
         gymnasium.make(OBJECTIVE, **world)
 
 
@@ -222,7 +222,7 @@ def test_a_resume_after_an_unfinished_step_knows_all_frames(
         decide(env)
     seen = other.step(np.zeros(other.action_space.shape, int))[0]
     with monkeypatch.context() as patched:
-        # Between the world's step and the belief's.
+        # Interrupts after the world's step, before the belief's update.
         patched.setattr(one._plans, "see", interrupted)
         with pytest.raises(KeyboardInterrupt):
             decide(one)
@@ -251,7 +251,7 @@ def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
 
     process = context.Process(target=child)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads
+        warnings.simplefilter("ignore", DeprecationWarning)  # about forks with threads
         process.start()
     assert receiver.poll(60)
     assert_same(receiver.recv(), [step[0] for step in expected])
@@ -290,7 +290,7 @@ def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
 
 def test_a_hidden_model_must_be_given() -> None:
     instance = server(reveal_model=False).instance
-    with refuses("model: expected one for the estimator 'known_model', or a checkpoint"):
+    with refuses("model: expected a model for the estimator 'known_model', or a checkpoint"):
         make(instance=instance)
     env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)
@@ -298,7 +298,7 @@ def test_a_hidden_model_must_be_given() -> None:
 
 
 def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> None:
-    """The same features as where the server reveals it."""
+    """Checks that features are the same as when the server reveals its model."""
     flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "sensor_radius": 1}
     shown = [server(**flags, **one).instance for one in ({}, {"reveal_model": False})]
     for name in ("learned_filter", "neural_belief"):
@@ -312,8 +312,8 @@ def test_a_wrong_keyword_is_refused() -> None:
     for keywords, words in (
         ({"estimator": "truth"}, 'estimator: expected one of known_model, .*, got "truth"'),
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
-        ({"estimator": 3}, "estimator: expected the name of one, got 3"),
-        ({"prior": None}, "prior: expected the name of one, got None"),
+        ({"estimator": 3}, "estimator: expected a name, got 3"),
+        ({"prior": None}, "prior: expected a name, got None"),
         ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
         ({"estimator": "neural_belief"}, "checkpoint.*of `train --learner neural`"),

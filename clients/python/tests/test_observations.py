@@ -1,4 +1,4 @@
-"""The parts of observations: what they show, and that single and vector environments agree."""
+"""Parts of observations: their contents, and agreement of single and vector environments."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from failures import refuses
 from emberwatch.belief import Transition, entropy
 from emberwatch.wrappers import BeliefObservation
 
-#: On the smallest grid that they are meant for.
+#: The smallest grid that the parts are meant for.
 SMALL: dict[str, Any] = {"height": 12, "width": 12, "n_moves": 6, "model": "wildfire-small"}
 
 
@@ -102,7 +102,7 @@ def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
         first.close()
         second = make(instance=instance, observation=("frame", "belief"))
         seen, _ = second.reset(options={"resume": True})
-        # The prior, corrected with the last frame: what came before it is lost.
+        # The prior, corrected with only the last frame: earlier frames are lost.
         assert np.array_equal(seen["frame"], last["frame"])
         unseen, _ = second.reset(seed=4)
         assert not np.array_equal(seen["belief"], unseen["belief"])

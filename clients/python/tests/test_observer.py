@@ -1,4 +1,4 @@
-"""Observers and truth readers: what is published, who gets it, and what they miss."""
+"""Observers and truth readers: published samples, their readers, and lost samples."""
 
 import subprocess
 
@@ -14,12 +14,12 @@ FRAME_BUFFER = LIMITS["FRAME_BUFFER"]
 
 
 def frames_until(observer: Observer, step: int, world: int = 0, seed: int = 0) -> list[Frame]:
-    """Reads frames until that of a step has come; all of them, that one last."""
+    """Reads frames up to the frame of a step. Returns all of them."""
     frames = []
     while not frames or (frames[-1].world, frames[-1].result.step) != (world, step):
         frame = observer.receive(PATIENCE)
         assert frame is not None, f"no frame of world {world} at step {step}"
-        # Of the episode that is meant: a new server's begins with another seed.
+        # The frame must be of this episode: a new server begins with another seed.
         if frame.world != world or frame.result.seed == seed + world:
             frames.append(frame)
     return frames
@@ -50,7 +50,7 @@ def test_a_frame_is_the_answer_of_its_step_with_the_path_flown() -> None:
             kept.append((robot.frame, robot.frame.copy()))
     for one, copied in kept:
         assert (one == copied).all()
-        one[:] = 0  # the reader's own to write to
+        one[:] = 0  # the reader may write to it
     assert sum(frame.n_lost for frame in frames) == 0
 
 
@@ -62,7 +62,7 @@ def test_losses_among_other_worlds_are_counted() -> None:
         for k in range(FRAME_BUFFER):
             lease.step(paths(k, 2))
         frames_until(other, FRAME_BUFFER, world=1)  # Published after the answer.
-        # World 0 is published first, so that the gap ends at a sample of the other world.
+        # World 0 is published first, so the gap ends at a sample of the other world.
         frames = frames_until(observer, FRAME_BUFFER, world=1)
     assert {frame.world for frame in frames} == {1}
     # One observer may get the last sample a moment before the other.

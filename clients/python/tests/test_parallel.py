@@ -1,4 +1,4 @@
-"""All robots of a world through PettingZoo, and each of them in an environment of its own."""
+"""All robots of a world through PettingZoo, and each robot in its own environment."""
 
 import sys
 import warnings
@@ -25,7 +25,7 @@ from processes import at_once, eventually
 import emberwatch
 from emberwatch.envs.parallel import WildfireParallelEnv
 
-with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
+with warnings.catch_warnings(action="ignore"):  # PettingZoo's games warn on import
     from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 AGENTS = [f"robot_{robot}" for robot in range(4)]
@@ -53,7 +53,7 @@ def test_pettingzoo_finds_no_fault_in_paths() -> None:
     env = parallel_to_aec(team(action="path", max_episode_steps=20))
     with pytest.warns(UserWarning) as warned:
         api_test(env, num_cycles=20)
-    # It knows neither dictionaries of observations nor actions that are arrays of choices.
+    # The test supports neither Dict observations nor MultiDiscrete actions.
     about = {str(warning.message).partition(" of ")[0] for warning in warned}
     assert all("bservation" in text or "ction" in text for text in about), about
 
@@ -101,7 +101,7 @@ def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
 
 
 def test_rewards_of_a_team_are_what_its_definition_says() -> None:
-    """Shares sum to the team's reward, and what is visited together is paid once."""
+    """Checks that shares sum to the team's reward, and that a shared cell pays once."""
     paths = random_actions(30, 4, (4,))
     flown: dict[str, list[dict[str, float]]] = {}
     for reward in ("share", "team", "marginal"):
@@ -126,7 +126,7 @@ def test_the_state_is_what_the_team_saw_and_where_it_is() -> None:
         state = env.state()
         assert env.state_space.contains(state)
         frame = np.min([one["frame"] for one in seen.values()], axis=0)[..., 0]
-        seen["robot_0"]["frame"][:] = 7  # the agent's own to write to
+        seen["robot_0"]["frame"][:] = 7  # the agent may write to it
         assert (env.state() == state).all()
         values = np.where(frame == 255, state.shape[2] - 2, frame)
         assert (state[..., :-1].argmax(axis=2) == values).all()
@@ -220,7 +220,7 @@ def test_a_late_path_is_not_flown_and_told() -> None:
         assert set(np.unique(seen["age"])) == {255}
         assert (reward, info["step"], info["n_missed"], info["n_visited"]) == (0.0, 3, 3, 0)
         assert (seen["robot"] == first["robot"]).all() and (seen["frame"] == 255).all()
-        # From there on it flies again.
+        # From this frame on, it flies again.
         flown, _ = at_once(lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1]))
         assert flown[4]["n_missed"] == 0 and flown[4]["step"] == 4 and flown[4]["n_visited"] > 0
         # Missed steps count in the ages.
@@ -235,7 +235,7 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCapt
         patient, slow = alone(instance, 0), alone(instance, 1)
         patient.reset()
         slow.reset()
-        words = "world 0 waits for the paths of other robots that are held"
+        words = "world 0 waits for the paths of its other leased robots"
 
         def late() -> Any:
             assert eventually(lambda: words in caplog.text)
@@ -255,7 +255,7 @@ def test_keywords_that_fit_no_team_of_a_server_are_named() -> None:
             (make, {}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
             (make, {"robot": 3}, "robot: expected 0 to 2, got 3"),
             (make, {"robot": -1}, "robot: expected 0 to 2, got -1"),
-            (make, {"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
+            (make, {"robot": 0, "robots": 2}, "robots: expected the server's 3"),
             (make, {"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
             (partial(make_vec, 3), {"robot": 0}, "robot: expected None, as a vector"),
             (partial(make, OBJECTIVE), {"robot": 0}, of_one),
@@ -276,7 +276,7 @@ def test_rows_of_a_world_are_reset_together() -> None:
     first, _ = envs.reset(seed=[5, 0, 0, 9, 0, 0])
     assert_same(envs.reset(seed=[5, 1, 1, 9, 2, 2])[0], first)
     some = np.array([True, False, False, False, False, False])
-    with refuses("reset_mask: expected all robots of a world"):
+    with refuses("reset_mask: expected the same value for all robots of a world"):
         envs.reset(options={"reset_mask": some})
     envs.step(envs.action_space.sample())
     _, infos = envs.reset(options={"reset_mask": np.arange(6) < 3})

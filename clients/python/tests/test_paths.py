@@ -1,4 +1,4 @@
-"""Paths with letters that the locale, or UTF-8, does not have."""
+"""Paths with characters that the locale, or UTF-8, cannot encode."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, netcdf
 import emberwatch
 from emberwatch.model import Model
 
-#: A locale of ASCII alone, and one of UTF-8 whose output takes nothing else.
+#: A locale of ASCII only, and a locale of strict UTF-8 output.
 PLAIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 STRICT = {"LC_ALL": "C.UTF-8", "PYTHONIOENCODING": "utf-8:strict"}
 LATIN = os.fsdecode(b"fire \xe9")

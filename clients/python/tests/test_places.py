@@ -1,4 +1,4 @@
-"""Where a client connects: instance names, servers that are waited for, the lock."""
+"""Where a client connects: instance names, waiting for servers, the lock."""
 
 import fcntl
 import os
@@ -31,7 +31,7 @@ def test_a_server_that_is_started_later_is_waited_for(caplog: pytest.LogCaptureF
         started = server(instance)
         with waiting.result(2 * PATIENCE) as client:
             assert client.info.pid == started.program.pid
-    # Once in this test, and once in `server` if its program was slow.
+    # Sleeps once in this test, and once in `server` if its program was slow.
     assert caplog.text.count("waiting up to 20 s") in (1, 2)
     assert f"no server on instance {instance!r}" in caplog.text
 

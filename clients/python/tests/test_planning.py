@@ -1,4 +1,4 @@
-"""Beam search: the best paths, and the refusal of what makes no sense."""
+"""Beam search: the best paths, and refusals of invalid arguments."""
 
 from typing import Any
 
@@ -24,12 +24,12 @@ def test_the_generator_breaks_ties() -> None:
         beam_search(values, robots, 3, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
     )
     assert np.array_equal(first, again) and not np.array_equal(first, other)
-    # Up, down, left and right are alike.
+    # Up, down, left and right are equally good.
     counts = np.bincount(np.concatenate((first, other))[:, 0], minlength=4)
     assert counts.min() >= 5, counts
 
 
-#: Changes of right arguments, and words of the refusal.
+#: Changes that make valid arguments invalid, and words of the error.
 WRONG: list[tuple[dict[str, Any], str]] = [
     *(
         ({"n_moves": n}, f"n_moves: expected an integer within 1 to 4096, got {n}")
@@ -38,7 +38,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"width": 2.5}, "width: expected an integer within 1 to 65536, got 2.5"),
     (
         {"values": np.zeros((1, 4096, 4096)), "n_moves": 4096, "width": 65536},
-        "width: expected an integer within 1 to 1016, got 65536",  # the memory that it needs
+        "width: expected an integer within 1 to 1016, got 65536",  # limited by memory
     ),
     ({"values": np.zeros((1, 1, 5000))}, "grid: expected height and width .*, got 1 x 5000"),
     ({"values": np.zeros((2, 2))}, r"values: expected .*, got shape \(2, 2\)"),

@@ -1,4 +1,4 @@
-"""Simulated priors: the agent program's, kept, and no trouble to signals and forks."""
+"""Simulated priors: equal to the agent program's, cached, and safe with signals and forks."""
 
 import signal
 import subprocess
@@ -15,7 +15,7 @@ from emberwatch.model import Model
 MODEL = Model.wildfire()
 WORLD: dict[str, Any] = {"height": 5, "width": 7, "burn_in": 40}
 
-#: Takes hours.
+#: A script whose simulation takes hours.
 ENDLESS = """
 from emberwatch.model import Model
 from emberwatch.belief.prior import simulated_prior

@@ -1,4 +1,4 @@
-"""Recorded worlds through Gymnasium: the truth is what was recorded, to the last step."""
+"""Recorded worlds through Gymnasium: the hidden states are the recorded states."""
 
 import warnings
 from pathlib import Path
@@ -17,7 +17,7 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError
 
 States = NDArray[np.uint8]
 
-#: What a states file decides.
+#: Settings that a states file decides.
 OF_STATES = dict.fromkeys(("height", "width", "burn_in", "model"))
 
 
@@ -57,7 +57,7 @@ def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -
         _, _, terminations, truncations, _ = envs.step(envs.action_space.sample())
         assert not terminations.any()
         ends.append(truncations)
-    # The first episodes are those of seeds 0 and 1; a reset takes a step of its own.
+    # The first episodes have seeds 0 and 1. An automatic reset takes a step of its own.
     assert [int(np.argmax(of_world)) for of_world in np.transpose(ends)] == [3, 5]
     assert np.sum(ends, axis=0).min() >= 2
 
@@ -71,11 +71,11 @@ def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
             assert recorded.description is not None
             assert "10 min" in recorded.description
         for setting in ({"states": states}, {"states_offset": 1}, {"states_symmetries": True}):
-            with refuses("the running server has its own"):
+            with refuses("the running server determines it"):
                 gymnasium.make(WILDFIRE, instance=instance, **setting)
         env: Any = gymnasium.make(WILDFIRE, instance=instance)
         with warnings.catch_warnings(action="error"):
-            observation, _ = env.reset(seed=0)  # There is nothing to find yet, as was recorded.
+            observation, _ = env.reset(seed=0)  # As recorded, there is nothing to find yet.
         assert env.unwrapped.model is None
         assert observation["frame"].shape[:2] == (4, 4)
     with serving() as simulated, emberwatch.connect(simulated) as client:
@@ -91,7 +91,7 @@ def test_pictures_have_the_colours_of_the_description(states: Path) -> None:
             colors = np.array([[0, 0, 0], [255, 0, 0], [0x77, 0x77, 0x77]], np.uint8)
             truth = colors[info["truth"]].repeat(128, axis=0).repeat(128, axis=1)
             shown = env.render()[:512, -512:]
-            corners = (slice(4, None, 128), slice(4, None, 128))  # the robot is in a middle
+            corners = (slice(4, None, 128), slice(4, None, 128))  # away from the robot
             np.testing.assert_array_equal(shown[corners], truth[corners], str(world))
             env.close()
 
@@ -120,5 +120,5 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
     for keywords, words in wrong:
         with pytest.raises((InvalidArgumentError, EmberwatchError), match=words):
             gymnasium.make(WILDFIRE, **(usual | keywords))
-    with refuses("expected none without a states file"):
+    with refuses("expected false and 0 without a states file"):
         gymnasium.make(WILDFIRE, states_offset=3)

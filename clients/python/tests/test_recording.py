@@ -1,4 +1,4 @@
-"""Recordings: what Python reads of them, and what it says when something is missing."""
+"""Recordings: reading them in Python, and messages about missing records."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def packed(kind: int, stored: bytes, n_lost: int = 0, nanos: int = 1_500_000_000
 
 
 def frame(sequence: int, n_lost: int = 0, n_moves: int = 4, **changes: int) -> bytes:
-    """Robot 0 was late; robot 1 flew and saw something in its last cell."""
+    """Makes a frame: robot 0 was late; robot 1 flew and found something in its last cell."""
     sizes = {"height": 3, "width": 5, "n_robots": 2} | changes
     result = wire.WORLD.pack(7, 0, 0, 1.0, 0, 1, 0, 4, 1, 0, 0)
     head = header("FrameHeader", sequence=sequence, result=result, **sizes)
@@ -77,7 +77,7 @@ def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
     assert late.path.tolist() == [] and flew.path.tolist() == [0, 1, 2, 3]
     assert (late.result.start, flew.result.cell) == ((1, 1), (2, 4))
     assert hidden.sample.step == 7 and not hidden.sample.states.any()
-    flew.frame[:] = 1  # your own to write to
+    flew.frame[:] = 1  # the caller may write to it
     assert list(recording.read(path, world=1)) == []
 
 

@@ -1,4 +1,4 @@
-"""Pictures: cells keep their colours, marks stand out, sizes stay, screens are what there is."""
+"""Pictures: colours of cells, contrast of marks, constant sizes, and the available screens."""
 
 import logging
 import re
@@ -54,7 +54,7 @@ def test_cells_are_squares_of_their_colour() -> None:
 def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     image = draw()
     assert pixel(image, 40, 20) == DARK  # between the first two cells
-    assert pixel(image, 20, 20) == WHITE  # where it begins
+    assert pixel(image, 20, 20) == WHITE  # where the path begins
     assert pixel(image, 60, 60) == DARK  # the robot's dot
     assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its circle
     without = draw(paths=[])
@@ -100,7 +100,7 @@ def test_panels_are_about_512_pixels_and_even() -> None:
         assert draw(**parts, truth=np.zeros(grid, np.uint8), scale=None).shape[:2] == both
 
 
-#: Changes of a picture, and words about them.
+#: Invalid changes of a picture, each with words of its error.
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"frame": FRAME[0]}, r"frame: expected shape \(H, W\)"),
     ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
@@ -186,7 +186,7 @@ def test_a_window_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     screen.show(Picture(**PARTS))
     screen.close()
     screen.close()
-    one, other = Screen(), Screen()  # take turns in the one window
+    one, other = Screen(), Screen()  # share one window in turn
     for screen in (one, other, one):
         screen.show(Picture(**PARTS))
     other.close()

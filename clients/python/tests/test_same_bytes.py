@@ -1,9 +1,8 @@
 """Every environment returns the same bytes as when `same_bytes.json` was recorded.
 
-The file has a digest for each 100 of what they return, with types, keys in their order, dtypes and
-shapes; the tests look at the first 600 of its 1,000 steps. It holds for worlds in this process and
-for those of a server.
-`python test_same_bytes.py` records it again, from the package that is installed.
+The file has one digest per 100 returned values, over their types, ordered keys, dtypes, shapes and
+bytes. The tests check the first 600 of its 1,000 steps, for worlds in this process and on a server.
+`python test_same_bytes.py` records the file again, from the installed package.
 """
 
 import functools
@@ -27,7 +26,7 @@ FILE = Path(__file__).with_name("same_bytes.json")
 
 N_RECORDED, N_STEPS, N_PER_DIGEST = 1000, 600, 100
 
-#: Moves of a path.
+#: Moves per path.
 T = 6
 
 WORLD: dict[str, Any] = {"height": 9, "width": 11, "n_moves": T, "burn_in": 60, "model": LIVELY}
@@ -36,17 +35,17 @@ FLAGS: dict[str, Any] = {"height": 9, "width": 11, "moves": T, "burn_in": 60, "m
 PARTS = ("frame", "image", "robot", "age", "belief", "team", "others")
 MOVES_PARTS = (*PARTS, "local", "recent", "visited", "move")
 
-#: Settings of worlds that a running server has, by the keyword.
+#: The server's flag for each keyword of a world.
 OF_SERVERS = {
     name: name for name in ("height", "width", "burn_in", "model", "states", "robots")
 } | {"n_moves": "moves"}
 
-#: What an environment returns, call by call.
+#: The values that an environment returns, call by call.
 Outcomes = Iterator[object]
 
 
 def told(value: Any) -> Iterator[bytes]:
-    """A value as bytes, with all that a caller can tell apart."""
+    """Yields a value as bytes, including everything that a caller can distinguish."""
     yield f"{type(value).__name__} ".encode()
     if isinstance(value, Mapping):
         yield from told(list(value.items()))
@@ -78,7 +77,7 @@ def actions(high: int, *shape: int) -> Iterator[Any]:
 
 
 def placed(attaches: bool, n_worlds: int, keywords: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of worlds in this process, or of the same at a server."""
+    """Returns keywords of worlds in this process, or of the same worlds on a server."""
     if not attaches:
         return keywords
     flags = {flag: keywords.get(name) for name, flag in OF_SERVERS.items()}
@@ -88,7 +87,7 @@ def placed(attaches: bool, n_worlds: int, keywords: dict[str, Any]) -> dict[str,
 
 
 def single(name: str, high: int, *shape: int, attaches: bool, **keywords: Any) -> Outcomes:
-    """Episodes of one environment, of which one is broken off and one resumed."""
+    """Runs episodes of one environment: one is cut short, and one is resumed."""
     keywords = {**WORLD, "max_episode_steps": 70, **keywords}
     env = make(name, **placed(attaches, 1, keywords))
     yield env.reset(seed=11)
@@ -114,7 +113,7 @@ def vector(
     robots: int = 1,
     **keywords: Any,
 ) -> Outcomes:
-    """Episodes of three worlds, which do not end together."""
+    """Runs episodes of three worlds, which end at different times."""
     n_rows = 3 * robots
     if robots > 1:
         keywords["robots"] = robots
@@ -149,7 +148,7 @@ def team(action: str, high: int, *shape: int, attaches: bool, **keywords: Any) -
 
 
 def members() -> Outcomes:
-    """Two environments that fly the robots of one world together."""
+    """Runs two environments that fly the robots of one world together."""
     instance = server(robots=2, **FLAGS).instance
     keywords = {"instance": instance, "observation": PARTS, "timeout": 60.0}
     envs = [make(robot=robot, reward="marginal", **keywords) for robot in range(2)]
@@ -160,7 +159,7 @@ def members() -> Outcomes:
 
 
 def lease(attaches: bool) -> Outcomes:
-    """The plain client's answers: all robots of three worlds, or one world after the other."""
+    """Flies three worlds with the plain client: all robots at once, or world by world."""
     flags = {"worlds": 3, "robots": 2, "coverage": "client", "history": 5, **FLAGS}
     client = server(**flags).connect() if attaches else emberwatch.embed(**flags)
     lease = client.acquire(0, 6)
@@ -175,7 +174,7 @@ def lease(attaches: bool) -> Outcomes:
 
 
 def recorded(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
-    """Worlds of recorded states, which end with the last of them."""
+    """Runs worlds of recorded states, which end with the last recorded state."""
     with tempfile.TemporaryDirectory() as folder:
         rng, path = np.random.default_rng(5), Path(folder, "states.npz")
         lengths = {"states_000": 40, "states_001": 53}
@@ -187,7 +186,7 @@ def recorded(name: str, high: int, *shape: int, **keywords: Any) -> Outcomes:
 
 
 def cases(attaches: bool) -> dict[str, Callable[[], Outcomes]]:
-    """All of them by name, in this process or at a server."""
+    """Returns all cases by name, in this process or on a server."""
     where = {"attaches": attaches}
     path = {"observation": PARTS, "truth": True, **where}
     moves = {"observation": MOVES_PARTS, "reward": "move", "truth": True, **where}

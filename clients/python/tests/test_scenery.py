@@ -1,4 +1,4 @@
-"""Zones, no-fly cells and what was seen beyond the path, in pictures."""
+"""Zones, no-fly cells and cells seen beyond the path, in pictures."""
 
 from itertools import product
 from typing import Any

@@ -1,4 +1,4 @@
-"""States of an environment's session: what a step, a resume and a reset do in each of them."""
+"""The states of an environment's session, and the effects of step, resume and reset in each."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -41,7 +41,7 @@ def torn(env: Any) -> None:
     interrupted(env._session, "_settle", lambda: env.reset(seed=2))
 
 
-#: From READY, how another state is reached.
+#: How each state is reached from READY.
 REACHED: dict[State, Callable[[Any], object]] = {
     State.CLOSED: lambda env: env.close(),
     State.READY: lambda env: None,
@@ -50,7 +50,7 @@ REACHED: dict[State, Callable[[Any], object]] = {
     State.TORN: torn,
 }
 
-#: Codes of a step and a resume in each state, or the step of the world that they show.
+#: The results of a step and of a resume in each state: an error's code, or the world's step.
 OUTCOMES: dict[State, tuple[str | int, str | int]] = {
     State.CLOSED: ("closed", "invalid_argument"),
     State.READY: (3, 2),
@@ -73,7 +73,7 @@ def started() -> Iterator[Server]:
 
 
 def outcome(call: Callable[[], Any]) -> str | int:
-    """The code of a refusal, or the step in the info."""
+    """Returns the code of an error, or the step in the info."""
     try:
         return call()[-1]["step"]
     except EmberwatchError as error:
@@ -95,7 +95,7 @@ def test_each_state_has_its_calls(env: Any, state: State) -> None:
         REACHED[state](env)
         assert env._session._state is state
         assert call(env) == OUTCOMES[state][n]
-        # A step that was refused has changed nothing, and after a resume steps are allowed.
+        # A refused step has changed nothing, and a resume allows steps again.
         expected = State.READY if isinstance(OUTCOMES[state][n], int) else state
         assert env._session._state is expected
     for fails_first in (False, True):
@@ -120,7 +120,7 @@ def test_an_episode_that_is_over_waits_for_the_holder_of_all(started: Server) ->
 
 
 def test_a_lone_robot_is_never_late(env: Any) -> None:
-    env._session.lease.native.note(0, 0)  # as if steps had passed unseen
+    env._session.lease.native.note(0, 0)  # as if steps had been missed
     assert step(env) == "late"
     assert step(env) == "interrupted"
     assert [resume(env), step(env)] == [2, 3]

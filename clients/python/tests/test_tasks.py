@@ -1,4 +1,4 @@
-"""Tasks: their names, ids and worlds, which are those of the same settings by hand."""
+"""Tasks: their names, ids and worlds, which equal worlds with the same settings by hand."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ from emberwatch._native import built_in
 from emberwatch.benchmark import evaluate, suite
 from emberwatch.model.tasks import Task, built_in_tasks
 
-with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
+with warnings.catch_warnings(action="ignore"):  # PettingZoo's games warn on import
     from pettingzoo.test import parallel_api_test
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -43,7 +43,7 @@ OF_TASKS = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
 
 
 def each(names: Iterable[str]) -> pytest.MarkDecorator:
-    """A test for each of these tasks; burn-ins of some take seconds."""
+    """Parametrizes a test by task. Tasks whose burn-ins take seconds are marked slow."""
     marks = {"sparse": pytest.mark.slow, "latent": pytest.mark.slow}
     kept = [pytest.param(name, marks=marks.get(name, ())) for name in names]
     return pytest.mark.parametrize("name", kept)
@@ -109,7 +109,7 @@ def test_the_team_task_passes_pettingzoo_and_refuses_one_robot() -> None:
     with no_warnings():
         env = emberwatch.parallel_env(task="team")
         assert len(env.possible_agents) == 4
-        # It resets with seed 0, and learns nothing.
+        # PettingZoo's test resets with seed 0, and learns nothing.
         warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
         parallel_api_test(env, num_cycles=50)
         env.close()
@@ -144,26 +144,26 @@ def test_a_running_server_must_have_the_task() -> None:
         with warns_of_tests("small"):
             env.reset(seed=0)
         env.close()
-        with refuses("task: expected 'small', as the server has, or None, got 'sparse'"):
+        with refuses("task: expected the server's 'small', or None, got 'sparse'"):
             gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
         with refuses("task ash: No such file"):
             gymnasium.make(WILDFIRE, instance=lab, task="ash")
 
 
-#: Changes of a task, and words about a server of the task before.
+#: Changes of a task, and words of the error about a server of the unchanged task.
 CHANGED = {
     "small": [
-        ("moves = 16", "moves = 15", "moves of task 'own': expected 16, as the server"),
+        ("moves = 16", "moves = 15", "moves of task 'own': expected the server's 16"),
         (
             "max_steps",
             "sensor_radius = 1\nmax_steps",
-            "sensor_radius of task 'own': expected 0, as",
+            "sensor_radius of task 'own': expected the server's 0",
         ),
-        ("burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected 3000, as"),
-        ("max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected 300"),
-        ("wildfire-small", "wildfire", "states of task 'own': expected those that the"),
+        ("burn_in = 3000", "burn_in = 3", "burn_in of task 'own': expected the server's 3000"),
+        ("max_steps = 300", "max_steps = 3", "max_steps of task 'own': expected the server's 300"),
+        ("wildfire-small", "wildfire", "states of task 'own': expected the server's states"),
     ],
-    "team": [("robots = 4", "robots = 3", "robots of task 'own': expected 4, as the server")],
+    "team": [("robots = 4", "robots = 3", "robots of task 'own': expected the server's 4")],
 }
 
 
@@ -215,7 +215,7 @@ def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
         suite({"small": down}, tasks=[file], **chosen)
 
 
-#: What makes environments of a task, and resets them on its test world of that seed.
+#: Functions that make environments of a task and reset them on the test world of a seed.
 ON_TEST_WORLDS: list[Any] = [
     lambda task: gymnasium.make(WILDFIRE, task=task),
     lambda task: gymnasium.make_vec(MOVES, 2, task=task),
@@ -266,7 +266,7 @@ def test_evaluations_are_on_test_worlds_without_a_warning(own: Path, tmp_path: P
         suite(up, tasks=[own], worlds=1, folder=tmp_path / "suite", **common)
 
 
-#: Resets at two places, of several environments, and one with the warning switched off before.
+#: Resets several environments at two places, first with the warning switched off.
 RESETS = """
 import warnings, gymnasium, emberwatch
 from gymnasium.vector import SyncVectorEnv

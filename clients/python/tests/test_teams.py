@@ -1,4 +1,4 @@
-"""Several robots of one world through the plain client: leases, paths, frames of the team."""
+"""Several robots of one world through the plain client: leases, paths, team frames."""
 
 from pathlib import Path
 from typing import Any
@@ -71,7 +71,7 @@ def test_a_team_is_evaluated_as_a_whole(tmp_path: Path) -> None:
     shared = evaluate(fly, name="both", robots=2, observation=("robot", "team"), **keywords)
     assert [row.team for row in shared] == ["shared"] * 2
     assert [row.mean_reward for row in shared] == [row.mean_reward for row in rows]
-    # The first step: two cells together, then two more each; later they press against the edge.
+    # At first they share two cells, then visit two more each. Later they push against the edge.
     assert all(0.0 < row.mean_repeated < 0.5 for row in rows)
     assert all(row.mean_distinct_cells < 8 for row in rows)
     assert len(emberwatch.benchmark.read(tmp_path / "team.csv")) == 4

@@ -1,4 +1,4 @@
-"""What the agent writes for TensorBoard, read by TensorBoard itself."""
+"""The agent's event files for TensorBoard, read by TensorBoard itself."""
 
 import csv
 import subprocess
@@ -65,7 +65,7 @@ def test_a_training_shows_its_metrics_and_beliefs(tmp_path: Path) -> None:
         assert scalars(folder, name) == pytest.approx(averages(folder, name), rel=1e-5)
     assert list(scalars(folder, "update").values())[-1] == int(rows(folder)[-1]["update"])
     images = read(folder).Images("belief_of_first_world")
-    # 120 steps of two worlds: the first and the hundred-and-first.
+    # 120 steps of two worlds have images at steps 1 and 101.
     assert [image.step for image in images] == [2, 202]
     for image in images:
         assert (image.width, image.height) == (9 * 16, 6 * 16)

@@ -1,4 +1,4 @@
-"""Threads of one process: forks meanwhile, other work during waits, turns, refused copies."""
+"""Threads of one process: concurrent forks, work during waits, turns, refused copies."""
 
 import copy
 import pickle
@@ -74,7 +74,7 @@ def test_a_wait_leaves_the_interpreter_to_other_threads() -> None:
     lease, mate = started.connect().acquire(0), started.connect().acquire(1)
     waits = threading.Thread(target=lambda: lease.step([3] * 6))
     waits.start()
-    mate.step([3] * 6)  # What the other waits for is done here.
+    mate.step([3] * 6)  # The other thread waits for this step.
     waits.join()
 
 
@@ -85,7 +85,7 @@ def test_what_is_open_is_not_copied() -> None:
             copied(client)
 
 
-#: Environments, with the action that all steps take.
+#: Environments, each with the action of all steps.
 SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
     "path": (make, np.array([1, 3, 1, 3])),
     "moves": (lambda: make_vec(3, MOVES, observation=("belief", "local")), np.array([3, 1, 0])),
@@ -98,7 +98,7 @@ SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
 
 @contextmanager
 def repeated(call: Callable[[], object]) -> Iterator[None]:
-    """Another thread calls meanwhile, and fails the test if that raises."""
+    """Repeats a call on another thread meanwhile, and fails the test if the call raises."""
     errors, is_over = list[BaseException](), threading.Event()
 
     def repeat() -> None:
@@ -132,12 +132,12 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
 
     at_once(step, step, step, step)
 
-    # They may be appended in another order.
+    # The threads may append in any order.
     def moment(outcome: Any) -> str:
         return repr(outcome[-1]) + repr(outcome[0]) + repr(outcome[1])
 
     assert sorted(map(moment, steps)) == sorted(map(moment, expected[1:]))
-    # A thread that resets waits for a step of another.
+    # A thread that resets waits for another thread's step.
     with repeated(lambda: env.step(action)):
         for _ in range(20):
             env.reset(seed=1000)
@@ -145,7 +145,7 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
     assert_same(first, [alone.reset(seed=1001), *(alone.step(action) for _ in range(8))])
 
 
-@pytest.mark.parametrize("height", [7, 130])  # beyond 16,384 cells in all, too
+@pytest.mark.parametrize("height", [7, 130])  # 7, and more than 16,384 cells in total
 def test_a_thread_that_watches_reads_masks_and_parts_of_the_path(height: int) -> None:
     envs = make_vec(2, MOVES, height=height, width=height)
     envs.reset(seed=1000)

@@ -1,4 +1,4 @@
-"""TorchRL takes the environments as they are."""
+"""TorchRL works with the environments unchanged."""
 
 from typing import Any
 
@@ -42,7 +42,7 @@ def test_its_wrapper_of_a_vector_returns_the_vectors_steps(mode: str) -> None:
     np.testing.assert_array_equal(seen["observation"].numpy(), first)
     for step in range(6):
         moves = plain.action_space.sample()
-        # Its categorical actions are one-hot unless it is asked otherwise.
+        # TorchRL's categorical actions are one-hot by default.
         seen["action"] = torch.nn.functional.one_hot(torch.from_numpy(moves), 4)
         seen = wrapped.step(seen)["next"]
         observations, rewards, _, truncated, infos = plain.step(moves)

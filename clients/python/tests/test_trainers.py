@@ -1,4 +1,4 @@
-"""Stable-Baselines3 takes the environments as they are."""
+"""Stable-Baselines3 works with the environments unchanged."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from emberwatch.benchmark import evaluate
 from emberwatch.sb3 import WildfireVecEnv, make_vec_env
 
-#: The smallest images that its convolutional policies take.
+#: The smallest images that its convolutional policies accept.
 IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY}
 
 
@@ -67,7 +67,7 @@ def test_the_vector_environment_is_that_of_single_ones(name: str, keywords: dict
 
 
 def plain(observations: Any) -> Any:
-    """Without its ordered dictionaries."""
+    """Converts an ordered dictionary of Stable-Baselines3 to a plain one."""
     return dict(observations) if isinstance(observations, dict) else observations
 
 
@@ -86,15 +86,15 @@ def test_robots_of_a_world_share_a_policy() -> None:
 
 
 def test_what_is_no_vector_for_it_is_named() -> None:
-    with refuses("env: expected gymnasium.make_vec of an env"):
+    with refuses("env: expected an environment of emberwatch from"):
         WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))
     vector = make_vec_env(MOVES, 2, **IMAGE)
     assert vector.get_attr("n_moves") == [4, 4] and vector.env_is_wrapped(VecMonitor) == [False] * 2
     for call in (lambda: vector.set_attr("n_moves", 3), lambda: vector.env_method("step")):
-        with refuses("the worlds share one environment"):
+        with refuses("all worlds share one environment"):
             call()
     for options in ({"resume": True}, [{}, {"resume": True}]):
-        with refuses("set_options: expected none, got"):
+        with refuses("set_options: expected no options, as resets"):
             vector.set_options(options)
     for options in (None, {}, [{}, {}]):
         vector.set_options(options)

@@ -1,4 +1,4 @@
-"""The tutorial of the documentation site, as a user runs it."""
+"""Runs the tutorial of the documentation site as a user would."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The vector environments against Gymnasium's `SyncVectorEnv` of single ones."""
+"""Vector environments, compared with Gymnasium's `SyncVectorEnv` of single environments."""
 
 import copy
 import os
@@ -26,7 +26,7 @@ from emberwatch.errors import LeaseLostError
 
 PARTS = ("frame", "robot", "age")
 
-#: Keywords of an environment that shows all it can.
+#: Keyword arguments of an environment with all parts of observations.
 ALL: dict[str, dict[str, Any]] = {
     WILDFIRE: {"observation": (*PARTS, "image", "belief")},
     MOVES: {"observation": (*PARTS, "image", "belief", "local", "recent", "visited", "move")},
@@ -39,7 +39,7 @@ Vector = VectorEnv[Any, Any, Any]
 
 
 def sync_of(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> Vector:
-    """The same worlds as single environments; with `instance` the worlds of a server in turn."""
+    """Returns the same worlds as single environments; with `instance`, a server's worlds."""
 
     def maker(world: int) -> Callable[[], gymnasium.Env[Any, Any]]:
         place = {} if keywords.get("instance") is None else {"world": world}
@@ -66,7 +66,7 @@ def assert_same_flight(ours: Vector, theirs: Vector, n_steps: int, seed: Any) ->
 
 
 def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
-    """The same for steps; returns how many episodes ended."""
+    """Asserts the same for steps. Returns the number of episodes that ended."""
     n_ends = 0
     for step, action in enumerate(actions(theirs, n_steps)):
         left, right = ours.step(action), theirs.step(action)
@@ -97,7 +97,7 @@ def test_every_field_is_that_of_single_environments(
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.single_action_space == theirs.single_action_space
     assert_same_flight(ours, theirs, 2, seed=17)
-    # Some are reset in between, so that episodes end at different times.
+    # Some worlds are reset in between, so that episodes end at different times.
     assert_same_resets(ours, theirs, [True, False, True, False], [7, None, 8, None])
     n_ends = assert_same_steps(ours, theirs, n_steps - 2)
     assert n_ends == 2
@@ -108,13 +108,13 @@ def test_every_field_is_that_of_single_environments(
         assert_same_steps(ours, theirs, 1)
     else:
         assert assert_same_steps(ours, theirs, 5 * n_steps) > 8
-    # Without a seed, each world's own generator goes on.
+    # Without a seed, each world's own generator continues.
     assert_same_flight(ours, theirs, 2, seed=None)
 
 
 @by_name
 def test_worlds_of_running_servers_are_the_same_too(name: str) -> None:
-    # The servers truncate by themselves, and the vector's worlds begin at 2 of theirs.
+    # The servers truncate by themselves, and the vector's worlds begin at the server's world 2.
     flags = {"publish_truth": True, "max_steps": 3}
     with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
         ours = make_vec(3, name, instance=one, world=2, truth=True)
@@ -133,14 +133,14 @@ def test_seeds_are_those_of_single_environments() -> None:
     for seed in (0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)):
         plain = int(seed) if isinstance(seed, np.integer) else seed
         assert_same(ours.reset(seed=seed), theirs.reset(seed=plain), repr(seed))
-        # The generators go on alike.
+        # The generators continue alike.
         for _ in range(2):
             assert_same(ours.reset(), theirs.reset(), repr(seed))
 
 
 def test_a_reset_mask_is_left_as_it_was() -> None:
     env = make_vec(2)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="reset of all worlds before"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match="all worlds in the first reset"):
         env.reset(options={"reset_mask": np.array([True, False])})
     env.reset(seed=1)
     options = {"reset_mask": np.array([True, False])}
@@ -193,7 +193,7 @@ def spoil(value: Any) -> None:
 def test_what_was_returned_is_never_changed_and_may_be_written_to(
     mode: AutoresetMode | None, name: str
 ) -> None:
-    """Of vectors in each mode, or of single environments."""
+    """Covers vectors in each mode, and single environments."""
     keywords: dict[str, Any] = {**ALL[name], "max_episode_steps": 3, "truth": True}
     keywords["render_mode"] = "rgb_array"
     many: dict[str, Any] = {"n_worlds": 3, "autoreset_mode": mode} if mode else {}

@@ -1,4 +1,4 @@
-"""The wire against PROTOCOL.md: tables, codes, limits, examples; and bytes that make no sense."""
+"""The wire format agrees with PROTOCOL.md: tables, codes, limits, examples; bad bytes fail."""
 
 import copy
 import dataclasses
@@ -31,7 +31,7 @@ from emberwatch.client.replies import (
 from emberwatch.errors import EmberwatchError
 
 LAYOUTS = document.layouts()
-#: What is in payloads: as bytes, as an array, as a tuple.
+#: The results in payloads, as bytes, as an array and as a tuple.
 RESULTS = {
     "WorldResult": (wire.WORLD, wire.WORLD_DTYPE, wire.WorldResult),
     "RobotResult": (wire.ROBOT, wire.ROBOT_DTYPE, wire.RobotResult),
@@ -39,11 +39,11 @@ RESULTS = {
 EXAMPLES = document.examples()
 HELLO, *HELLOS = (message for message in EXAMPLES if message.get("reply") == "hello")
 SIZES = {"height": 3, "width": 5, "n_moves": 4, "n_worlds": 1, "n_robots": 2}
-#: With all that land adds to it.
+#: The example with all fields about land.
 LANDED = next(message for message in HELLOS if "airspace" in message)
 LEFT = next(message for message in EXAMPLES if message.get("reply") == "belief")
 
-#: Where the world stands in that example.
+#: The state of the world in that example.
 RESULT = SimpleNamespace(world=SimpleNamespace(episode=1, step=2))
 
 #: The belief of that example.
@@ -55,7 +55,7 @@ def replies(kind: str) -> list[dict[str, Any]]:
 
 
 class Wire:
-    """In place of a native connection: keeps the requests and answers what it is told to."""
+    """A fake native connection that keeps the requests and returns prepared answers."""
 
     def __init__(self, hello: dict[str, Any]) -> None:
         self.info = json.dumps(hello)
@@ -78,7 +78,7 @@ class Wired:
         self.lease = Lease(self.client, grant, (), range(0, 2))
 
     def say(self, reply: object) -> None:
-        """Lets it answer this, to whatever request."""
+        """Prepares the answer to any request."""
         self.wire.answer = reply if isinstance(reply, str) else json.dumps(reply)
 
 
@@ -201,7 +201,7 @@ def test_a_refusal_is_in_the_words_of_python() -> None:
     assert str(errors.refusal(10, error["detail"], error["message"])) == message
 
 
-#: Changes of the documented land that no grid has.
+#: Changes of the documented land that make it invalid.
 NO_LAND: list[tuple[str, Any]] = [
     ("airspace", []),
     *(("airspace", {"radius": it}) for it in (9, None, 1.0)),

@@ -1,4 +1,4 @@
-"""Errors of environments in worker processes, which `AsyncVectorEnv` formats and makes again."""
+"""Errors of environments in worker processes, which `AsyncVectorEnv` formats and recreates."""
 
 import ast
 import pickle
@@ -25,13 +25,13 @@ def workers(**keywords: Any) -> AsyncVectorEnv:
 
 
 def make_later(**keywords: Any) -> Callable[[], Any]:
-    # Spawned workers know no id but with its package.
+    # Spawned workers know an id only with its package.
     return lambda: gymnasium.make(f"emberwatch:{WILDFIRE}", **keywords)
 
 
 @pytest.fixture(autouse=True)
 def quiet() -> Any:
-    """Gymnasium tells the errors of workers as warnings."""
+    """Ignores Gymnasium's warnings about errors of workers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -70,7 +70,7 @@ def test_an_error_made_again_is_the_same() -> None:
 
 
 def test_no_line_of_a_traceback_has_a_percent_sign() -> None:
-    # `AsyncVectorEnv` formats the traceback with `%`, which then hides the error.
+    # `AsyncVectorEnv` formats the traceback with `%`, so a percent sign would hide the error.
     raised = [PACKAGE / "envs", PACKAGE / "client"]
     for path in [*PACKAGE.glob("*.py"), *(it for folder in raised for it in folder.rglob("*.py"))]:
         lines = path.read_text().splitlines()

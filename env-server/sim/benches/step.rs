@@ -1,7 +1,7 @@
-//! The server's work for one step request, without the channel: checks, paths, world transitions,
-//! sensor, results and frames.
+//! Measures the server's work for one step request without the channel: checks, paths, world transitions, sensor,
+//! results and frames.
 //!
-//! Peer: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
+//! For comparison: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
 //! `cargo bench -p emberwatch-sim --bench step -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
@@ -17,20 +17,20 @@ use std::time::Instant;
 
 const CLIENT: ClientId = ClientId { node: 1, pid: 1 };
 
-/// A client's view of a simulator: a lease on every robot, and the next request.
+/// A simulator and its client, with a lease on every robot and the next request.
 struct Session {
     simulator: Simulator,
     request: StepRequest,
-    /// Many random paths: a robot that flew the same ever again would be easy to predict.
+    /// Many random paths, since the CPU would learn to predict the branches of a single repeated path.
     paths: Vec<Vec<u8>>,
-    /// The step of each world.
+    /// The current step of each world.
     steps: Vec<u64>,
     body: Vec<u8>,
     payload: Vec<u8>,
 }
 
 impl Session {
-    /// Worlds at k = 0, on grids of 64 x 64, with paths of 64 moves.
+    /// Creates worlds at k = 0 on grids of 64 x 64 cells, with paths of 64 moves.
     fn new(n_worlds: u32, team: u32) -> Self {
         Self::of(ServerConfig {
             worlds: n_worlds,
@@ -75,7 +75,7 @@ impl Session {
         }
     }
 
-    /// One request; returns the size of the answer's payload.
+    /// Sends one request and returns the size of the answer's payload.
     fn step(&mut self) -> usize {
         let path = &self.paths[self.request.sequence as usize % self.paths.len()];
         self.body.clear();
@@ -92,7 +92,7 @@ impl Session {
     }
 }
 
-/// A lease on every robot.
+/// Acquires a lease on every robot and returns its token.
 fn acquire(simulator: &mut Simulator, n_robots: u32) -> u64 {
     let request = Request::Acquire {
         first_robot: 0,
@@ -155,7 +155,7 @@ fn simulator_step(criterion: &mut Criterion) {
 fn snapshot(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("snapshot (target: 100 us each)");
     let mut session = Session::new(1, 1);
-    // As many as are kept.
+    // Enough steps to fill the history (256 by default).
     (0..300).for_each(|_| _ = session.step());
     let simulator = &session.simulator;
     let bytes = simulator.snapshot(0..1).expect("a world that is ready");

@@ -1,17 +1,17 @@
-//! The least and the greatest value of each number among the settings.
+//! The minimum and maximum of each numeric setting.
 
 use emberwatch_messages::capacity::{MAX_ROBOTS, MAX_WORLDS};
 use emberwatch_model::MAX_RADIUS;
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::path::MAX_MOVES;
 
-/// Milliseconds.
+/// One day in milliseconds.
 const DAY: i128 = 86_400_000;
 
-/// Any number of 64 bits.
+/// The maximum of settings that accept any unsigned 64-bit number.
 const ANY: i128 = u64::MAX as i128;
 
-/// By the name of the setting. A `sensor_radius` of -1 is the model's own.
+/// Name, minimum and maximum of each numeric setting. A `sensor_radius` of -1 means the radius of the model file.
 pub const BOUNDS: [(&str, i128, i128); 16] = [
     ("worlds", 1, MAX_WORLDS as i128),
     ("moves", 1, MAX_MOVES as i128),

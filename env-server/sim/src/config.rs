@@ -20,10 +20,10 @@ use std::path::Path;
 use std::sync::Arc;
 use thiserror::Error;
 
-/// The name of the default model.
+/// Name of the default model.
 const WILDFIRE: &str = "wildfire";
 
-/// Every setting; `config/server.toml` and `flags.rs` explain each.
+/// All settings of a server. `config/server.toml` and the server's `flags.rs` explain each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ServerConfig {
@@ -56,50 +56,50 @@ pub struct ServerConfig {
     pub snapshot_keep: u32,
 }
 
-/// Checked settings, with the model and the recorded worlds that they name.
+/// Checked settings, with the loaded model and recorded states that they name.
 #[derive(Debug, Clone)]
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
-    /// The name of the task, if the worlds are one.
+    /// Name of the task that set the worlds' settings, if any.
     pub task: Option<String>,
-    /// That of recorded worlds has no changes.
+    /// For recorded worlds, a model without transitions: the states come from the file.
     pub model: Model,
     pub shape: Shape,
-    /// What no-fly cells leave to the robots.
+    /// The free cells that robots can reach.
     pub reach: Reach,
     pub recorded: Option<CheckedStates>,
 }
 
-/// What recorded worlds show.
+/// Recorded states after their checks.
 #[derive(Debug, Clone)]
 pub struct CheckedStates {
-    /// Their description in TOML.
+    /// The description file as TOML.
     pub description: String,
-    /// CRC-32 of the sequences.
+    /// CRC-32 of the sequences' shapes and values.
     pub checksum: u32,
     pub recorded: Arc<Recorded>,
 }
 
-/// Why settings were refused.
+/// An error in the settings.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigError {
-    /// `what` is `config file` or `model file`.
+    /// An error in a file; `what` is `config file` or `model file`.
     #[error("{what} {path}: {problem}")]
     File {
         what: &'static str,
         path: String,
         problem: String,
     },
-    /// A setting out of its range.
+    /// A setting outside its range.
     #[error("{setting}: expected {expected}, got {got}")]
     Range {
         setting: &'static str,
         expected: String,
         got: String,
     },
-    /// A setting given by name that is impossible.
+    /// A setting given by name ([`ServerConfig::with`]) that is unknown, invalid or not allowed here.
     #[error("{setting}: expected {expected}, got {got}")]
     Given {
         setting: String,
@@ -153,7 +153,9 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Checks every setting; a task decides all that makes worlds, a states file model, grid and burn-in.
+    /// Checks every setting and loads the files that they name.
+    ///
+    /// A task replaces every setting that shapes the worlds; a states file replaces model, grid and burn-in.
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
         let task = self.take_task()?;
@@ -199,7 +201,7 @@ impl ServerConfig {
         })
     }
 
-    /// Takes the settings of the task, if there is one; its name.
+    /// Copies the settings of the task, if there is one, and returns its name.
     fn take_task(&mut self) -> Result<Option<String>, ConfigError> {
         if self.task.is_empty() {
             return Ok(None);
@@ -216,13 +218,13 @@ impl ServerConfig {
 
     fn check_ranges(&self) -> Result<(), ConfigError> {
         let settings = self.values();
-        // Recorded states decide height and width later; `Shape` checks both.
+        // Recorded states may still replace height and width; `Shape` checks both later.
         let bounds = BOUNDS
             .iter()
             .filter(|(it, ..)| !["height", "width"].contains(it));
         for &(setting, least, most) in bounds {
             let number = settings[setting].as_number().and_then(Number::as_i128);
-            let number = number.expect("invariant: bounds are those of integers");
+            let number = number.expect("invariant: bounded settings are integers");
             in_range(setting, number, least, most)?;
         }
         let needs = |setting, expected: &str, got| {
@@ -240,7 +242,7 @@ impl ServerConfig {
         if self.states.is_empty() && (self.states_symmetries || self.states_offset > 0) {
             let got = format!("{} and {}", self.states_symmetries, self.states_offset);
             let settings = "states_symmetries and states_offset";
-            return needs(settings, "none without a states file", got);
+            return needs(settings, "false and 0 without a states file", got);
         }
         Ok(())
     }
@@ -253,7 +255,7 @@ impl ServerConfig {
         in_range("cells times robots", n_cells * n_robots, 1, most)
     }
 
-    /// The settings by name.
+    /// Returns the settings by name.
     pub fn values(&self) -> Map<String, Value> {
         match serde_json::to_value(self) {
             Ok(Value::Object(values)) => values,
@@ -261,14 +263,14 @@ impl ServerConfig {
         }
     }
 
-    /// The settings of a TOML file.
+    /// Reads the settings from a TOML file.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
         toml::from_str(&text).map_err(|error| wrong(&error))
     }
 
-    /// The states file, which decides some of the settings.
+    /// Reads the states file and replaces the settings that it decides: grid, burn-in and model.
     fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
         let file = StatesFile::named(&self.states)?;
         (self.height, self.width) = file.shape.dim();
@@ -296,7 +298,7 @@ impl ServerConfig {
         }
         let path = Path::new(&self.model);
         Model::read(path).map_err(|error| match error {
-            // The name may be mistyped.
+            // The path may be a mistyped name of a built-in model.
             ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
                 let names = listed(Model::built_in_names());
                 let problem = format!("{problem}: expected one, or {names}");

@@ -1,6 +1,6 @@
-//! Worlds inside a process that uses them alone: the requests and answers of a server, without channels.
+//! Worlds inside a process that is their only client. They answer a server's requests without channels.
 //!
-//! Threads of its own reset worlds and work on files, so that a wait for them may end early.
+//! Background threads reset worlds and read and write files, so that a caller can stop waiting for them early.
 
 #[cfg(test)]
 mod tests;
@@ -26,26 +26,26 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// The name in errors: no instance can have it.
+/// The instance name in errors. No server can have this name.
 pub const INSTANCE: &str = "(embedded)";
 
-/// Jobs on files that may wait, each with its bytes.
+/// Maximum number of queued file jobs. Each holds a whole snapshot in memory.
 const MAX_FILES: usize = 16;
 
-/// How often a wait looks whether it is interrupted.
+/// How often a waiting call checks for an interrupt.
 const INTERVAL: Duration = Duration::from_millis(5);
 
-/// A world after its reset.
+/// The index of a world and its episode after a reset.
 type Reset = (usize, Box<Episode>);
 
-/// Worlds inside this process.
+/// A simulator inside this process, with the threads for its slow work.
 pub struct Embedded {
     simulator: Simulator,
     rules: Arc<Rules>,
     resets: (Sender<Reset>, Receiver<Reset>),
-    /// Apart from the simulator's own, which steps would wait for.
+    /// Separate from the simulator's threads, so that steps do not wait for resets.
     reset_threads: ThreadPool,
-    /// One thread: of two snapshots to one file the later one stays.
+    /// One thread: of two snapshots written to the same file, the later one remains.
     file_thread: ThreadPool,
     n_files: Arc<AtomicUsize>,
     info: ServerInfo,
@@ -56,7 +56,7 @@ pub struct Embedded {
 }
 
 impl Embedded {
-    /// Begins the worlds of these settings; those about channels and saving by itself are not used.
+    /// Creates the worlds and starts their burn-ins. Ignores settings about channels and automatic snapshots.
     ///
     /// # Errors
     /// If the model does not fit the grid, there is too little memory, or no threads can be started.
@@ -93,10 +93,10 @@ impl Embedded {
         Ok(embedded)
     }
 
-    /// The present episodes of consecutive worlds; `None` if one is missing, or in its reset.
+    /// Returns the current episodes of consecutive worlds, or `None` if a world does not exist or is being reset.
     ///
     /// # Errors
-    /// After a `shutdown`.
+    /// If the worlds were shut down.
     pub fn episodes(
         &mut self,
         mut worlds: Range<usize>,
@@ -109,7 +109,7 @@ impl Embedded {
         }))
     }
 
-    /// Takes in what an interrupted wait has left, and ends leases that are over.
+    /// Installs the worlds whose reset finished after an interrupted wait, and ends expired leases.
     fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
@@ -130,14 +130,14 @@ impl Embedded {
             self.reset_threads.spawn(move || {
                 let reset = job.run(&rules);
                 if !rules.ended.load(Ordering::Relaxed) {
-                    // Nobody receives it once this is dropped.
+                    // Sending fails after `Embedded` was dropped; the episode is then not needed.
                     drop(sender.send(reset));
                 }
             });
         }
     }
 
-    /// Waits until worlds are ready.
+    /// Waits until the worlds of a pending reply are ready.
     fn reset(
         &mut self,
         pending: &PendingReply,
@@ -158,7 +158,7 @@ impl Embedded {
         }
     }
 
-    /// Waits for work on a file.
+    /// Runs a file job on its thread and waits for the result.
     fn file(
         &mut self,
         job: Job,
@@ -168,7 +168,7 @@ impl Embedded {
         if self.n_files.fetch_add(1, Ordering::Relaxed) >= MAX_FILES {
             self.n_files.fetch_sub(1, Ordering::Relaxed);
             self.simulator.cancel_file(Instant::now(), pending);
-            let message = "too many files at a time: try again later".into();
+            let message = "too many file jobs at a time: try again later".into();
             return Ok(Reply::error(Status::BadFile, 0, message));
         }
         let (sender, receiver) = channel();
@@ -187,7 +187,8 @@ impl Embedded {
     }
 }
 
-/// A server's requests and answers; `control_text` may also be interrupted, and after a `shutdown` the server is gone.
+/// Answers requests as a server does. `control_text` can also be interrupted, and after a `shutdown` request every call
+/// fails with [`ConnectionError::ServerGone`].
 impl Backend for Embedded {
     fn info(&self) -> &ServerInfo {
         &self.info
@@ -226,7 +227,7 @@ impl Backend for Embedded {
         Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
     }
 
-    /// Needs no time limit: nobody else holds robots of these worlds.
+    /// Ignores the timeout: no other client holds robots of these worlds, so a step never waits.
     fn step(
         &mut self,
         request: StepRequest,
@@ -244,7 +245,9 @@ impl Backend for Embedded {
             .simulator
             .step(now, self.client, &request, body, &mut payload);
         let Stepped::Reply(mut reply) = stepped else {
-            unreachable!("invariant: the only client names all robots that it holds in a world");
+            unreachable!(
+                "invariant: the only client sends the paths of all robots that it holds in a world"
+            );
         };
         check_status("step", reply.status, reply.detail, None)?;
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
@@ -253,16 +256,16 @@ impl Backend for Embedded {
 }
 
 impl Drop for Embedded {
-    /// Burn-ins that still run end.
+    /// Stops burn-ins that are still running.
     fn drop(&mut self) {
         self.rules.ended.store(true, Ordering::Relaxed);
     }
 }
 
-/// What another thread sends, unless the time since `start` is over or the wait is interrupted.
+/// Receives a value from another thread, for at most `timeout` after `start`.
 ///
 /// # Errors
-/// [`ConnectionError::Timeout`], or of a wait that is interrupted.
+/// [`ConnectionError::Timeout`] if the time is over or the sender is gone, or the interrupt's error.
 pub fn wait_for<T>(
     receiver: &Receiver<T>,
     start: Instant,
@@ -273,7 +276,7 @@ pub fn wait_for<T>(
         match receiver.recv_timeout(left.min(INTERVAL)) {
             Ok(next) => return Ok(next),
             Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
-            // A job that has panicked sends nothing.
+            // The time is over, or the job panicked before it sent a value.
             Err(_) => {
                 return Err(ConnectionError::Timeout {
                     what: "a control request",
@@ -285,7 +288,7 @@ pub fn wait_for<T>(
     }
 }
 
-/// Starts threads whose jobs may panic: that ends the job, not the process.
+/// Starts a pool in which a panic ends only the job, not the process.
 fn threads(n_threads: usize) -> Result<ThreadPool, NoThreads> {
     start(ThreadPoolBuilder::new().panic_handler(|_| ()), n_threads)
 }

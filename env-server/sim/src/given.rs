@@ -1,4 +1,4 @@
-//! Settings given by name, as flags or by a program: each replaces that of a file or the default.
+//! Settings given by name, from flags or from a program. Each replaces the value of the settings file or the default.
 
 use crate::bounds::BOUNDS;
 use crate::config::{ConfigError, ServerConfig};
@@ -8,10 +8,10 @@ use emberwatch_model::task::{Start, Task};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-/// What recorded states decide.
+/// Settings that a states file decides.
 const OF_STATES: [&str; 4] = ["model", "height", "width", "burn_in"];
 
-/// What a task decides.
+/// Settings that a task decides.
 const OF_TASK: [&str; 12] = [
     "model",
     "sensor_radius",
@@ -28,11 +28,11 @@ const OF_TASK: [&str; 12] = [
 ];
 
 impl ServerConfig {
-    /// The same settings with some replaced, by their names in `config/server.toml`. `start` may also be text such as
-    /// `3,5`.
+    /// Returns these settings with some replaced. The keys are the names in `config/server.toml`; `start` may also be a
+    /// text such as `3,5`.
     ///
     /// # Errors
-    /// If there is no such setting, its value is impossible, or a task or recorded states decide it.
+    /// If a name is unknown, a value is invalid, or a task or recorded states decide the setting.
     pub fn with(&self, given: &Map<String, Value>) -> Result<Self, ConfigError> {
         let mut settings = self.values();
         for (name, value) in given {
@@ -54,7 +54,7 @@ impl ServerConfig {
     }
 }
 
-/// The value of a setting, whose default is of the same kind; or what was expected.
+/// Returns a setting's value if it has the type of the default and is within bounds, and otherwise what was expected.
 fn check(name: &str, value: &Value, default: Option<&Value>) -> Result<Value, String> {
     let fits = match (name, default) {
         (_, None) => {
@@ -84,7 +84,7 @@ fn check(name: &str, value: &Value, default: Option<&Value>) -> Result<Value, St
 
 fn within(name: &str, value: &Value) -> Result<Value, String> {
     let bounds = BOUNDS.iter().find(|(setting, ..)| *setting == name);
-    let (_, least, most) = bounds.expect("invariant: each number has bounds");
+    let (_, least, most) = bounds.expect("invariant: each numeric setting has bounds");
     let number = value.as_number().and_then(serde_json::Number::as_i128);
     match number.filter(|number| (least..=most).contains(&number)) {
         Some(_) => Ok(value.clone()),
@@ -114,7 +114,7 @@ fn refused(name: &str, expected: String, got: &Value) -> ConfigError {
     }
 }
 
-/// A start as flags write it.
+/// Parses the start of robots: `corner`, `centre`, `random` or `ROW,COL`.
 pub fn start_of(text: &str) -> Result<Start, String> {
     match text {
         "corner" => Ok(Start::Corner),
@@ -164,7 +164,7 @@ mod tests {
         assert_eq!(with(start).map(|it| it.start), Ok(config.start));
     }
 
-    /// Settings, and what is said of them.
+    /// Invalid settings, and a part of the error for each.
     const WRONG: &str = r#"
 {"height": -1} => height: expected 1 to 4096, got -1
 {"height": 16.0} => height: expected 1 to 4096, got 16.0
@@ -184,7 +184,7 @@ mod tests {
 "#;
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn errors_name_the_wrong_setting() {
         for line in WRONG.trim().lines() {
             let (given, words) = line.split_once(" => ").expect(line);
             let error = with(serde_json::from_str(given).expect(line)).expect_err(line);

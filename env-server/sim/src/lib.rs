@@ -1,12 +1,12 @@
-//! Simulated worlds: requests in, answers out, without channels.
+//! Simulated worlds that answer requests, without channels.
 //!
-//! One step, in reading order: [`world`] (hidden states, robot, noise), [`simulator`] (leases; request in, answer out).
-//! [`snapshot`] saves worlds. [`config`] has the settings, [`given`] those given by name. [`embedded`] has worlds
-//! inside the process that uses them.
+//! To follow one step, read [`world`] (hidden states, robots, sensor noise), then [`simulator`] (leases, requests,
+//! replies). [`snapshot`] saves worlds. [`config`] defines the settings, and [`given`] replaces them by name.
+//! [`embedded`] runs worlds inside the process that uses them.
 
 #![allow(
     missing_docs,
-    reason = "the server's inside: what names say is not said again"
+    reason = "internals of the server: docs that would only repeat a name are left out"
 )]
 
 pub mod bounds;

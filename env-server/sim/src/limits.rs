@@ -1,7 +1,7 @@
-//! What worlds take of the system, memory and threads, and the refusal of more than there is.
+//! The memory and threads that worlds need, and the checks that the system has them.
 
 use crate::config::{Checked, ServerConfig};
-use crate::world::{LEAST_ROOM, bytes_of_history, bytes_of_robot, most_seen};
+use crate::world::{MIN_HISTORY_BYTES, bytes_of_history, bytes_of_robot, most_seen};
 use emberwatch_messages::control::CoverageRule;
 use emberwatch_messages::limits::memory::{self, NoMemory};
 use emberwatch_messages::limits::threads::NoThreads;
@@ -9,7 +9,7 @@ use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
 use emberwatch_model::Dynamics;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// The number of threads that step worlds; as many reset them.
+/// Returns the number of threads that step worlds. The same number of threads resets them.
 pub fn n_threads(config: &ServerConfig) -> usize {
     match config.threads {
         0 => std::thread::available_parallelism().map_or(1, usize::from),
@@ -20,39 +20,39 @@ pub fn n_threads(config: &ServerConfig) -> usize {
 /// Starts the threads of a pool.
 ///
 /// # Errors
-/// If the system does not start as many.
+/// If the system cannot start that many threads.
 pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, NoThreads> {
     let started = pool.num_threads(n_threads).build();
     let pool = started.map_err(|error| NoThreads::new(n_threads, &error))?;
-    // The first allocation of a thread reserves address space, of which `check_memory` shall know.
+    // A thread's first allocation reserves address space. It must happen before `check_memory` measures what is left.
     pool.broadcast(|_| drop(std::hint::black_box(Box::new(0_u8))));
     Ok(pool)
 }
 
-/// Checks that there is memory for all worlds, for those that `n_threads` resets replace, and for the longest answer.
-/// Call it when these threads have started.
+/// Checks that there is memory for all worlds, for the `n_threads` worlds that may be in a reset at once, and for the
+/// longest answer. Call it after these threads have started.
 ///
 /// # Errors
-/// If there is not.
+/// If there is too little memory.
 pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory> {
     let n_worlds = checked.config.worlds as usize;
     let n_at_once = (n_worlds + n_threads.min(n_worlds)) as u64;
     let n_bytes = n_at_once.saturating_mul(bytes_of_world(checked) as u64);
     let n_bytes = n_bytes.saturating_add(answer_bytes(checked) as u64);
-    // What allocators waste: an eighth is enough (measured).
+    // An eighth covers the overhead of allocators (measured).
     let n_bytes = n_bytes.saturating_add(n_bytes / 8);
     let worlds = if n_worlds == 1 { "world" } else { "worlds" };
     let what = format!("{n_worlds} {worlds} of {} cells", checked.shape);
     memory::check(what, n_bytes)
 }
 
-/// The longest answer on `step`: that for all robots, bytes.
+/// Returns the length of the longest answer on the `step` channel, in bytes: the answer for all robots.
 pub fn answer_bytes(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     config.worlds as usize * (WORLD_BYTES + config.robots as usize * (ROBOT_BYTES + n_cells))
 }
 
-/// The memory of a world, its beginning, its robots and the frames that it keeps, at most.
+/// Returns an upper bound on the memory of a world, in bytes: its states now and at k = 0, its robots and its history.
 fn bytes_of_world(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     let sensor = checked.model.file().sensor.as_ref();
@@ -68,10 +68,10 @@ fn bytes_of_world(checked: &Checked) -> usize {
     let sees_all = config.coverage != CoverageRule::Path;
     let history = bytes_of_history(config.history as usize, n_robots, n_seen);
     let whole_frames = if sees_all {
-        LEAST_ROOM + n_robots * n_cells
+        MIN_HISTORY_BYTES + n_robots * n_cells
     } else {
         0
     };
-    // Counts of cells, and the work space of flights.
+    // 3 bytes per cell: visit counts and the scratch buffers of flights.
     of_states + 3 * n_cells + robots + history + whole_frames
 }

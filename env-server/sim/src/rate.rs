@@ -1,11 +1,11 @@
-//! Steps per second.
+//! The measured rate of world steps.
 
 use std::time::{Duration, Instant};
 
-/// Over how long the step rate is measured.
+/// Minimum length of the window over which the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
-/// World steps a second over the last window.
+/// A measurement of world steps per second over the last window.
 pub struct Rate {
     since: Instant,
     n_steps: u64,

@@ -1,10 +1,10 @@
-//! Outcomes of steps as the results of messages, which snapshots hold, too.
+//! Conversions between outcomes of steps and the results in messages. Snapshots store the same results.
 
 use crate::world::{InvalidWorld, RobotOutcome, WorldOutcome};
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_model::{Cell, Coverage};
 
-/// A world's outcome as a message has it.
+/// Converts a world's outcome to the result in a message.
 pub fn world_result(outcome: &WorldOutcome) -> WorldResult {
     WorldResult {
         step: outcome.step,
@@ -21,7 +21,7 @@ pub fn world_result(outcome: &WorldOutcome) -> WorldResult {
     }
 }
 
-/// A robot's outcome as a message has it.
+/// Converts a robot's outcome to the result in a message.
 pub fn robot_result(outcome: &RobotOutcome) -> RobotResult {
     let (start, cell) = (outcome.start, outcome.cell);
     RobotResult {
@@ -38,14 +38,16 @@ pub fn robot_result(outcome: &RobotOutcome) -> RobotResult {
     }
 }
 
-/// The outcome that a result of a snapshot stands for.
+/// Converts a world's result in a snapshot to an outcome.
 ///
 /// # Errors
-/// For a flag that is neither 0 nor 1.
+/// If a flag is neither 0 nor 1.
 pub fn world_outcome(result: &WorldResult) -> Result<WorldOutcome, InvalidWorld> {
     let flag = |flag: u16| match flag {
         0 | 1 => Ok(flag == 1),
-        got => Err(InvalidWorld(format!("ends: expected 0 or 1, got {got}"))),
+        got => Err(InvalidWorld(format!(
+            "terminated, truncated: expected 0 or 1, got {got}"
+        ))),
     };
     Ok(WorldOutcome {
         step: result.step,
@@ -62,10 +64,10 @@ pub fn world_outcome(result: &WorldResult) -> Result<WorldOutcome, InvalidWorld>
     })
 }
 
-/// As [`world_outcome`], of a robot.
+/// Converts a robot's result in a snapshot to an outcome.
 ///
 /// # Errors
-/// For an unknown coverage.
+/// If the coverage is unknown.
 pub fn robot_outcome(result: &RobotResult) -> Result<RobotOutcome, InvalidWorld> {
     let got = result.coverage;
     let coverage = Coverage::try_from(got)
@@ -104,6 +106,6 @@ mod tests {
         assert_eq!(world_result(&outcome), world);
         world.terminated = 2;
         let error = world_outcome(&world).expect_err("no flag").to_string();
-        assert_eq!(error, "ends: expected 0 or 1, got 2");
+        assert_eq!(error, "terminated, truncated: expected 0 or 1, got 2");
     }
 }

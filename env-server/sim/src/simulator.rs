@@ -1,4 +1,4 @@
-//! All worlds and leases of a server: requests in, answers out, no I/O and no clock.
+//! All worlds and leases of a server. Answers requests without I/O and without a clock.
 
 mod advance;
 mod answer;

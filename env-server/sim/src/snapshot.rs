@@ -1,4 +1,4 @@
-//! Snapshots: worlds as bytes and as files.
+//! Snapshots: the state of worlds, encoded as bytes and stored in files.
 
 mod error;
 mod file;

@@ -1,7 +1,7 @@
-//! States files: recorded hidden states as NumPy arrays, and their description. docs/recorded-worlds.md has the form.
+//! States files: recorded hidden states as NumPy arrays, with a description. See docs/recorded-worlds.md.
 //!
-//! An array's header is checked before its values are read or inflated. Memory grows with what is there, not with what
-//! is claimed, and each array stays where it was read to.
+//! An array's header is checked before its values are read or decompressed. Memory grows with the bytes that are
+//! present, not with the size that a header claims, and the values of an array are not copied after they were read.
 
 use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;
@@ -17,39 +17,39 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 use zip::ZipArchive;
 
-/// Maximum number of bytes of all arrays together: 4 GiB.
+/// Maximum size of all arrays together: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
+/// Maximum length of an array's header. NumPy writes 128 bytes; a long one could overflow the parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
 
-/// Longest end of a zip archive: a record of 22 bytes, and a comment.
+/// Maximum length of the end record of a zip archive: 22 bytes and a comment.
 const MAX_ZIP_END_BYTES: u64 = 22 + u16::MAX as u64;
 
-/// K, H and W.
+/// The axes of an array: K recorded steps, height H and width W.
 type Dim = (usize, usize, usize);
 
-/// What a states file holds.
+/// Recorded hidden states and their description.
 #[derive(Debug)]
 pub struct StatesFile {
     pub description: Description,
-    /// The description's states, unchanging.
+    /// A model with the description's states and observations but no transitions.
     pub model: Model,
     pub shape: Shape,
     pub sequences: Sequences,
 }
 
-/// Sequences of one shape `[H, W]`, whose values are states.
+/// Recorded sequences of hidden states on the same grid.
 #[derive(Debug, Default)]
 pub struct Sequences {
-    /// Each of shape `[K, H, W]`, row-major, K at least 2.
+    /// Each has shape `[K, H, W]`, row-major, with K at least 2.
     pub arrays: Vec<Array3<u8>>,
     n_states: usize,
     n_bytes: u64,
     checksum: crc32fast::Hasher,
 }
 
-/// A states file that is refused.
+/// An error in a states file.
 #[derive(Debug, Error)]
 #[error("states file {path}: {problem}")]
 pub struct StatesError {
@@ -58,21 +58,21 @@ pub struct StatesError {
 }
 
 impl StatesFile {
-    /// The built-in one of a name, or that of a path.
+    /// Loads the built-in states of this name, or the states file at this path.
     pub fn named(name: &str) -> Result<Self, StatesError> {
         match STATES.iter().find(|(known, ..)| *known == name) {
             Some((_, archive, description)) => Ok(read_built_in(archive, description)
-                .expect("invariant: built-in states are valid, as a test shows")),
+                .expect("invariant: built-in states are valid (tested)")),
             None => Self::read(Path::new(name)),
         }
     }
 
-    /// The built-in recorded states: name, and text of the description.
+    /// Returns the name and the description's text of each of the built-in recorded states.
     pub fn built_in_descriptions() -> impl Iterator<Item = (&'static str, &'static str)> {
         STATES.iter().map(|(name, _, text)| (*name, *text))
     }
 
-    /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.
+    /// Reads a `.npz` or `.npy` file with its description next to it, or a folder that holds such files and one.
     pub fn read(path: &Path) -> Result<Self, StatesError> {
         read(path).map_err(|problem| StatesError {
             path: path.display().to_string(),
@@ -91,7 +91,7 @@ impl StatesFile {
 }
 
 impl Sequences {
-    /// None yet, of so many states.
+    /// Creates an empty collection. Values of added arrays must be below `n_states`.
     pub fn new(n_states: usize) -> Self {
         Self {
             n_states,
@@ -99,25 +99,27 @@ impl Sequences {
         }
     }
 
-    /// CRC-32 of shapes and values, in order.
+    /// Returns the CRC-32 of all shapes and values, in order.
     pub fn checksum(&self) -> u32 {
         self.checksum.clone().finalize()
     }
 
-    /// Adds the arrays of a `.npz` archive in the order of their names.
+    /// Adds the arrays of a `.npz` archive, sorted by name.
     pub fn add_archive(&mut self, mut archive: impl Read + Seek) -> Result<(), String> {
         let n_entries = n_entries(&mut archive).map_err(|error| error.to_string())?;
         let unfit = |error| format!("expected a .npz archive: {error}");
         let mut archive = ZipArchive::new(archive).map_err(unfit)?;
         let mut names: Vec<String> = archive.file_names().map(String::from).collect();
         if let Some(got) = n_entries.filter(|&n| n != names.len()) {
-            let expected = format!("expected {} arrays, one of each name", names.len());
-            return Err(format!("{expected}, got {got}"));
+            let n_names = names.len();
+            return Err(format!(
+                "expected distinct array names, got {n_names} for {got} arrays"
+            ));
         }
         names.sort_by(|a, b| bare(a).cmp(bare(b)));
         for name in &names {
             if !name.ends_with(".npy") {
-                return Err(format!("expected arrays alone, got the member {name:?}"));
+                return Err(format!("expected only .npy members, got {name:?}"));
             }
             let member = archive
                 .by_name(name)
@@ -132,13 +134,13 @@ impl Sequences {
         }
     }
 
-    /// Adds one array in NumPy's format, of so many bytes.
+    /// Reads and adds one array in NumPy's format, header included, of `n_bytes` bytes.
     pub fn add_array(&mut self, name: &str, n_bytes: u64, from: impl Read) -> Result<(), String> {
         let about = |problem: String| format!("array {name:?}: {problem}");
         self.n_bytes = self.n_bytes.saturating_add(n_bytes);
         if self.n_bytes > MAX_BYTES {
             let got = self.n_bytes;
-            let expected = format!("expected at most {MAX_BYTES} bytes with those before it");
+            let expected = format!("expected at most {MAX_BYTES} bytes in all arrays");
             return Err(about(format!("{expected}, got {got}")));
         }
         let array = self.read_array(n_bytes, from).map_err(about)?;
@@ -187,7 +189,7 @@ impl Sequences {
             && first != shape
         {
             return Err(format!(
-                "expected {first} cells as the first array has, got {shape}"
+                "expected {first} cells, as in the first array, got {shape}"
             ));
         }
         Ok(())
@@ -203,7 +205,7 @@ impl Sequences {
         let (step, cell) = (wrong.unwrap_or(0) / shape.n_cells(), wrong.unwrap_or(0));
         let cell = shape.cell(cell % shape.n_cells());
         Err(format!(
-            "expected states below {}, as the description has, got {most} in cell {cell} of recorded step {step}",
+            "expected states below {}, as in the description, got {most} in cell {cell} of recorded step {step}",
             self.n_states
         ))
     }
@@ -261,7 +263,7 @@ fn described(text: &str) -> anyhow::Result<(Description, Model)> {
     Ok((description, model))
 }
 
-/// The arrays and archives in a folder, in the order of their names.
+/// Returns the arrays and archives in a folder, sorted by name.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
     let paths: Result<Vec<PathBuf>, _> = entries
@@ -288,7 +290,7 @@ fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
     }
 }
 
-/// The length of a file that can be opened; where it is a pipe, that would wait for a writer.
+/// Returns the length of a regular file. Opening a pipe instead would wait for a writer.
 fn check_regular(path: &Path) -> Result<u64, String> {
     let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
     if metadata.is_file() {
@@ -298,8 +300,8 @@ fn check_regular(path: &Path) -> Result<u64, String> {
     }
 }
 
-/// Entries as the end of an archive counts them, of which its reader keeps one for each name; `None` where it does not
-/// count so far, or where there is no such end.
+/// Reads the number of entries from the end record of an archive. `ZipArchive` keeps only one entry per name, so
+/// duplicate names show as a difference. Returns `None` if there is no end record or its 16-bit count is saturated.
 fn n_entries(archive: &mut (impl Read + Seek)) -> std::io::Result<Option<usize>> {
     let n_bytes = archive.seek(SeekFrom::End(0))?;
     archive.seek(SeekFrom::Start(n_bytes.saturating_sub(MAX_ZIP_END_BYTES)))?;
@@ -319,14 +321,14 @@ fn is_archive(path: &Path) -> bool {
     path.extension() == Some(OsStr::new("npz"))
 }
 
-/// An array's name without the ending of its member.
+/// Strips the `.npy` ending from the name of an archive's member.
 fn bare(name: &str) -> &str {
     name.strip_suffix(".npy").unwrap_or(name)
 }
 
 fn shape_of(array: &Array3<u8>) -> Shape {
     let (_, height, width) = array.dim();
-    Shape::new(height, width).expect("invariant: it was checked")
+    Shape::new(height, width).expect("invariant: the shape was checked")
 }
 
 fn cells(array: &Array3<u8>) -> &[u8] {
@@ -351,7 +353,7 @@ fn read_header(from: &mut impl Read) -> Result<Header, String> {
         .map_err(|error| format!("expected a NumPy array: {error}"))
 }
 
-/// The axes of an array of so many bytes behind its header.
+/// Checks a header against the `n_values` bytes that follow it, and returns the axes of the array.
 fn checked_dim(header: &Header, n_values: u64) -> Result<Dim, String> {
     let dtype = &header.type_descriptor;
     if !matches!(
@@ -371,12 +373,12 @@ fn checked_dim(header: &Header, n_values: u64) -> Result<Dim, String> {
         as u64;
     if n_cells > n_values {
         let missing = n_cells - n_values;
-        return Err(format!("cut short: expected {missing} bytes more"));
+        return Err(format!("cut short: expected {missing} more bytes"));
     }
     match n_values - n_cells {
         0 => Ok((n_recorded, height, width)),
         behind => Err(format!(
-            "expected the array alone, got {behind} bytes behind it"
+            "expected the end after the array, got {behind} more bytes"
         )),
     }
 }

@@ -1,4 +1,4 @@
-//! One world with its robots; pure.
+//! One world with its robots, without I/O and without a clock.
 
 mod episode;
 mod flown;
@@ -16,7 +16,7 @@ mod starts;
 pub use episode::Episode;
 pub use flown::Flown;
 pub use hidden::{Source, World};
-pub use history::{LEAST_ROOM, PastRobot, PastStep, bytes_of_history};
+pub use history::{MIN_HISTORY_BYTES, PastRobot, PastStep, bytes_of_history};
 pub use outcome::{RobotOutcome, WorldOutcome};
 pub use recorded::Recorded;
 pub use robot::{Robot, bytes_of_robot};

@@ -1,4 +1,4 @@
-//! Tasks, models, settings and limits in the documents are those of the code.
+//! Checks that tasks, models, settings and limits in the documents agree with the code.
 
 use emberwatch_messages::capacity::{MAX_CLIENTS, MAX_ROBOT_NUMBERS, MAX_ROBOTS};
 use emberwatch_model::built_in::state_names;
@@ -14,7 +14,7 @@ const ENVIRONMENTS: &str = include_str!("../../../docs/environments/index.md");
 
 const RECORDED: &str = include_str!("../../../docs/recorded-worlds.md");
 
-/// The rows of the table whose header begins like this, as far as cells are numbers and words in code.
+/// Returns the rows of the table whose header begins with `header`, without the commas in numbers.
 fn rows(header: &str) -> Vec<String> {
     let (_, table) = ENVIRONMENTS.split_once(header).expect("the table");
     let lines = table.lines().skip(2);
@@ -41,7 +41,7 @@ fn every_task_has_its_row() {
             "| `{name}` | `{ids}` | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
         )
     });
-    // The third column has words behind the model or the states, the sixth the longest of recorded episodes.
+    // The third column has words after the model or the states. The sixth says "up to" for recorded episodes.
     let documented = rows("| task | ids begin with |").into_iter().map(|row| {
         let mut cells: Vec<&str> = row.split(" | ").collect();
         let world = cells[2].split_inclusive('`').take(2).collect::<String>();
@@ -82,7 +82,7 @@ fn every_setting_is_explained_with_its_range() {
             .flat_map(str::split_whitespace)
             .filter(|word| *word != "#");
         let words = words.collect::<Vec<_>>().join(" ");
-        // A radius of -1 is explained in words.
+        // The document explains a radius of -1 in words.
         let range = format!("{} to {most}", least.max(0));
         assert!(
             words.contains(&range),

@@ -1,4 +1,4 @@
-//! One program: each would link the crate.
+//! All integration tests in one program: separate programs would each link the crate.
 
 mod documents;
 mod states_file;

@@ -1,4 +1,4 @@
-//! States files as NumPy writes them, and broken ones: one error each.
+//! States files as NumPy writes them, and the error for each kind of broken file.
 
 use emberwatch_model::built_in::state_names;
 use emberwatch_sim::config::ServerConfig;
@@ -23,26 +23,26 @@ states = [
 observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#ff0000" }]
 "##;
 
-/// What the header of an array says.
+/// A valid header of an array.
 const HEADER: &str = "{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }\n";
 
-/// What replaces a part of this header, and the problem of the array then.
+/// Rows of `part of the header => its replacement => the expected error`.
 const WRONG_HEADERS: &str = "
 |u1 => <f4 => expected dtype '|u1' (uint8), got '<f4'
 |u1 => |i1 => expected dtype '|u1' (uint8), got '|i1'
 |u1 => |b1 => expected dtype '|u1' (uint8), got '|b1'
 (2, 3, 4) => (2, 3, 4, 1) => expected three axes [K, H, W], got 4
 (2, 3, 4) => (24,) => expected three axes [K, H, W], got 1
-(2, 3, 4) => (0, 3, 4) => expected the array alone, got 24 bytes
+(2, 3, 4) => (0, 3, 4) => expected the end after the array, got 24 more bytes
 (2, 3, 4) => (1, 4, 6) => expected at least 2 recorded steps, got 1
-(2, 3, 4) => (2, 3, 5) => cut short: expected 6 bytes more
+(2, 3, 4) => (2, 3, 5) => cut short: expected 6 more bytes
 2, 3 => 999999, 999999999 => cut short: expected
 2, 3 => 99999999999, 99999999999 => expected a NumPy array:
 'shape' => 'form' => expected a NumPy array:
 False => [[[[[[[[ => expected a NumPy array:
 ";
 
-/// Rows of a table.
+/// Builds an array of `(bytes, words)` pairs from rows.
 macro_rules! rows {
     ($($bytes:expr => $words:expr;)*) => {
         [$(($bytes, $words)),*]
@@ -60,7 +60,7 @@ fn npy<T: WritableElement, D: Dimension>(array: &Array<T, D>) -> Vec<u8> {
     bytes
 }
 
-/// An array of 24 cells under a header of one's own.
+/// Returns an array file of 24 cells with the given header.
 fn npy_with(header: &str) -> Vec<u8> {
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
     bytes.extend((header.len() as u16).to_le_bytes());
@@ -83,7 +83,7 @@ fn stored(members: &[(&str, Vec<u8>)]) -> Vec<u8> {
     npz(members, CompressionMethod::Stored)
 }
 
-/// A file with a description beside it.
+/// Writes a file and a description next to it, and returns the file's path.
 fn file_in(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
     let path = folder.path().join(name);
     write(&path, bytes).expect("write");
@@ -105,7 +105,7 @@ fn archives_stored_or_deflated_are_read_in_the_order_of_names() {
         sequence(2, (9, 3, 4)),
     ];
     let [first, second, third] = sequences.each_ref().map(npy);
-    // As Python sorts them: "a" before "a-b", whose member's name would come first.
+    // Python sorts names without `.npy`: "a" before "a-b". With the ending, "a-b.npy" would come before "a.npy".
     let members = [("b.npy", third), ("a.npy", first), ("a-b.npy", second)];
     let mut checksums = Vec::new();
     for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
@@ -186,7 +186,7 @@ fn broken_arrays_are_refused_each_by_its_problem() {
     let mut fourth = sequence(0, (2, 3, 4));
     fourth[[1, 2, 3]] = 3;
     for (bytes, words) in rows! {
-        npy(&fourth) => "expected states below 3, as the description has, got 3 in cell (2, 3) of recorded step 1";
+        npy(&fourth) => "expected states below 3, as in the description, got 3 in cell (2, 3) of recorded step 1";
         npy_with(&header("False", &"[".repeat(60_000))) => "expected a NumPy array with a header of at most 512 bytes, got 60058";
         b"".to_vec() => "expected a NumPy array: ";
         b"PNG and so on".to_vec() => "expected a NumPy array: ";
@@ -195,7 +195,7 @@ fn broken_arrays_are_refused_each_by_its_problem() {
     }
 }
 
-/// A reader that ends in an error.
+/// A reader that always fails.
 struct Broken;
 
 impl Read for Broken {
@@ -217,7 +217,7 @@ fn broken_archives_are_refused_each_by_its_problem() {
     while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
         twice[at..at + 7].copy_from_slice(b"one.npy");
     }
-    // A member that says that it has 3 GiB, twice: neither is there, and takes no memory.
+    // Two members that claim 3 GiB each but hold less: claimed sizes must not be allocated.
     let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
     let bytes = npy_with(&header);
     let claimed = (3_u32 << 30) + 10 + header.len() as u32;
@@ -233,10 +233,10 @@ fn broken_archives_are_refused_each_by_its_problem() {
         Vec::new() => "expected a .npz archive: ";
         deflated[..deflated.len() / 2].to_vec() => "expected a .npz archive: ";
         stored(&[]) => "expected at least one array, got none";
-        two("a.txt", &whole) => "expected arrays alone, got the member \"a.txt\"";
-        two("two.npy", &turned) => "array \"two\": expected 3 x 4 cells as the first array has, got 4 x 3";
+        two("a.txt", &whole) => "expected only .npy members, got \"a.txt\"";
+        two("two.npy", &turned) => "array \"two\": expected 3 x 4 cells, as in the first array, got 4 x 3";
         damaged => "array \"a\": ";
-        twice => "expected 1 arrays, one of each name, got 2";
+        twice => "expected distinct array names, got 1 for 2 arrays";
         large => &*format!("array \"a\": expected {claimed} bytes, got ");
     } {
         let error = read("lab.npz", &bytes).expect_err(words);
@@ -303,7 +303,7 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
     let words = "states_offset: expected 0 to 3, as the shortest sequence allows, got 4";
     for (config, words) in [
         (config(4), words),
-        (without, "expected none without a states file"),
+        (without, "expected false and 0 without a states file"),
     ] {
         let error = config.check().expect_err(words).to_string();
         assert!(error.contains(words), "{error}");

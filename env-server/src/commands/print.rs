@@ -1,9 +1,9 @@
-//! Standard output.
+//! Printing to standard output.
 
 use anyhow::{Context, Result};
 use std::io::Write;
 
-/// Writes to standard output.
+/// Prints a text; a failure is an error, not a panic.
 pub fn print(text: &str) -> Result<()> {
     std::io::stdout()
         .write_all(text.as_bytes())

@@ -1,4 +1,4 @@
-//! `record`: what an instance publishes, into a file.
+//! `record`: records what an instance publishes.
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -7,10 +7,10 @@ use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_server::recording::{RecordOptions, RecordSummary, record};
 use std::path::PathBuf;
 
-/// Observe an instance and write what is published to a file.
+/// Records the frames that an instance publishes to a file.
 #[derive(Args)]
 pub struct RecordCommand {
-    /// The server's instance name; the server may start later, and again
+    /// Instance name of the server, which may start later and restart
     #[arg(long, default_value = "default")]
     instance: String,
     /// The file to write
@@ -22,7 +22,7 @@ pub struct RecordCommand {
     /// Record hidden states too, where the server publishes them (`--publish-truth`)
     #[arg(long)]
     truth: bool,
-    /// World steps to record; 0: until stopped
+    /// Number of world steps to record, 0 for no limit
     #[arg(long, default_value_t = 0)]
     steps: u64,
     /// The worlds to record, such as 0,2,3 [default: all]
@@ -31,7 +31,7 @@ pub struct RecordCommand {
 }
 
 impl RecordCommand {
-    /// Records until stopped, or until the steps are recorded.
+    /// Records until stopped or until the requested number of steps is reached.
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
         let options = RecordOptions {
@@ -68,7 +68,7 @@ fn report(summary: &RecordSummary) {
     if summary.n_unknown > 0 {
         tracing::warn!(
             samples = summary.n_unknown,
-            "not recorded: their server did not say who it is"
+            "samples were not recorded: their server did not answer `hello`"
         );
     }
 }

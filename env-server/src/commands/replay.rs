@@ -1,4 +1,4 @@
-//! `replay`: a recording, published again.
+//! `replay`: publishes a recording again.
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -8,37 +8,37 @@ use emberwatch_server::recording::{ReplayOptions, replay};
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Publish a recording as its server did.
+/// Publishes a recording in the same way as the recorded server.
 #[derive(Args)]
 pub struct ReplayCommand {
-    /// The recording
+    /// The recording to publish
     file: PathBuf,
     /// The instance to publish on
     #[arg(long, default_value = "default")]
     instance: String,
-    /// How many times as fast as recorded, or `max`: as fast as observers can follow
+    /// Speed relative to the recording, or `max` for as fast as observers can follow
     #[arg(long, default_value = "1", value_parser = parse_speed, value_name = "FACTOR|max")]
     speed: Speed,
-    /// Leave out this much of the beginning, seconds
+    /// Skip this many seconds at the beginning
     #[arg(long, default_value = "0", value_parser = parse_seconds, value_name = "SECONDS")]
     from: Duration,
-    /// Start again at the end, until stopped
+    /// Restart at the end, until stopped
     #[arg(long = "loop")]
     repeat: bool,
-    /// Start at once, rather than with the first observer
+    /// Start immediately instead of waiting for the first observer
     #[arg(long)]
     no_wait: bool,
-    /// Refuse a recording that is damaged or cut short, rather than replay its whole records
+    /// Refuse a damaged or truncated recording instead of replaying its intact records
     #[arg(long)]
     strict: bool,
 }
 
-/// How fast to replay; `None`: no waiting for the recorded times.
+/// Speed relative to the recording; `None`: as fast as observers can follow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Speed(Option<f64>);
 
 impl ReplayCommand {
-    /// Replays until the end, or until stopped.
+    /// Replays until the end or until stopped.
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
         let options = ReplayOptions {

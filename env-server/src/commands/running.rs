@@ -1,4 +1,4 @@
-//! `status` and `stop`: questions to a running server.
+//! `status` and `stop`: requests to a running server.
 
 use super::print::print;
 use anyhow::Result;
@@ -9,17 +9,17 @@ use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus};
 use serde::Serialize;
 use std::time::Duration;
 
-/// How long to wait for the server.
+/// How long to wait for the server's answer.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Print the state of a running server.
+/// Prints the state of a running server.
 #[derive(Args)]
 pub struct StatusCommand {
     #[command(flatten)]
     target: Target,
 }
 
-/// Stop a running server.
+/// Stops a running server.
 #[derive(Args)]
 pub struct StopCommand {
     #[command(flatten)]
@@ -36,7 +36,7 @@ struct Target {
     json: bool,
 }
 
-/// The answer to `status`, with the task that the worlds are, if any.
+/// The answer to `status`, with the name of the worlds' task, if any.
 #[derive(Serialize)]
 struct NamedStatus<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -46,7 +46,7 @@ struct NamedStatus<'a> {
 }
 
 impl StatusCommand {
-    /// Prints the answer.
+    /// Prints the server's status as text or JSON.
     pub fn run(&self) -> Result<()> {
         let (info, reply) = self.target.ask(&Request::Status {})?;
         match reply {
@@ -62,14 +62,14 @@ impl StatusCommand {
 }
 
 impl StopCommand {
-    /// Returns when the server has answered that it ends.
+    /// Asks the server to stop, and returns when it has confirmed.
     pub fn run(&self) -> Result<()> {
         self.target.ask(&Request::Shutdown {}).map(|_| ())
     }
 }
 
 impl Target {
-    /// What the server says of itself, and its answer.
+    /// Sends a request. Returns the server's description and its reply.
     fn ask(&self, request: &Request) -> Result<(ServerInfo, Reply)> {
         let instance = Instance::new(&self.instance)?;
         let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;

@@ -1,4 +1,4 @@
-//! `snapshot`, `restore`, `fork`.
+//! `snapshot`, `restore` and `fork`: save, replace and copy worlds.
 
 use anyhow::{Result, bail};
 use clap::Args;
@@ -10,10 +10,10 @@ use emberwatch_sim::snapshot::read;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// How long to wait: files may be large, and worlds in their burn-in.
+/// How long to wait for the server. Files may be large, and worlds may be in their burn-in.
 const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// Write worlds to a file; needs no lease.
+/// Writes worlds to a file. This needs no lease.
 #[derive(Args)]
 pub struct SnapshotCommand {
     /// The file to write
@@ -24,12 +24,12 @@ pub struct SnapshotCommand {
     /// The first world to write
     #[arg(long, default_value_t = 0)]
     first_world: u32,
-    /// How many worlds to write [default: all from the first]
+    /// Number of worlds to write [default: all from the first on]
     #[arg(long)]
     worlds: Option<u32>,
 }
 
-/// Replace worlds of a server by those of a file.
+/// Replaces worlds of a server by worlds from a file.
 #[derive(Args)]
 pub struct RestoreCommand {
     /// The file to read
@@ -43,15 +43,15 @@ pub struct RestoreCommand {
     /// The first of the file's worlds to read
     #[arg(long, default_value_t = 0)]
     from: u32,
-    /// How many worlds to read [default: all of the file's from the first]
+    /// Number of worlds to read [default: all of the file from the first on]
     #[arg(long)]
     worlds: Option<u32>,
-    /// Take robots that are held from their holders
+    /// Take over robots that other clients hold
     #[arg(long)]
     takeover: bool,
 }
 
-/// Replace a world by a copy of another.
+/// Replaces a world by a copy of another world.
 #[derive(Args)]
 pub struct ForkCommand {
     /// The world to copy
@@ -61,13 +61,13 @@ pub struct ForkCommand {
     /// The server's instance name
     #[arg(long, default_value = "default")]
     instance: String,
-    /// Take robots of the world to replace from their holders
+    /// Take over robots of the replaced world that other clients hold
     #[arg(long)]
     takeover: bool,
 }
 
 impl SnapshotCommand {
-    /// Asks the server to write.
+    /// Asks the server to write the file.
     pub fn run(&self) -> Result<()> {
         let mut server = connect(&self.instance)?;
         let rest = server.info().n_worlds.saturating_sub(self.first_world);
@@ -92,13 +92,13 @@ impl SnapshotCommand {
 }
 
 impl RestoreCommand {
-    /// Acquires the robots of the worlds, has the worlds replaced, and releases the robots.
+    /// Acquires the robots of the worlds, lets the server replace the worlds, and releases the robots.
     pub fn run(&self) -> Result<()> {
-        // A wrong file is refused before any lease is taken over.
+        // Reads the file first, so that a wrong file is refused before any robot is taken over.
         let in_file = read(&self.file)?.worlds.len() as u32;
         let Some(rest) = in_file.checked_sub(self.from).filter(|rest| *rest > 0) else {
             bail!(
-                "--from: expected a world below {in_file}, as the file has, got {}",
+                "--from: expected a world below {in_file}, the number in the file, got {}",
                 self.from
             );
         };
@@ -120,7 +120,7 @@ impl RestoreCommand {
 }
 
 impl ForkCommand {
-    /// Acquires the robots of the world to replace, has it replaced, and releases them.
+    /// Acquires the robots of the world, lets the server replace the world, and releases the robots.
     pub fn run(&self) -> Result<()> {
         let (from, to) = (self.from, self.to);
         replace(
@@ -132,7 +132,7 @@ impl ForkCommand {
     }
 }
 
-/// Replaces worlds under a lease on all their robots.
+/// Sends a request that replaces worlds, under a temporary lease on all their robots.
 fn replace(
     server: Connection,
     worlds: std::ops::Range<u32>,
@@ -150,7 +150,7 @@ fn replace(
     let replaced = client.backend().control(&request, TIMEOUT);
     client.release()?;
     let Reply::Restored { worlds } = replaced? else {
-        bail!("expected worlds that were replaced");
+        bail!("expected a reply to the replacement of worlds, got another one");
     };
     for WorldInfo {
         world,
@@ -173,7 +173,7 @@ fn connect(instance: &str) -> Result<Connection> {
     )?)
 }
 
-/// A path as the server, which may run in another folder, can use it.
+/// Makes a path absolute, because the server may run in another folder.
 fn absolute(path: &PathBuf) -> Result<String> {
     let absolute = std::path::absolute(path)?;
     match absolute.to_str() {

@@ -1,17 +1,17 @@
-//! When the samples of a recording are published. Pure: time comes in as an argument.
+//! The times at which the samples of a recording are published. Pure functions: the current time is an argument.
 
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use std::time::{Duration, Instant};
 
-/// Samples that are published at once: two bursts fit an observer's buffer.
+/// Maximum number of samples published without a pause. Two bursts fit an observer's buffer.
 const BURST: usize = FRAME_BUFFER / 2;
 
-/// How long a burst takes at least: observers poll every 500 us, and a machine is sometimes busy.
+/// Minimum time between the beginnings of two bursts: observers poll every 500 us, and the machine may be busy.
 const BURST_TIME: Duration = Duration::from_millis(1);
 
 /// The pace of a replay.
 pub struct Pace {
-    /// How many times as fast as it was recorded.
+    /// Speed relative to the recording.
     speed: f64,
     round_began: Instant,
     n_in_burst: usize,
@@ -19,7 +19,7 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// A replay that begins; `None`: as fast as observers can follow.
+    /// Creates the pace of a replay that begins now. Without a speed, it is as fast as observers can follow.
     pub fn new(speed: Option<f64>, now: Instant) -> Self {
         Self {
             speed: speed.unwrap_or(f64::INFINITY),
@@ -29,18 +29,18 @@ impl Pace {
         }
     }
 
-    /// Begins the recording from its start.
+    /// Restarts the recording from its beginning.
     pub fn begin_round(&mut self, now: Instant) {
         self.round_began = now;
     }
 
-    /// When a moment of the recording is due; `None`: never.
+    /// Returns when this time of the recording is due, or `None` if that is too late to represent.
     pub fn due(&self, time: Duration) -> Option<Instant> {
         let after = Duration::try_from_secs_f64(time.as_secs_f64() / self.speed).ok()?;
         self.round_began.checked_add(after)
     }
 
-    /// How long to wait before the next sample, so that observers can follow; `None`: not at all.
+    /// Returns until when the next sample must wait, so that observers can follow, or `None` if it need not wait.
     pub fn pause(&self) -> Option<Instant> {
         (self.n_in_burst == BURST).then(|| self.burst_began + BURST_TIME)
     }
@@ -89,6 +89,10 @@ mod tests {
         for _ in 0..BURST {
             pace.publish(late);
         }
-        assert_eq!(pace.pause(), Some(late + BURST_TIME), "from when it began");
+        assert_eq!(
+            pace.pause(),
+            Some(late + BURST_TIME),
+            "counted from the burst's beginning"
+        );
     }
 }

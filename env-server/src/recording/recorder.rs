@@ -1,7 +1,9 @@
-//! Records an instance: an observer that writes what is published to a file.
+//! An observer that records what an instance publishes.
 //!
-//! One thread reads, so that it returns to the channels at once; another compresses and writes. Lost samples are
-//! counted by sequence numbers, in each record and in the end record.
+//! One thread reads the channels without delay; another compresses and writes. Gaps in the sequence numbers reveal lost
+//! samples, whose number is stored in each record and in the end record.
+//!
+//! A frame of 64 x 64 cells with its path of 64 moves takes about 150 bytes in a file, its hidden states 650.
 
 use anyhow::{Context, Result};
 use emberwatch_protocol::Connection;
@@ -23,60 +25,60 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Longest wait for a frame before the recorder checks whether to stop.
+/// Maximum wait for a frame before the recorder checks whether to stop.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Time between flushes: every record reaches the system within a second.
+/// Time between flushes, so that every record reaches the operating system within a second.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Longest wait for the answer to `hello`. A server that does not answer publishes nothing either.
+/// Maximum wait for the answer to `hello`. A server that does not answer does not publish either.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Pause before `hello` is sent again to a server that did not answer.
+/// Pause before another `hello` to a server that did not answer.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Most bytes that wait to be written: 16,000 frames of 64 x 64 cells.
+/// Capacity of the queue to the writing thread: about 16,000 frames of 64 x 64 cells.
 const MAX_QUEUED_BYTES: usize = 64 << 20;
 
-/// The name by which servers log this client.
+/// The client name that servers log.
 const NAME: &str = "emberwatch-server record";
 
-/// What to record, and to which file.
+/// Options of a recording.
 #[derive(Debug)]
 pub struct RecordOptions {
-    /// Its server may start later, end, and start again.
+    /// The instance to record. Its server may start later, and may end and restart.
     pub instance: Instance,
     pub out: PathBuf,
     /// Whether to overwrite an existing file.
     pub overwrite: bool,
     /// Whether to record hidden states, where the server publishes them.
     pub truth: bool,
-    /// World steps to record; 0: until stopped.
+    /// Number of world steps to record; 0: no limit.
     pub n_steps: u64,
     /// The worlds to record; empty: all.
     pub worlds: Vec<u32>,
 }
 
-/// What was recorded.
+/// A summary of a recording.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecordSummary {
     pub totals: Totals,
-    /// World steps in it.
+    /// Number of recorded world steps.
     pub n_steps: u64,
-    /// Length of the file.
+    /// Length of the file in bytes.
     pub n_bytes: u64,
-    /// Samples of servers that did not answer `hello`, which are not in the file.
+    /// Number of samples that were not recorded, because their server did not answer `hello`.
     pub n_unknown: u64,
 }
 
-/// Records until `stop` is set or the steps are recorded.
+/// Records until `stop` is set or the requested number of steps is reached.
 ///
 /// # Errors
-/// If the file cannot be written, or the instance not be observed; earlier records stay in the file.
+/// If the file cannot be written or the instance cannot be observed. Earlier records remain in the file.
 pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary> {
-    // Before observing: a fast agent would fill an observer's buffer while this waits for the answer.
+    // Sends `hello` before observing: during the wait, a fast agent would overflow an observer's buffer.
     let first_server = Connection::open(&options.instance, NAME, HELLO_TIMEOUT);
-    // The truth first, so that every recorded frame has its hidden states.
+    // Observes the hidden states first, so that they are recorded for every recorded frame.
     let truths = options
         .truth
         .then(|| Observer::truth(&options.instance))
@@ -101,12 +103,12 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
         n_unknown: 0,
     };
     recorder.announce();
-    while !stop.load(Ordering::Relaxed) && recorder.goes_on() {
+    while !stop.load(Ordering::Relaxed) && recorder.wants_more() {
         recorder.run_once(&frames, truths.as_ref(), TICK)?;
     }
-    // Reads what was published before the stop, at most one buffer: the server may go on publishing.
+    // Reads what was published before the stop: at most one buffer, because the server may keep publishing.
     for _ in 0..FRAME_BUFFER {
-        if !recorder.goes_on() || !recorder.run_once(&frames, truths.as_ref(), Duration::ZERO)? {
+        if !recorder.wants_more() || !recorder.run_once(&frames, truths.as_ref(), Duration::ZERO)? {
             break;
         }
     }
@@ -117,25 +119,25 @@ struct Recorder<'a> {
     options: &'a RecordOptions,
     writing: Writing,
     began: Instant,
-    /// The answer to `hello` from before the first sample.
+    /// The answer to the `hello` sent before the first sample.
     first_server: Option<ServerInfo>,
-    /// The process whose samples are recorded now.
+    /// The server process whose samples are being recorded.
     server: Option<u32>,
-    /// A process that did not answer `hello`, and when.
+    /// A server process that did not answer `hello`, and when it was asked.
     silent: Option<(u32, Instant)>,
     frames: Channel,
     truths: Channel,
-    /// Episode and step of each world's last frame: a frame may be published again.
+    /// Episode and step of each world's latest frame, because frames may be published repeatedly.
     steps: HashMap<u32, (u64, u64)>,
     n_steps: u64,
     n_unknown: u64,
 }
 
-/// The sequence numbers of a channel.
+/// The sequence numbers of a channel, to detect lost samples.
 #[derive(Default)]
 struct Channel {
     next: Option<u64>,
-    /// Lost since the last sample that was recorded.
+    /// Number of samples lost since the last recorded one.
     n_lost: u64,
 }
 
@@ -145,11 +147,11 @@ impl Recorder<'_> {
         if self.first_server.is_some() {
             tracing::info!(instance, "recording");
         } else {
-            tracing::info!(instance, "no server yet; recording when there is one");
+            tracing::info!(instance, "no server yet; recording starts with the server");
         }
     }
 
-    /// Waits for a frame; records it after the hidden states before it. Returns whether there was one.
+    /// Waits for a frame, and records it after the hidden states published before it. Returns whether one came.
     fn run_once(
         &mut self,
         frames: &Observer<FrameHeader>,
@@ -192,7 +194,7 @@ impl Recorder<'_> {
         self.push(world, n_lost, Event::Frame(sample));
     }
 
-    /// Whether a sample's server is known; asks a new server for its settings and records them.
+    /// Returns whether the server of a sample is known. Asks a new server for its description and records it.
     fn knows(&mut self, publisher: Option<u32>, is_new: bool) -> bool {
         if publisher.is_some() && publisher == self.server && !is_new {
             return true;
@@ -225,19 +227,23 @@ impl Recorder<'_> {
             Ok(connection) if connection.info().pid == publisher => {
                 return Some(connection.info().clone());
             }
-            Ok(connection) => format!("pid {} is there now", connection.info().pid),
-            Err(ConnectionError::Channel(ChannelError::NoServer { .. })) => "it is gone".into(),
+            Ok(connection) => format!("pid {} now runs the instance", connection.info().pid),
+            Err(ConnectionError::Channel(ChannelError::NoServer { .. })) => {
+                "the server has ended".into()
+            }
             Err(error) => error.to_string(),
         };
-        tracing::warn!(pid = publisher, problem, "a server did not say who it is");
+        tracing::warn!(pid = publisher, problem, "a server did not answer `hello`");
         self.silent = Some((publisher, Instant::now()));
         None
     }
 
-    /// Warns of worlds and hidden states that were asked for and that this server lacks.
+    /// Warns if the server lacks requested worlds or does not publish requested hidden states.
     fn warn_of_gaps(&self, info: &ServerInfo) {
         if self.options.truth && !info.publish_truth {
-            tracing::warn!("--truth: expected a server with --publish-truth; recording frames");
+            tracing::warn!(
+                "--truth: expected a server with --publish-truth, got one without; recording only frames"
+            );
         }
         for world in self
             .options
@@ -272,8 +278,8 @@ impl Recorder<'_> {
         });
     }
 
-    /// Whether more is to be recorded, and the thread that writes still runs.
-    fn goes_on(&self) -> bool {
+    /// Returns whether more steps are to be recorded and the writing thread still runs.
+    fn wants_more(&self) -> bool {
         let is_done = self.options.n_steps > 0 && self.n_steps >= self.options.n_steps;
         !is_done && self.writing.is_running()
     }
@@ -290,12 +296,12 @@ impl Recorder<'_> {
 }
 
 impl Channel {
-    /// Whether this sample can only be a new server's.
+    /// Returns whether a sequence number is too low to come from the same server.
     fn is_new(&self, sequence: u64) -> bool {
         self.next.is_some_and(|next| sequence < next)
     }
 
-    /// Counts a sample; returns how many were lost since the last that was recorded.
+    /// Counts a sample. Returns the number of samples lost since the last recorded one.
     fn count(&mut self, sequence: u64, is_recorded: bool) -> u32 {
         let expected = self.next.unwrap_or(sequence);
         self.n_lost = self
@@ -310,7 +316,7 @@ impl Channel {
     }
 }
 
-/// The thread that writes.
+/// The writing thread and its queue.
 struct Writing {
     queue: Sender<Record>,
     n_queued_bytes: Arc<AtomicUsize>,
@@ -333,14 +339,14 @@ impl Writing {
         })
     }
 
-    /// Queues a record. Waits while the queue is full: the observer then loses samples, and counts them.
+    /// Queues a record. Waits while the queue is full, during which the observer may lose samples; they are counted.
     fn push(&self, record: Record) {
         while self.n_queued_bytes.load(Ordering::Relaxed) > MAX_QUEUED_BYTES && self.is_running() {
             std::thread::sleep(Duration::from_millis(1));
         }
         self.n_queued_bytes
             .fetch_add(bytes_of(&record), Ordering::Relaxed);
-        // Fails only when writing has failed, which `finish` reports.
+        // Sending fails only if writing has failed, which `finish` reports.
         let _ = self.queue.send(record);
     }
 
@@ -389,24 +395,24 @@ fn bytes_of(record: &Record) -> usize {
         }
 }
 
-/// A file that no other user can read: it may hold hidden states.
+/// Creates the file, readable only by its owner because it may hold hidden states.
 fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
     let mut file_options = OpenOptions::new();
     file_options.write(true).mode(0o600);
     let found = path.metadata().ok().filter(|_| overwrite);
     let file = match found.map(|found| found.is_file()) {
-        // A new file: other programs may have the old one open.
+        // Replaces the file instead of truncating it: other programs may have the old one open.
         Some(true) => path.canonicalize().and_then(|path| {
             std::fs::remove_file(&path)?;
             file_options.create_new(true).open(path)
         }),
-        Some(false) => file_options.open(path), // a pipe, perhaps
-        None if overwrite => file_options.create(true).open(path), // a link to nothing, perhaps
+        Some(false) => file_options.open(path), // for example a pipe
+        None if overwrite => file_options.create(true).open(path), // also a dangling link
         None => file_options.create_new(true).open(path),
     };
     file.map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => {
-            Error::other("expected a new file, got one that exists; --force writes over it")
+            Error::other("expected a new file, got an existing one; --force overwrites it")
         }
         _ => error,
     })

@@ -1,6 +1,11 @@
-//! Publishes a recording again, as its server did: the same headers and bytes, in the recorded order.
+//! Publishes a recording again, with the same headers and bytes and in the same order as the recorded server.
 //!
-//! The file is read twice: once to check all of it before anybody sees anything, once to publish it.
+//! The file is read twice: first to check it completely before anything is published, then to publish it.
+//!
+//! By default a replay begins with the first observer and keeps the recorded timing. At any speed it publishes at most
+//! 64 samples within a millisecond, so an observer that polls every 500 us loses none. Nothing is published twice: an
+//! observer that comes late sees each world from its next sample on. At its end, a replay waits up to 3 s for its
+//! observers to leave. When a replay repeats, sequence numbers start again, as with a new server.
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
@@ -18,36 +23,36 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How often a replay that waits checks for observers and for the end.
+/// How often a waiting replay checks for observers and whether to stop.
 const TICK: Duration = Duration::from_millis(50);
 
-/// How long observers may take to read the last samples, unless they leave before.
+/// How long a replay waits at its end for observers to read the last samples and leave.
 const LAST_SAMPLES_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// What to replay, and how.
+/// Options of a replay.
 #[derive(Debug)]
 pub struct ReplayOptions {
     pub file: PathBuf,
     /// The instance to publish on.
     pub instance: Instance,
-    /// How many times as fast as it was recorded; `None`: as fast as observers can follow.
+    /// Speed relative to the recording; `None`: as fast as observers can follow.
     pub speed: Option<f64>,
-    /// What to leave out at the beginning.
+    /// Length of the beginning to skip.
     pub from: Duration,
-    /// Whether to start again at the end, until stopped.
+    /// Whether to restart at the end, until stopped.
     pub repeat: bool,
-    /// Whether to begin without an observer.
+    /// Whether to start without waiting for an observer.
     pub at_once: bool,
-    /// Whether to refuse a file that is damaged or cut short.
+    /// Whether to refuse a damaged or truncated file.
     pub strict: bool,
 }
 
-/// Replays until the end, `stop`, or a client's `shutdown`.
+/// Replays a recording until its end, until `stop` is set, or until a client requests a shutdown.
 ///
-/// A recording that is damaged or cut short is replayed up to there, with a warning.
+/// Unless `strict` is set, a damaged or truncated recording is replayed up to the damage, with a warning.
 ///
 /// # Errors
-/// If the file holds nothing to replay, or the channels fail.
+/// If the file has no samples to replay, or the channels fail.
 pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
     let summary = RecordingSummary::of(options)?;
     let ports = Ports::open_with(&summary.config)?;
@@ -74,10 +79,10 @@ pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
     outcome
 }
 
-/// What the whole file holds.
+/// Message sizes, first server and totals of the whole file.
 struct RecordingSummary {
     config: PortConfig,
-    /// The first server.
+    /// The first server in the file.
     info: ServerInfo,
     totals: Totals,
 }
@@ -118,7 +123,7 @@ impl RecordingSummary {
         match (first, end) {
             (Some(info), end) if !is_empty => {
                 if let Some(problem) = end {
-                    tracing::warn!(file = %options.file.display(), "{problem}; replaying these");
+                    tracing::warn!(file = %options.file.display(), "{problem}; replaying the records before it");
                 }
                 Ok(Self {
                     config,
@@ -128,7 +133,7 @@ impl RecordingSummary {
             }
             (_, Some(problem)) => Err(file_error(&options.file, problem)),
             _ => bail!(
-                "{}: expected samples from {:?} on, got none",
+                "{}: expected samples after the first {:?}, got none",
                 in_file(&options.file),
                 options.from
             ),
@@ -155,7 +160,7 @@ impl Playback<'_> {
         Ok(())
     }
 
-    /// Publishes the recording once.
+    /// Publishes the whole recording once.
     fn publish_all(&mut self) -> Result<()> {
         self.pace.begin_round(Instant::now());
         for record in open(&self.options.file)? {
@@ -178,7 +183,7 @@ impl Playback<'_> {
         Ok(())
     }
 
-    /// Waits until a moment of the recording, and until observers can follow.
+    /// Waits until a time of the recording is due and observers can follow.
     fn wait_until_due(&mut self, time: Duration) -> Result<()> {
         let due = self.pace.due(time);
         let mut now = Instant::now();
@@ -207,7 +212,7 @@ impl Playback<'_> {
         self.is_over || self.stop.load(Ordering::Relaxed)
     }
 
-    /// Answers requests until a moment, or the end.
+    /// Answers requests until a time or the end of the replay.
     fn serve_until(&mut self, until: Instant) -> Result<()> {
         loop {
             self.ports.connect_observers();

@@ -1,4 +1,4 @@
-//! Replies to the clients of a replay: what the recorded server answered to `hello`, and its worlds at present.
+//! Replies to the clients of a replay: the recorded server's answer to `hello`, and the worlds as last published.
 
 use emberwatch_protocol::control::{
     Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse,
@@ -10,9 +10,10 @@ use emberwatch_protocol::recording::Event;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-const REFUSAL: &str = "a recording is replayed on this instance: it can be observed, not acted on";
+const REFUSAL: &str =
+    "this instance replays a recording: it can be observed but accepts no actions";
 
-/// What a replay has published so far.
+/// The server and worlds that a replay has published so far.
 pub struct ReplayState {
     info: ServerInfo,
     has_truth: bool,
@@ -22,15 +23,15 @@ pub struct ReplayState {
     n_refused: u64,
 }
 
-/// The connected clients and observers.
+/// Numbers of connected clients and observers.
 pub struct ConnectionCounts {
-    /// Clients on the step channel.
+    /// Number of clients on the step channel.
     pub n_clients: usize,
-    /// Observers of frames.
+    /// Number of observers of frames.
     pub n_observers: usize,
 }
 
-/// What to do after an answer.
+/// Whether the replay continues after an answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next {
     Continue,
@@ -38,7 +39,7 @@ pub enum Next {
 }
 
 impl ReplayState {
-    /// A replay of this server before its first sample.
+    /// Creates the state of a replay before the server's first sample.
     pub fn new(info: ServerInfo, has_truth: bool) -> Self {
         Self {
             info,
@@ -50,12 +51,12 @@ impl ReplayState {
         }
     }
 
-    /// World steps published.
+    /// Returns the number of published world steps.
     pub fn n_steps(&self) -> u64 {
         self.n_steps
     }
 
-    /// Keeps what is published.
+    /// Updates the state with a published record.
     pub fn record(&mut self, event: &Event) {
         match event {
             Event::Server(info) => {
@@ -82,7 +83,7 @@ impl ReplayState {
         }
     }
 
-    /// The status of every step request.
+    /// Counts a step request and returns the status that refuses it.
     pub fn refuse_step(&mut self, version: u32) -> Status {
         self.n_refused += 1;
         if version == VERSION {
@@ -92,7 +93,7 @@ impl ReplayState {
         }
     }
 
-    /// The answer to a control request.
+    /// Answers a control request.
     pub fn answer(
         &mut self,
         version: u32,

@@ -1,4 +1,8 @@
-//! Snapshots that a server writes regularly, and starts with.
+//! The automatic snapshots of a server, and the snapshot that it starts with.
+//!
+//! Of the automatic snapshots, these survive a loss of power: the first, then each one that is due at least five
+//! seconds after the previous such snapshot, and the server's last one. The newest of them is kept in addition to the
+//! last few. All snapshots survive the death of any process.
 
 use super::files::Files;
 use emberwatch_protocol::throttle::Throttle;
@@ -12,30 +16,29 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Least time between two snapshots that survive a loss of power: to wait for the disk each time would slow the steps
-/// down.
+/// Minimum time between two snapshots that survive a loss of power, because waiting for the disk delays steps.
 const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
-/// When to write the next one, and where.
+/// The schedule and the folder of automatic snapshots.
 pub struct Autosave {
     folder: Folder,
     keep: usize,
-    /// World steps between two.
+    /// Number of world steps between two snapshots.
     every: u64,
-    /// World steps at which the next is due.
+    /// Number of world steps at which the next snapshot is due.
     due: u64,
-    /// The job that writes one now.
+    /// The job that is currently writing a snapshot.
     writing: Option<(u64, Durability)>,
-    /// The last that survives a loss of power, and when it was written.
+    /// The latest snapshot that survives a loss of power, and when it was written.
     safe: Option<(Instant, PathBuf)>,
     failures: Throttle,
 }
 
 impl Autosave {
-    /// By the settings; `None` if they want none.
+    /// Prepares the snapshots that the settings ask for, or returns `None` if they ask for none.
     ///
     /// # Errors
-    /// If the folder cannot be written to, or has another run's files.
+    /// If the folder is not writable, or holds snapshots of an earlier run although `restore` is not set.
     pub fn new(checked: &Checked) -> Result<Option<Self>, FileError> {
         let config = &checked.config;
         if config.snapshot_every == 0 {
@@ -59,18 +62,18 @@ impl Autosave {
         }))
     }
 
-    /// Whether one is to be written after so many world steps. Never two at once: a disk that is too
-    /// slow gets fewer.
+    /// Returns whether a snapshot is due after `n_steps` world steps. On a slow disk, snapshots are skipped: the next
+    /// is due only when the previous one is written.
     pub fn is_due(&self, n_steps: u64) -> bool {
         n_steps >= self.due && self.writing.is_none()
     }
 
-    /// Leaves one out.
+    /// Skips the snapshot that is due.
     pub fn skip(&mut self, n_steps: u64) {
         self.due = n_steps.saturating_add(self.every);
     }
 
-    /// Starts one; the last of a run always survives a loss of power.
+    /// Starts to write a snapshot. The last one of a run always survives a loss of power.
     pub fn start(&mut self, n_steps: u64, bytes: Vec<u8>, is_last: bool, files: &mut Files) {
         self.skip(n_steps);
         let safe = self.safe.as_ref();
@@ -85,7 +88,7 @@ impl Autosave {
         self.writing = Some((job, durability));
     }
 
-    /// Handles the result of a job; returns whether it was one of these.
+    /// Handles the result of a file job. Returns whether the job was an automatic snapshot.
     pub fn finish(&mut self, job: u64, outcome: &Result<Done, FileError>) -> bool {
         let Some((_, durability)) = self.writing.take_if(|(own, _)| *own == job) else {
             return false;
@@ -100,15 +103,15 @@ impl Autosave {
         true
     }
 
-    /// Warns, at most every ten seconds, that one was not written.
+    /// Warns, at most every ten seconds, that a snapshot was not written.
     pub fn warn(&mut self, error: &dyn Display) {
         if let Some(n_unsaid) = self.failures.pass(Instant::now()) {
-            tracing::warn!(n_unsaid, "not saved: {error}");
+            tracing::warn!(n_unsaid, "no snapshot was written: {error}");
         }
     }
 }
 
-/// What the next snapshot must survive; `age`: time since the last that survives a loss of power, if there is one.
+/// Returns what the next snapshot must survive. `age`: time since the latest that survives a loss of power.
 fn durability(age: Option<Duration>, is_last: bool) -> Durability {
     match age {
         Some(age) if age < SYNC_INTERVAL && !is_last => Durability::Kill,
@@ -116,17 +119,18 @@ fn durability(age: Option<Duration>, is_last: bool) -> Durability {
     }
 }
 
-/// Worlds that a server starts with.
+/// The saved worlds that a server starts with.
 pub struct FirstWorlds {
-    /// Their file.
+    /// The snapshot file.
     pub path: PathBuf,
     pub worlds: Vec<SnapshotWorld<Box<Episode>>>,
 }
 
-/// The worlds that the settings want a server to start with; `None`: new ones. Damaged files of a folder are skipped.
+/// Loads the worlds that a server starts with. Skips damaged files of a folder. Returns `None` if new worlds should
+/// start.
 ///
 /// # Errors
-/// If no file is whole, or the last whole one does not fit.
+/// If all files are damaged, or the latest intact one does not fit.
 pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstWorlds>, FileError> {
     if checked.config.restore.is_empty() {
         return Ok(None);
@@ -165,8 +169,8 @@ pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstW
     damaged.map_or(Ok(None), Err)
 }
 
-/// Logs why nothing of a folder is restored. An empty folder is that of a first start. One with other instances' files
-/// may be too, but the user may also have meant those.
+/// Logs why no snapshot of a folder is restored. An empty folder is normal at the first start. Snapshots of other
+/// instances are worth a warning, because the user may have meant them.
 fn log_why_none(folder: &Folder, path: &Path) {
     let (path, expected) = (path.display(), folder.pattern());
     match &folder.snapshots()[..] {

@@ -1,4 +1,4 @@
-//! Results of work on other threads, and a descriptor that wakes the server's loop for them.
+//! A channel for results of other threads, with a descriptor that wakes the server's loop.
 
 use emberwatch_protocol::channels::{ChannelError, call_error};
 use rustix::event::{EventfdFlags, eventfd};
@@ -6,23 +6,23 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
-/// Results that have arrived.
+/// The receiving end: results of other threads.
 pub struct Completions<T> {
     pub results: Receiver<T>,
-    /// Readable while `results` may hold something.
+    /// Readable while `results` may not be empty.
     signal: Arc<OwnedFd>,
 }
 
-/// Sends results from another thread.
+/// The sending end, for another thread.
 pub struct CompletionSender<T> {
     results: Sender<T>,
     signal: Arc<OwnedFd>,
 }
 
-/// Both ends.
+/// Creates both ends.
 ///
 /// # Errors
-/// If the system gives no descriptor.
+/// If the system has no file descriptor left.
 pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), ChannelError> {
     let signal = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
     let signal = Arc::new(signal.map_err(|errno| call_error("eventfd2", errno))?);
@@ -35,7 +35,7 @@ pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), Channel
 }
 
 impl<T> CompletionSender<T> {
-    /// Sends a result, unless the server has ended meanwhile.
+    /// Sends a result. Does nothing if the server has ended.
     pub fn send(&self, result: T) {
         let _ = self.results.send(result);
         let _ = rustix::io::write(&*self.signal, &1u64.to_ne_bytes());
@@ -52,13 +52,13 @@ impl<T> Clone for CompletionSender<T> {
 }
 
 impl<T> Completions<T> {
-    /// The results since the last call.
+    /// Returns the results since the last call.
     pub fn take(&self) -> Vec<T> {
         let _ = rustix::io::read(&*self.signal, &mut [0u8; 8]);
         self.results.try_iter().collect()
     }
 
-    /// Readable while there are results.
+    /// Returns a descriptor that is readable while results wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.signal.as_fd()
     }

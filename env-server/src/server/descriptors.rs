@@ -1,14 +1,14 @@
-//! File descriptors. iceoryx2 takes some for each client and observer; without them, a new one gets no answer at all.
-//! So there must be enough for all before a server starts.
+//! The limit on file descriptors. iceoryx2 opens some for each client and observer. Without them, a new client gets no
+//! answer at all, so a server starts only if there are enough for all.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use thiserror::Error;
 
-/// What a server, all clients and all observers take, and some more: 40 alone, 10 for each of 16 clients, up to 8 more where
-/// its requests grow, 1 for each of 16 observers and 4 readers (measured).
+/// Minimum limit for a server with all clients and observers, with a reserve. Measured: 40 for the server, 10 for each
+/// of 16 clients and up to 8 more if its requests grow, 1 for each of 16 observers and 4 readers of hidden states.
 const NEEDED: u64 = 512;
 
-/// A limit that is too low for all clients and observers.
+/// The error that the limit is too low for all clients and observers.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error(
     "file descriptors: expected a limit of at least {NEEDED}, got {got}; raise it (`ulimit -Hn`; docker: --ulimit \
@@ -18,7 +18,7 @@ pub struct TooFewDescriptors {
     got: u64,
 }
 
-/// Raises the soft limit if it is too low.
+/// Raises the soft limit on file descriptors if it is too low.
 pub fn raise_limit() -> Result<(), TooFewDescriptors> {
     let Some(raised) = enough(getrlimit(Resource::Nofile))? else {
         return Ok(());
@@ -27,7 +27,7 @@ pub fn raise_limit() -> Result<(), TooFewDescriptors> {
     setrlimit(Resource::Nofile, raised).map_err(|_| TooFewDescriptors { got })
 }
 
-/// The limits to set; `None` if these are enough.
+/// Returns the limits to set, or `None` if the given ones are high enough.
 fn enough(limits: Rlimit) -> Result<Option<Rlimit>, TooFewDescriptors> {
     let is_enough = |limit: Option<u64>| limit.is_none_or(|limit| limit >= NEEDED);
     match limits.maximum {

@@ -1,4 +1,4 @@
-//! Snapshot files are written and read on a thread of its own, so that no disk delays a step.
+//! Writes and reads snapshot files on a separate thread, so that the disk never delays a step.
 
 use super::completions::{Completions, completions};
 use emberwatch_protocol::limits::threads::spawn;
@@ -7,13 +7,13 @@ use std::os::fd::BorrowedFd;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// Most jobs at a time.
+/// Maximum number of unfinished jobs.
 const MAX_JOBS: u64 = 16;
 
 /// A job's number and result.
 pub type FileResult = (u64, Result<Done, FileError>);
 
-/// The thread that works on files.
+/// The thread that runs file jobs, and its queue.
 pub struct Files {
     jobs: Option<Sender<(u64, Job)>>,
     n_jobs: u64,
@@ -25,7 +25,7 @@ impl Files {
     /// Starts the thread.
     ///
     /// # Errors
-    /// If the system gives no descriptor, or starts no thread.
+    /// If the system has no file descriptor left or cannot start a thread.
     pub fn start(spec: WorldSpec) -> anyhow::Result<Self> {
         let (sender, finished) = completions()?;
         let (jobs, queue) = channel::<(u64, Job)>();
@@ -43,7 +43,7 @@ impl Files {
         })
     }
 
-    /// Queues a job; returns its number.
+    /// Queues a job and returns its number.
     pub fn add(&mut self, job: Job) -> u64 {
         self.n_jobs += 1;
         if let Some(jobs) = &self.jobs {
@@ -52,22 +52,22 @@ impl Files {
         self.n_jobs
     }
 
-    /// Whether there is room for another job: those of clients that gave up are still done.
-    pub fn has_room(&self) -> bool {
+    /// Returns whether another job can be queued. Jobs whose clients have stopped waiting count until done.
+    pub fn has_capacity(&self) -> bool {
         self.n_jobs - self.n_done < MAX_JOBS
     }
 
-    /// The jobs that are done since the last call.
+    /// Returns the jobs finished since the last call.
     pub fn finished(&mut self) -> Vec<FileResult> {
         let finished = self.finished.take();
         self.n_done += finished.len() as u64;
         finished
     }
 
-    /// Waits until all jobs are done; returns their results.
+    /// Waits until all jobs are done and returns their results.
     ///
     /// # Errors
-    /// If they take longer than the limit: the results by then.
+    /// If the jobs take longer than `limit`. The error holds the results so far.
     pub fn finish(mut self, limit: Duration) -> Result<Vec<FileResult>, Vec<FileResult>> {
         self.jobs = None;
         let deadline = Instant::now() + limit;
@@ -82,7 +82,7 @@ impl Files {
         }
     }
 
-    /// Readable while a job is done.
+    /// Returns a descriptor that is readable while finished jobs wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.finished.descriptor()
     }

@@ -1,4 +1,4 @@
-//! Which processes the clients and observers are, and whether they run; removes the files of dead ones.
+//! Watches the processes of clients and observers, and removes the files of dead ones.
 
 use emberwatch_protocol::cleanup::remove_leftovers;
 use emberwatch_protocol::limits::threads::spawn;
@@ -12,11 +12,11 @@ use std::os::fd::BorrowedFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Nodes remembered before the table is emptied: bounds the memory that a client that always reconnects can take.
+/// Maximum number of known nodes; then the table is emptied. Bounds the memory that a reconnecting client can use.
 const MAX_KNOWN_NODES: usize = 1024;
 
-/// The processes behind requests, and those of observers. When one has died, a thread removes its files: that takes
-/// milliseconds, and steps must not wait for it.
+/// The watched processes of clients and observers. When one has died, a thread removes its files, which takes
+/// milliseconds and must not delay steps.
 #[derive(Default)]
 pub struct Clients {
     nodes: HashMap<u128, u32>,
@@ -27,12 +27,12 @@ pub struct Clients {
 }
 
 impl Clients {
-    /// The process of a node; watches it from now on.
+    /// Returns the process of a node, and watches it from now on.
     pub fn identify(&mut self, node: u128) -> ClientId {
         if let Some(&pid) = self.nodes.get(&node) {
             return ClientId { node, pid };
         }
-        // PROTOCOL.md section 9 tells what an id holds.
+        // PROTOCOL.md section 1 defines the content of a node id.
         let pid = (node >> 64) as u32;
         if self.nodes.len() == MAX_KNOWN_NODES {
             self.nodes.clear();
@@ -43,13 +43,13 @@ impl Clients {
         ClientId { node, pid }
     }
 
-    /// One descriptor per process, readable when it has ended.
+    /// Returns one descriptor per process, which becomes readable when the process ends.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.processes.values().map(WatchedProcess::descriptor)
     }
 
-    /// The processes of these nodes, and of those behind requests, that have ended since the last call; they are
-    /// forgotten, and their files removed.
+    /// Returns the processes that have ended since the last call, among those of `nodes` and of clients. Stops watching
+    /// them and removes their files.
     pub fn take_dead(&mut self, nodes: &HashSet<u128>) -> Vec<u32> {
         for &node in nodes {
             self.identify(node);
@@ -78,14 +78,14 @@ impl Clients {
         }
     }
 
-    /// Watches a process; returns whether there is no need to try again.
+    /// Watches a process. Returns false if that failed and should be tried again.
     fn watch(&mut self, pid: u32) -> bool {
         if self.processes.contains_key(&pid) {
             return true;
         }
         match WatchedProcess::open(i32::try_from(pid).unwrap_or(0)) {
             Ok(process) => self.processes.insert(pid, process).is_none(),
-            // Its lease will expire.
+            // The process has already ended. Its lease will expire.
             Err(Errno::SRCH) => {
                 self.is_cleanup_due = true;
                 true
@@ -106,9 +106,9 @@ impl Clients {
 
 fn clean_up() {
     match remove_leftovers() {
-        Ok(n_files) => tracing::debug!(n_files, "removed what dead processes left"),
-        // The next program removes them.
-        Err(error) => tracing::debug!("not removed what dead processes left: {error}"),
+        Ok(n_files) => tracing::debug!(n_files, "removed files of dead processes"),
+        // The next program that starts tries again.
+        Err(error) => tracing::debug!("could not remove files of dead processes: {error}"),
     }
 }
 
@@ -119,7 +119,7 @@ mod tests {
     use std::process::Command;
 
     #[test]
-    fn a_death_wakes_the_wait_for_the_descriptors_and_is_told_once() {
+    fn a_death_makes_the_descriptors_readable_and_is_reported_once() {
         let mut clients = Clients::default();
         let mut child = Command::new("sleep").arg("600").spawn().expect("a process");
         let nodes = HashSet::from([1, 2].map(|node| u128::from(child.id()) << 64 | node));

@@ -1,5 +1,6 @@
-//! Shared memory for a server's messages. A server starts only if there is enough for all clients and observers. Each
-//! gets its part when it comes, so that few clients take little, and a server writes only where there is memory.
+//! Shared memory for a server's messages. A server starts only if there is enough for all clients and observers. The
+//! memory is allocated when they connect: few clients use little, and the server never writes to memory that the
+//! system cannot supply.
 
 use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
@@ -10,16 +11,16 @@ use emberwatch_protocol::channels::{
 use emberwatch_protocol::responder::JSON_SLICE;
 use emberwatch_protocol::shared_memory::MessageMemory;
 
-/// Bytes that iceoryx2 adds to each message, at most.
+/// Maximum overhead of iceoryx2 per message, in bytes.
 const MESSAGE_OVERHEAD: usize = 512;
 
-/// Shared memory for everything of fixed size: control messages, events, tables.
+/// Shared memory of fixed size, in bytes: control messages, events and tables.
 const FIXED_BYTES: u64 = 8 << 20;
 
-/// Answers to one client, as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
+/// Answers that iceoryx2 reserves per client: for each of 2 requests one buffered, one borrowed, one loaned.
 const ANSWERS: usize = 2 * 3;
 
-/// Shared memory for the messages of a server's ports.
+/// The shared memory for the messages of a server's ports.
 pub struct PortMemory {
     control: MessageMemory,
     step: MessageMemory,
@@ -36,7 +37,7 @@ pub struct PortIds {
 }
 
 impl PortMemory {
-    /// That of these ports, with enough for a first client.
+    /// Creates the memory of these ports and makes it ready for a first client.
     pub fn new(ids: &PortIds, config: &PortConfig) -> Result<Self, ChannelError> {
         let n_answers = MAX_CLIENTS * ANSWERS;
         let truth = ids.truth.map(|id| {
@@ -54,18 +55,18 @@ impl PortMemory {
         Ok(memory)
     }
 
-    /// Makes memory ready for answers to so many clients.
+    /// Makes memory ready for answers to `n_clients` clients.
     pub fn for_clients(&self, n_clients: usize) -> Result<(), ChannelError> {
         self.control.make_ready(n_clients * ANSWERS)?;
         self.step.make_ready(n_clients * ANSWERS)
     }
 
-    /// Makes memory ready for frames to so many observers.
+    /// Makes memory ready for frames to `n_observers` observers.
     pub fn for_observers(&self, n_observers: usize) -> Result<(), ChannelError> {
         self.frames.make_ready(samples(n_observers, FRAME_BUFFER))
     }
 
-    /// Makes memory ready for hidden states to so many readers.
+    /// Makes memory ready for hidden states to `n_readers` readers.
     pub fn for_readers(&self, n_readers: usize) -> Result<(), ChannelError> {
         let n_truths = samples(n_readers, TRUTH_BUFFER);
         self.truth
@@ -74,12 +75,13 @@ impl PortMemory {
     }
 }
 
-/// Samples in use at a time: a buffer and one that is read for each, the last and the next.
+/// Returns the maximum number of samples in use: for each subscriber a full buffer and one that it reads, and for the
+/// publisher the last sample and the next.
 fn samples(n_subscribers: usize, buffer: usize) -> usize {
     n_subscribers * (buffer + 1) + 2
 }
 
-/// Checks that `/dev/shm` has enough room for all clients and observers that there may be.
+/// Checks that `/dev/shm` has enough space for the maximum number of clients and observers.
 pub fn check_shared_memory(config: &PortConfig) -> Result<()> {
     let bytes =
         |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;

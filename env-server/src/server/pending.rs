@@ -1,4 +1,4 @@
-//! What is answered later: requests that wait for resets and files.
+//! Requests that are answered later, because they wait for resets or files.
 
 use super::state::Server;
 use emberwatch_protocol::control::Reply;
@@ -19,7 +19,7 @@ impl Server {
         }
     }
 
-    /// Has a file read or written for a request that is answered afterwards.
+    /// Starts a file job for a request, which is answered when the job is done.
     pub(super) fn start_file(
         &mut self,
         now: Instant,
@@ -27,13 +27,13 @@ impl Server {
         job: Job,
         pending: PendingFile,
     ) {
-        if self.files.has_room() {
+        if self.files.has_capacity() {
             let number = self.files.add(job);
             self.pending_files.insert(number, (request, pending));
             return;
         }
         self.simulator.cancel_file(now, &pending);
-        let message = "too many files at a time: try again later".into();
+        let message = "too many file jobs at a time: try again later".into();
         self.send_reply(&request, &Reply::error(Status::BadFile, 0, message));
     }
 
@@ -50,7 +50,7 @@ impl Server {
         self.answer_pending(now);
     }
 
-    /// Warns of the first world in which there is nothing to find.
+    /// Warns, once, if no cell of a new world is in the state with the highest reward.
     fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
         let is_recorded = self.simulator.is_recorded();
         if self.has_warned_of_barren || is_recorded || episode.outcome().n_target_cells > 0 {
@@ -60,8 +60,8 @@ impl Server {
         tracing::warn!(
             world,
             seed = episode.outcome().seed,
-            "no cell is in the state that pays most: set --burn-in, a larger grid, or a model for small ones, \
-             --model wildfire-small"
+            "no cell is in the state with the highest reward: raise --burn-in, enlarge the grid, or use a model for \
+             small grids, such as --model wildfire-small"
         );
     }
 
@@ -70,11 +70,11 @@ impl Server {
             if let Some(autosave) = &mut self.autosave
                 && autosave.finish(number, &outcome)
             {
-                self.save_if_due(); // More steps may have been made meanwhile.
+                self.save_if_due(); // The next snapshot may have become due meanwhile.
                 continue;
             }
             let Some((request, pending)) = self.pending_files.remove(&number) else {
-                continue; // Its client gave up.
+                continue; // The client has stopped waiting.
             };
             let reply = self.simulator.file_reply(now, &pending, outcome);
             self.send_reply(&request, &reply);
@@ -84,7 +84,7 @@ impl Server {
         }
     }
 
-    /// Drops requests whose clients no longer wait: until then, iceoryx2 delivers none of the same client's next ones.
+    /// Drops requests whose clients have stopped waiting. Until then, iceoryx2 delivers no new requests of theirs.
     pub(super) fn cancel_abandoned(&mut self, now: Instant) {
         let simulator = &mut self.simulator;
         self.waiting_steps.retain(|(ticket, request)| {

@@ -1,25 +1,25 @@
-//! What a server's ports must hold.
+//! The maximum sizes of messages on a server's ports.
 
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::payload::ROBOT_BYTES;
 
-/// The instance, and the sizes of its messages.
+/// The instance and the maximum sizes of its messages.
 #[derive(Debug, Clone)]
 pub struct PortConfig {
     pub instance: Instance,
-    /// Most cells of a frame, or of hidden states.
+    /// Maximum number of cells of a grid.
     pub n_cells: usize,
-    /// Longest sample on `frames`, bytes.
+    /// Maximum length of a sample on `frames`, in bytes.
     pub frame_bytes: usize,
-    /// Longest answer on `step`, bytes.
+    /// Maximum length of an answer on `step`, in bytes.
     pub answer_bytes: usize,
     /// Whether to publish hidden states.
     pub publish_truth: bool,
 }
 
 impl PortConfig {
-    /// Of an instance that serves nothing yet.
+    /// Returns the sizes of an instance without worlds.
     pub fn empty(instance: Instance) -> Self {
         Self {
             instance,
@@ -30,7 +30,7 @@ impl PortConfig {
         }
     }
 
-    /// Makes room for the samples of a server's worlds.
+    /// Increases the sizes to fit the samples of a server's worlds.
     pub fn fit(&mut self, info: &ServerInfo) {
         let n_cells = info.height * info.width;
         let n_bytes = frame_bytes(info.n_robots, n_cells, info.n_moves);
@@ -39,7 +39,7 @@ impl PortConfig {
     }
 }
 
-/// The longest payload of a sample on `frames`.
+/// Returns the maximum length of a sample on `frames`, in bytes.
 pub(super) fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
     n_robots as usize * (ROBOT_BYTES + n_cells + n_moves)
 }

@@ -1,4 +1,4 @@
-//! The server's ends of the channels.
+//! The server's ports on the channels.
 
 use super::descriptors::raise_limit;
 use super::memory::{PortIds, PortMemory, check_shared_memory};
@@ -39,7 +39,7 @@ use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
 use std::time::Instant;
 
-/// A request on `step` that waits for its answer.
+/// A received request on `step` that is not answered yet.
 pub type ActiveStep = Active<StepRequest, StepReply>;
 
 /// All ports of a server.
@@ -59,7 +59,7 @@ pub struct Ports {
     truth_service: Option<TruthService>,
     entries: Entries,
     _node: Node<Ipc>,
-    /// Dropped last, so that everything else is removed within this turn.
+    /// Dropped last, so that all other files are removed during this turn.
     end: Option<Turn>,
 }
 
@@ -70,10 +70,10 @@ impl Drop for Ports {
 }
 
 impl Ports {
-    /// Opens the ports of a simulator.
+    /// Opens the ports for worlds with these settings.
     ///
     /// # Errors
-    /// If another server has them, or the system has too little memory or descriptors.
+    /// If another server runs the instance, or the system has too little memory or too few descriptors.
     pub fn open(checked: &Checked) -> Result<Self> {
         let (n_cells, config) = (checked.shape.n_cells(), &checked.config);
         let of_robots = config.robots as usize * (ROBOT_BYTES + n_cells);
@@ -86,7 +86,7 @@ impl Ports {
         })
     }
 
-    /// Opens ports for messages of these sizes.
+    /// Opens ports for messages of the configured sizes.
     pub fn open_with(config: &PortConfig) -> Result<Self> {
         WatchedProcess::check()?;
         check_shared_memory(config)?;
@@ -149,24 +149,25 @@ impl Ports {
         self.entries.check_at(Instant::now())
     }
 
-    /// Closes the ports, unless their files were removed: those of the same names are another server's then.
+    /// Closes the ports and removes their files. If the files were already removed, leaves the current files of the
+    /// same names alone, because they belong to another server.
     pub fn close(self) {
         if self.entries.check().is_err() {
             std::mem::forget(self);
         }
     }
 
-    /// The next step request.
+    /// Returns the next step request, if any.
     pub fn receive_step(&self) -> Option<ActiveStep> {
         received(self.step.receive(), &self.failed_connections)
     }
 
-    /// The next control request.
+    /// Returns the next control request, if any.
     pub fn receive_control(&self) -> Option<ActiveControl> {
         received(self.control.receive(), &self.failed_connections)
     }
 
-    /// A reply, or a refusal if it welcomes a client for whose answers there is no memory.
+    /// Returns the reply. Replaces a reply to `hello` by a refusal if there is no memory for answers to another client.
     pub fn with_memory(&self, reply: Reply) -> Reply {
         let n_clients = self.control_service.dynamic_config().number_of_clients();
         match (
@@ -178,12 +179,12 @@ impl Ports {
         }
     }
 
-    /// Sends answers to requests of both kinds.
+    /// Returns the sender of answers to step and control requests.
     pub fn answers(&mut self) -> &mut Answers {
         &mut self.answers
     }
 
-    /// Publishes a step of a world, if anybody observes.
+    /// Publishes a step of a world to the observers.
     pub fn publish_frame(&self, header: FrameHeader, bytes: &[u8]) {
         let (n_observers, _) = self.observers();
         let ready = self.memory.for_observers(n_observers);
@@ -192,7 +193,7 @@ impl Ports {
         self.warn_of(sent, "a frame was not published");
     }
 
-    /// Publishes hidden states, if the server does so at all.
+    /// Publishes hidden states, if the server is configured to do so.
     pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
         let Some(truth) = &self.truth else { return };
         let (_, n_readers) = self.observers();
@@ -202,7 +203,7 @@ impl Ports {
         self.warn_of(sent, "hidden states were not published");
     }
 
-    /// Warns, at most every ten seconds, of what was not published.
+    /// Warns, at most every ten seconds, about a sample that was not published.
     fn warn_of(&self, sent: Result<usize, String>, what: &str) {
         if let Err(problem) = sent
             && let Some(n_unsaid) = self.unpublished.borrow_mut().pass(Instant::now())
@@ -211,12 +212,12 @@ impl Ports {
         }
     }
 
-    /// Warns, at most every ten seconds, of clients and observers that cannot connect.
+    /// Warns, at most every ten seconds, about clients and observers that cannot connect.
     pub fn warn_of_descriptors(&self, now: Instant) {
         self.failed_connections.warn(now);
     }
 
-    /// The number of observers of frames and of readers of the truth.
+    /// Returns the number of observers of frames and of readers of hidden states.
     pub fn observers(&self) -> (usize, usize) {
         let n_frames = self.frame_service.dynamic_config().number_of_subscribers();
         let n_truth = self.truth_service.as_ref().map_or(0, |service| {
@@ -225,12 +226,12 @@ impl Ports {
         (n_frames, n_truth)
     }
 
-    /// Who observes frames or reads the truth.
+    /// Returns the port ids of the observers of frames and readers of hidden states.
     pub fn observer_ids(&self) -> Vec<u128> {
         self.list_observers(|observer| observer.subscriber_id.value())
     }
 
-    /// The nodes with an open connection, and those of observers.
+    /// Returns the nodes of clients with an open connection and of observers.
     pub fn nodes(&self) -> HashSet<u128> {
         let mut nodes = self.client_nodes();
         nodes.extend(self.list_observers(|observer| observer.node_id.value()));
@@ -252,9 +253,9 @@ impl Ports {
         list
     }
 
-    /// Connects to new observers.
+    /// Connects to new observers and disconnects from those that have left.
     pub fn connect_observers(&self) {
-        // An observer that cannot be connected to gets nothing; others are not affected.
+        // If connecting to one observer fails, only that observer receives nothing.
         let _ = self.frames.update_connections();
         let _ = self
             .truth
@@ -262,12 +263,12 @@ impl Ports {
             .map(UpdateConnections::update_connections);
     }
 
-    /// Clients connected to `step`.
+    /// Returns the number of clients connected to `step`.
     pub fn n_clients(&self) -> usize {
         self.step_service.dynamic_config().number_of_clients()
     }
 
-    /// The nodes with an open connection.
+    /// Returns the nodes of clients with an open connection.
     pub fn client_nodes(&self) -> HashSet<u128> {
         let mut nodes = HashSet::new();
         let mut add = |client: &ClientDetails| {
@@ -279,12 +280,12 @@ impl Ports {
         nodes
     }
 
-    /// Drops wake-ups; returns whether there were any.
+    /// Discards pending wake-ups and returns whether there were any.
     pub fn drain(&self) -> Result<bool, ChannelError> {
         drain(&self.listener)
     }
 
-    /// Readable while there are wake-ups.
+    /// Returns a descriptor that is readable while wake-ups are pending.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         descriptor(&self.listener)
     }

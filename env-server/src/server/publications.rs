@@ -1,4 +1,4 @@
-//! What observers get: every world after its step, and all worlds when they connect.
+//! Publishes each world after its step, and all worlds when an observer connects.
 
 use super::ports::Ports;
 use emberwatch_protocol::channels::FRAME_BUFFER;
@@ -8,11 +8,11 @@ use emberwatch_sim::simulator::Simulator;
 use emberwatch_sim::world::Episode;
 use std::ops::Range;
 
-/// What has been published, and to whom.
+/// The known observers and the numbers of published samples.
 #[derive(Default)]
 pub struct Publications {
     observers: Vec<u128>,
-    /// Worlds that are yet to be published for new observers.
+    /// Worlds that new observers have not received yet.
     for_new: Range<usize>,
     n_frames: u64,
     n_truths: u64,
@@ -20,30 +20,30 @@ pub struct Publications {
 }
 
 impl Publications {
-    /// Whether worlds are yet to be published for new observers.
+    /// Returns whether worlds are still to be published for new observers.
     pub fn has_new_observers(&self) -> bool {
         !self.for_new.is_empty()
     }
 
-    /// Publishes every world, part by part, for new observers.
+    /// Publishes the next worlds for new observers, until all are published.
     pub fn publish_to_new(&mut self, ports: &Ports, simulator: &Simulator) {
         let observers = ports.observer_ids();
         let has_new = observers.iter().any(|id| !self.observers.contains(id));
         if observers != self.observers {
-            // Also disconnects those that have left.
+            // Also disconnects observers that have left.
             ports.connect_observers();
         }
         self.observers = observers;
         if has_new {
             self.for_new = simulator.worlds();
         }
-        // In parts: more at once would overflow the buffers of new observers.
+        // In batches: more samples at once would overflow the buffers of new observers.
         let part = self.for_new.start..self.for_new.end.min(self.for_new.start + FRAME_BUFFER);
         self.for_new.start = part.end;
         self.publish(ports, simulator, part);
     }
 
-    /// Publishes worlds as they are now; costs nothing without observers.
+    /// Publishes the current step of worlds. Costs almost nothing without observers.
     pub fn publish(&mut self, ports: &Ports, simulator: &Simulator, worlds: Range<usize>) {
         let (n_observers, n_readers) = ports.observers();
         if n_observers == 0 && n_readers == 0 {

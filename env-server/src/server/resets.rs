@@ -1,5 +1,4 @@
-//! Resets run here, on threads of their own, so that one client's burn-in never delays another's
-//! step.
+//! Runs resets on separate threads, so that one client's burn-in never delays another client's step.
 
 use super::completions::{CompletionSender, Completions, completions};
 use emberwatch_protocol::channels::ChannelError;
@@ -9,7 +8,7 @@ use rayon::ThreadPool;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 
-/// The threads that reset worlds.
+/// The threads that reset worlds, and the finished resets.
 pub struct Resets {
     threads: ThreadPool,
     rules: Arc<Rules>,
@@ -18,10 +17,10 @@ pub struct Resets {
 }
 
 impl Resets {
-    /// Threads without work yet.
+    /// Prepares the threads for resets.
     ///
     /// # Errors
-    /// If the system gives no descriptor.
+    /// If the system has no file descriptor left.
     pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, ChannelError> {
         let (sender, finished) = completions()?;
         Ok(Self {
@@ -39,12 +38,12 @@ impl Resets {
         }
     }
 
-    /// The worlds that have been reset since the last call.
+    /// Returns the worlds whose reset has finished since the last call.
     pub fn finished(&self) -> Vec<(usize, Box<Episode>)> {
         self.finished.take()
     }
 
-    /// Readable while a reset has finished.
+    /// Returns a descriptor that is readable while finished resets wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.finished.descriptor()
     }

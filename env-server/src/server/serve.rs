@@ -1,4 +1,4 @@
-//! The loop: receive, check the lease, step, answer, publish.
+//! The server's main loop: receives requests, answers them, and publishes frames.
 
 use super::ports::ActiveStep;
 use super::state::Server;
@@ -21,16 +21,16 @@ use std::time::{Duration, Instant};
 /// How often an idle server checks for expired leases and new observers.
 const IDLE_TICK: Duration = Duration::from_millis(250);
 
-/// The same for a busy server: the longest delay until it notices that a client has died.
+/// How often a busy server makes these checks. This limits the delay until it notices that a client has died.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
-/// One round in this many takes a control request before a step.
+/// One of this many rounds looks for a control request before a step request.
 const CONTROL_FIRST: u64 = 64;
 
-/// How often a server publishes the next worlds for new observers.
+/// How often a server publishes the next batch of worlds for new observers.
 const NEW_OBSERVER_TICK: Duration = Duration::from_millis(5);
 
-/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends.
+/// Serves until `stop` is set, a client requests a shutdown, or the process `exit_with` ends.
 pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -> Result<()> {
     let mut server = Server::start(checked, exit_with)?;
     let mut outcome = Ok(());
@@ -44,16 +44,16 @@ pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -
     Ok(())
 }
 
-/// What a round of the loop found.
+/// The event that ended the wait of a round.
 enum Found {
     Step(ActiveStep),
     Control(ActiveControl),
-    /// A wake-up without a request, a death or a finished reset.
+    /// A wake-up without a request, the end of a process, or a finished reset or file job.
     Event,
 }
 
 impl Server {
-    /// Waits for something and handles it.
+    /// Waits for a request or another event and handles it.
     fn run_once(&mut self) -> Result<()> {
         let woken = Cell::new(false);
         let tick = if self.publications.has_new_observers() {
@@ -65,7 +65,7 @@ impl Server {
         let tick = deadline.map_or(tick, |at| {
             tick.min(at.saturating_duration_since(Instant::now()))
         });
-        // Sometimes control comes first, so that endless steps cannot block it.
+        // Control requests sometimes take precedence, so that a constant stream of steps cannot block them.
         self.n_rounds = self.n_rounds.wrapping_add(1);
         if self.n_rounds.is_multiple_of(CONTROL_FIRST)
             && let Some(request) = self.ports.receive_control()
@@ -103,7 +103,8 @@ impl Server {
         woken.get().then_some(Found::Event)
     }
 
-    /// Sleeps until a wake-up, a signal, a death or a finished reset; returns whether there was one.
+    /// Sleeps for at most `limit`, until a wake-up, a signal, the end of a process, or a finished reset or file job.
+    /// Returns whether there was one.
     fn sleep(&self, limit: Duration) -> Result<bool> {
         let own = [
             self.ports.descriptor(),
@@ -114,7 +115,7 @@ impl Server {
         let others = exit_with.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
         let woken = sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?;
-        // Wake-ups that are left would end the next sleep at once.
+        // Wake-ups that stay pending would end the next sleep immediately.
         self.ports.drain()?;
         Ok(woken)
     }
@@ -140,7 +141,7 @@ impl Server {
         }
     }
 
-    /// Answers the requests whose world has moved, or that have lost a robot.
+    /// Answers waiting requests whose world has moved or which have lost a robot, and publishes the worlds that moved.
     pub(super) fn answer_settled(&mut self, now: Instant) {
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut self.payload) {
             let mut waiting = self.waiting_steps.iter();
@@ -158,7 +159,7 @@ impl Server {
         }
     }
 
-    /// Sends the answer that is in `payload`.
+    /// Sends an answer whose body is in `self.payload`.
     fn send_step(&mut self, now: Instant, request: &ActiveStep, mut reply: StepReply) {
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         let header = request.user_header().0;
@@ -169,7 +170,7 @@ impl Server {
     }
 
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
-        // Frees the robots of a holder that has just died.
+        // Frees the robots of clients that have just died, so that this request can acquire them.
         self.forget_ended_clients(now);
         let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
@@ -204,7 +205,7 @@ impl Server {
         self.answer_settled(now);
     }
 
-    /// Work without a request: ended clients, finished jobs, expired leases, new observers.
+    /// Does the work that needs no request: ended clients, finished jobs, expired leases, new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);
@@ -239,7 +240,7 @@ impl Server {
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }
-        // Before anything else changes the worlds.
+        // These answers show their own step, so they must be sent before the worlds change again.
         self.answer_settled(now);
     }
 }

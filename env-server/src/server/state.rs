@@ -1,4 +1,4 @@
-//! The state of a running server: how it starts, and how it ends.
+//! The state of a running server, its start and its end.
 
 use super::autosave::{Autosave, FirstWorlds, first_worlds};
 use super::files::Files;
@@ -27,7 +27,7 @@ use std::hash::BuildHasher;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// How long a server that ends waits for its files.
+/// How long an ending server waits for its file jobs.
 const LAST_FILES: Duration = Duration::from_secs(10);
 
 pub(super) struct Server {
@@ -41,7 +41,7 @@ pub(super) struct Server {
     pub(super) waiting_steps: Vec<(Ticket, ActiveStep)>,
     pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
     pub(super) files: Files,
-    /// Requests that wait for a file, by the number of its job.
+    /// Requests that wait for a file, by the number of the file job.
     pub(super) pending_files: HashMap<u64, (ActiveControl, PendingFile)>,
     pub(super) autosave: Option<Autosave>,
     pub(super) payload: Vec<u8>,
@@ -134,7 +134,7 @@ impl Server {
         }
     }
 
-    /// Writes a last snapshot and closes the channels; then others may take the instance.
+    /// Writes a last snapshot and closes the channels. Afterwards another server can use the instance's name.
     pub(super) fn end(mut self) -> Result<()> {
         self.save(true);
         let (finished, is_late) = match self.files.finish(LAST_FILES) {
@@ -142,7 +142,7 @@ impl Server {
             Err(finished) => (finished, true),
         };
         if is_late {
-            tracing::warn!("files were not written within {LAST_FILES:?}");
+            tracing::warn!("snapshot files were not finished within {LAST_FILES:?}");
         }
         self.ports.close();
         let failed = finished
@@ -173,7 +173,7 @@ fn announce(checked: &Checked) {
     }
 }
 
-/// Logs how many free cells robots cannot reach, and which fixed starts are closed in.
+/// Logs how many free cells random starts cannot reach, and which fixed starts no-fly cells enclose.
 pub fn announce_reach(reach: &Reach) {
     if let Some(words) = reach.cut_off() {
         tracing::info!("{words}");
@@ -183,7 +183,7 @@ pub fn announce_reach(reach: &Reach) {
     }
 }
 
-/// The worlds, restored if there is a snapshot of them, and the resets that start the others.
+/// Creates the worlds, restored from a snapshot if the settings name one, and the resets that start the others.
 fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
     let (mut simulator, mut resets) = Simulator::new(checked, steps, token_source())?;
@@ -197,7 +197,8 @@ fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<Rese
     Ok((simulator, resets))
 }
 
-/// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.
+/// Returns a generator of unguessable lease tokens. They are at least 1, and below 2^53 so that every JSON reader
+/// represents them exactly.
 fn token_source() -> Box<dyn FnMut() -> u64 + Send> {
     let entropy = RandomState::new();
     let mut key = [0; 32];

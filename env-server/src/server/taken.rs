@@ -1,7 +1,7 @@
-//! An instance that another server has, or that a dead one left.
+//! Instances whose name is in use by another server or still blocked by a dead one.
 //!
-//! Files of a dead process are removed in a turn (`emberwatch_protocol::turn`), which another process may hold for a while. Until
-//! then the dead process seems to have the instance.
+//! Files of a dead process are removed during a turn (`emberwatch_protocol::turn`), for which a process may have to
+//! wait. Until then the dead process appears to own the instance.
 
 use anyhow::Result;
 use emberwatch_protocol::program::WatchedProcess;
@@ -9,13 +9,13 @@ use rustix::io::Errno;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
-/// How long to try while a dead process has the instance.
+/// How long to retry while a dead process owns the instance.
 const LIMIT: Duration = Duration::from_secs(10);
 
-/// How long to wait between two tries.
+/// Pause between two attempts.
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// Another server has the instance.
+/// The error that another server already runs the instance.
 #[derive(Debug, Error)]
 #[error("instance {instance:?} is already running, as pid {pid}")]
 pub struct Taken {
@@ -27,13 +27,13 @@ impl Taken {
     fn is_left_over(&self) -> bool {
         match WatchedProcess::open(self.pid) {
             Ok(process) => process.has_ended(),
-            // Any other error tells nothing of the process.
+            // Other errors do not show whether the process has ended.
             Err(errno) => errno == Errno::SRCH,
         }
     }
 }
 
-/// Opens something, as soon as no dead process has it.
+/// Calls `open`, and calls it again while the instance belongs to a dead process.
 pub fn once_free<T>(mut open: impl FnMut() -> Result<T>) -> Result<T> {
     let start = Instant::now();
     loop {
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
     use std::process::Command;
 
-    /// Tries until opened, at most twice; returns how often.
+    /// Opens an instance that process `pid` owns at the first attempt, and returns the number of attempts.
     fn tries(pid: u32) -> usize {
         let mut n_tries = 0;
         let opened = once_free(|| {

@@ -1,4 +1,4 @@
-//! The channel `agent`: the beliefs that agents publish, for displays. A reader gets an [`AgentBelief`] from each sample.
+//! The channel `agent`: the beliefs that agents publish for displays. [`AgentBelief`] is a decoded sample.
 
 use crate::message::{AgentHeader, VERSION};
 use crate::sample::Sample;
@@ -9,36 +9,36 @@ use thiserror::Error;
 /// Maximum number of states of a published belief.
 pub const MAX_STATES: u32 = 256;
 
-/// Longest [`Intent`] in JSON, bytes.
+/// Maximum size of an [`Intent`] in JSON, in bytes.
 pub const MAX_INTENT_BYTES: usize = 65_536;
 
-/// What an agent's last path was planned for.
+/// The policy, estimator and objective behind an agent's last path.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Intent {
     /// Name of the agent's policy.
     pub policy: String,
     /// The estimator that made the belief.
     pub belief_from: String,
-    /// The objective of the path that was just flown.
+    /// The objective of the last path that was flown.
     pub objective: String,
     /// Names of the belief's states.
     pub states: Vec<String>,
-    /// Time that the path's plan took, milliseconds.
+    /// Time that planning the path took, in milliseconds.
     pub plan_millis: f64,
 }
 
-/// One sample of `agent`, checked.
+/// A checked sample of `agent`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentBelief {
-    /// World, episode, step, process.
+    /// The header, with world, episode, step and process.
     pub header: AgentHeader,
-    /// The belief about the state at that step, the posterior; shape `[S, H, W]`, each in 0..=1.
+    /// The posterior belief about the state at that step, shape `[S, H, W]`, each value in 0..=1.
     pub belief: Probabilities,
-    /// What the path was planned for.
+    /// The intent of the path.
     pub intent: Intent,
 }
 
-/// A malformed sample.
+/// The error for a malformed sample.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("sample of an agent: {problem}")]
 pub struct BeliefError {

@@ -1,24 +1,24 @@
-//! What answers a client's requests.
+//! The backend of a client, which answers its requests.
 
 use crate::control::{Reply, Request, ServerInfo};
 use crate::errors::{ConnectionError, garbled};
 use crate::message::{StepReply, StepRequest};
 use std::time::Duration;
 
-/// The answer to a step request: its header, and its payload, which fits the header: results of the worlds, results of
-/// the robots, frames.
+/// The answer to a step request: its header, and its payload (results of worlds, results of robots, frames). The
+/// payload's length fits the header.
 pub type StepAnswer = (StepReply, Vec<u8>);
 
 /// A server, or worlds in this process.
 pub trait Backend {
-    /// What the server said of itself.
+    /// Returns the server's settings.
     fn info(&self) -> &ServerInfo;
 
-    /// Answers a step request; fills in what the way to the server needs: version, sequence, listener. The answer to a
-    /// `Step` waits until the worlds have moved.
+    /// Answers a step request. Fills in the fields that a connection needs: version, sequence number and listener. The
+    /// answer to a `Step` waits until the worlds have moved.
     ///
     /// # Errors
-    /// If the server refuses, has ended, or gives no good answer in time.
+    /// If the server refuses, has ended, or sends no valid answer in time.
     fn step(
         &mut self,
         request: StepRequest,
@@ -26,16 +26,16 @@ pub trait Backend {
         timeout: Duration,
     ) -> Result<StepAnswer, ConnectionError>;
 
-    /// Answers a control request, JSON with JSON.
+    /// Answers a control request in JSON with a reply in JSON.
     ///
     /// # Errors
-    /// As [`Self::step`].
+    /// Like [`Self::step`].
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError>;
 
     /// Answers a control request.
     ///
     /// # Errors
-    /// As [`Self::step`].
+    /// Like [`Self::step`].
     fn control(&mut self, request: &Request, timeout: Duration) -> Result<Reply, ConnectionError> {
         let text = serde_json::to_vec(request).expect("invariant: requests serialise");
         let answer = self.control_text(&text, timeout)?;

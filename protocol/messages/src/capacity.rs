@@ -1,4 +1,4 @@
-//! Maximum numbers of clients, worlds, robots and cells, which PROTOCOL.md lists.
+//! Maximum numbers of clients, worlds, robots and cells, also listed in PROTOCOL.md.
 
 /// Maximum number of clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;

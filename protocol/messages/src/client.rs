@@ -1,4 +1,4 @@
-//! A client: acquires robots, flies paths, receives frames.
+//! A client that acquires robots, flies paths and receives frames.
 
 pub use crate::backend::Backend;
 pub use crate::observation::Observation;
@@ -17,17 +17,18 @@ use emberwatch_model::path::{Move, path_to_bytes};
 use std::ops::Range;
 use std::time::Duration;
 
-/// How long a step may take, in addition to the server's deadline.
+/// Maximum time of a step, in addition to the server's deadline.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long anything else may take; resets simulate the burn-in of all their worlds, on a busy machine for minutes.
+/// Maximum time of other requests. A reset simulates the burn-in of all its worlds, which takes minutes on a busy
+/// machine.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(600);
 
-/// A lease on consecutive robots of a server, or of worlds in this process. Robots are numbered through: robot r of world
-/// w is `w * R + r`.
+/// A lease on consecutive robots of a server, or of worlds in this process. Robots are numbered across all worlds:
+/// robot r of world w is `w * R + r`.
 ///
-/// Dropping it drops the backend; a dropped connection ends its leases. Unless another is named, errors are a refusal,
-/// which changed nothing, a server that has ended, or no good answer in time.
+/// Dropping the client drops its backend, and dropping a connection ends its leases. Unless a method documents others,
+/// its errors are a refusal (which changed nothing), a server that has ended, and no valid answer in time.
 pub struct Client<B> {
     backend: B,
     lease: Lease,
@@ -36,19 +37,19 @@ pub struct Client<B> {
     shares_frames: bool,
 }
 
-/// Which robots to fly, and how to get them.
+/// The robots to fly, and how to acquire them.
 #[derive(Debug, Clone)]
 pub struct Claim {
-    /// Their numbers, at least one.
+    /// The numbers of the robots, at least one.
     pub robots: Range<u32>,
-    /// Take them from their holders.
+    /// Whether to take the robots from other clients that hold them.
     pub takeover: bool,
-    /// The lease ends this long after its last use, at least 0.1 s and at most a day; `None`: the server's default.
+    /// Time after its last use when the lease ends, 0.1 s to one day; `None` for the server's default.
     pub time_to_live: Option<Duration>,
 }
 
 impl Claim {
-    /// Robots that nobody else holds, for the server's default time.
+    /// Claims robots that no other client holds, for the server's default time.
     pub fn new(robots: Range<u32>) -> Self {
         Self {
             robots,
@@ -59,10 +60,10 @@ impl Claim {
 }
 
 impl<B: Backend> Client<B> {
-    /// Acquires robots, which stay where they are; returns when their worlds are out of their burn-in.
+    /// Acquires robots, which stay in their cells. Returns when the burn-in of their worlds is done.
     ///
     /// # Errors
-    /// A refusal as `Busy` names the holder of a robot that is taken.
+    /// If another client holds a robot, a `Busy` refusal names its process.
     pub fn acquire(mut backend: B, claim: &Claim) -> Result<Self, ConnectionError> {
         let shape = backend.info().shape();
         let shape = shape.map_err(|error| garbled("hello", error))?;
@@ -87,47 +88,47 @@ impl<B: Backend> Client<B> {
         })
     }
 
-    /// Whether frames show from here on what all robots of a world saw, teammates that others fly among them.
+    /// Sets whether later frames show what all robots of a world saw, including robots of other clients.
     pub fn share_frames(&mut self, shares: bool) {
         self.shares_frames = shares;
     }
 
-    /// What the server said of itself.
+    /// Returns the server's settings.
     pub fn info(&self) -> &ServerInfo {
         self.backend.info()
     }
 
-    /// The connection or the worlds, for requests that have no method here.
+    /// Returns the connection or the worlds, for requests that have no method here.
     pub fn backend(&mut self) -> &mut B {
         &mut self.backend
     }
 
-    /// The lease, for such requests.
+    /// Returns the lease's number, for requests that have no method here.
     pub fn lease(&self) -> u64 {
         self.lease.number()
     }
 
-    /// Height and width of the grid.
+    /// Returns the height and width of the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// The numbers of its robots.
+    /// Returns the numbers of the client's robots.
     pub fn robots(&self) -> Range<u32> {
         self.robots.clone()
     }
 
-    /// The worlds that some robots are in.
+    /// Returns the worlds of these robots.
     pub fn worlds_of(&self, robots: &Range<u32>) -> Range<u32> {
         worlds_of(robots.start, robots.len() as u32, self.info().n_robots)
     }
 
-    /// Flies a path of `n_moves` moves with each of consecutive robots of the lease. A world moves when all of its held
-    /// robots have a path, or at the server's deadline. Returns what each robot shows then.
+    /// Flies a path of `n_moves` moves with each of these consecutive robots of the lease. A world moves when all its
+    /// held robots have a path, or at the server's deadline. Returns each robot's observation after that.
     ///
     /// # Errors
-    /// A refusal as `Late` if a world has moved on without these paths, as `LeaseLost` if a robot is held no longer, as
-    /// `WrongPathLength` or `WrongLength` if there is not one path of `n_moves` moves for each robot.
+    /// `Late` if a world moved without these paths, `LeaseLost` if a robot is no longer held, and `WrongPathLength` or
+    /// `WrongLength` unless each robot has one path of `n_moves` moves.
     pub fn step(
         &mut self,
         robots: Range<u32>,
@@ -137,11 +138,11 @@ impl<B: Backend> Client<B> {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// As [`Self::step`]; `None` if `is_over` before the worlds have moved. That is checked each [`STEP_TIMEOUT`] and
-    /// deadline.
+    /// Flies like [`Self::step`], but returns `None` if `is_over` is true before the worlds have moved. It is checked
+    /// every [`STEP_TIMEOUT`] plus the server's deadline.
     ///
     /// # Errors
-    /// As [`Self::step`].
+    /// Like [`Self::step`].
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -151,10 +152,10 @@ impl<B: Backend> Client<B> {
         self.step_unless(robots, paths, 0, is_over)
     }
 
-    /// As [`Self::step`], with frames that show every cell.
+    /// Flies like [`Self::step`], with frames that show every cell.
     ///
     /// # Errors
-    /// As [`Self::step`]; a refusal if the server's coverage is `path`.
+    /// Like [`Self::step`], and a refusal if the server's coverage is `path`.
     pub fn step_full(
         &mut self,
         robots: Range<u32>,
@@ -164,7 +165,7 @@ impl<B: Backend> Client<B> {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// What robots and their worlds show now, changing nothing; they may be others' as well.
+    /// Observes robots and their worlds without changing anything. The robots may be held by other clients.
     ///
     /// # Errors
     /// A refusal if the server has no such robot.
@@ -173,10 +174,10 @@ impl<B: Backend> Client<B> {
         self.send(Call::new(request, &[], STEP_TIMEOUT))
     }
 
-    /// What they showed at an earlier step k.
+    /// Returns the observations of robots at an earlier step k.
     ///
     /// # Errors
-    /// A refusal as `NotKept` tells the nearest step that is kept.
+    /// A `NotKept` refusal has the nearest step that the server keeps.
     pub fn recall(
         &mut self,
         robots: Range<u32>,
@@ -187,10 +188,10 @@ impl<B: Backend> Client<B> {
         self.send(Call::of_past(request, steps, STEP_TIMEOUT))
     }
 
-    /// Starts new episodes with the given seeds; returns the worlds as they are when burn-in is done.
+    /// Starts new episodes with the given seeds. Returns the worlds when the burn-in is done.
     ///
     /// # Errors
-    /// A refusal as `Busy` if another client holds a robot of these worlds, as `NoLease` if this one holds none.
+    /// `Busy` if another client holds a robot of these worlds, and `NoLease` if this client holds none.
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
         let request = Request::Reset {
             lease: self.lease(),
@@ -205,10 +206,10 @@ impl<B: Backend> Client<B> {
         }
     }
 
-    /// Extends the lease without acting.
+    /// Extends the lease without flying.
     ///
     /// # Errors
-    /// A refusal as `LeaseLost` if none of the robots is held any longer.
+    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn renew(&mut self) -> Result<(), ConnectionError> {
         let lease = self.lease();
         let renewed = self
@@ -217,10 +218,10 @@ impl<B: Backend> Client<B> {
         renewed.map(|_| ())
     }
 
-    /// Gives the robots back.
+    /// Returns the robots to the server.
     ///
     /// # Errors
-    /// A refusal as `LeaseLost` if none of them is held any longer.
+    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn release(mut self) -> Result<(), ConnectionError> {
         let lease = self.lease();
         let released = self
@@ -239,7 +240,7 @@ impl<B: Backend> Client<B> {
         let mut request = self.request(Operation::Step, &robots);
         let n_moves = self.info().n_moves;
         let wrong = paths.iter().map(Vec::len).find(|len| *len != n_moves);
-        request.n_moves = wrong.unwrap_or(n_moves) as u32; // The server refuses others.
+        request.n_moves = wrong.unwrap_or(n_moves) as u32; // The server refuses a wrong length.
         request.flags |= flags;
         let moves: Vec<u8> = paths.iter().flat_map(|path| path_to_bytes(path)).collect();
         let paths = Call::new(request, &moves, STEP_TIMEOUT);

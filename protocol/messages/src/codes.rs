@@ -1,4 +1,4 @@
-//! The numbers of the binary messages: version, operations, flags, status codes.
+//! The codes in binary messages: version, operations, flags and statuses.
 
 use crate::limits::memory::in_words;
 use thiserror::Error;
@@ -6,28 +6,28 @@ use thiserror::Error;
 /// Version of the protocol.
 pub const VERSION: u32 = 2;
 
-/// Set in [`crate::message::StepRequest::flags`]: observe every cell, not only the path (needs a server whose
-/// coverage is `client` or `full`).
+/// Flag in [`crate::message::StepRequest::flags`]: observe every cell, not only the path. The server's coverage must be
+/// `client` or `full`.
 pub const FLAG_FULL_COVERAGE: u32 = 1;
 
-/// Set in [`crate::message::StepRequest::flags`]: instead of each robot's frame return one for each world, of all that
-/// its robots saw.
+/// Flag in [`crate::message::StepRequest::flags`]: return one frame per world, with everything that its robots saw,
+/// instead of one per robot.
 pub const FLAG_TEAM_FRAMES: u32 = 2;
 
-/// What a step request asks for.
+/// The operation of a step request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Operation {
-    /// Fly a path with each robot; a world moves from k to k + 1 as soon as all its robots that are held have one.
-    /// Needs a lease.
+    /// Fly a path with each robot. A world moves from k to k + 1 as soon as all its held robots have a path. Needs a
+    /// lease.
     Step = 1,
-    /// Return the last results and frames again, changing nothing; needs no lease.
+    /// Return the last results and frames again, without changing anything. Needs no lease.
     Observe = 2,
-    /// Return the results and frames of an earlier step k of each world; needs no lease.
+    /// Return the results and frames of an earlier step k of each world. Needs no lease.
     Recall = 3,
 }
 
-/// A number that is no [`Status`] or no [`Operation`].
+/// The error for a number that is not a [`Status`] or not an [`Operation`].
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("{what}: {value} is not a known code")]
 pub struct UnknownCode {
@@ -37,31 +37,31 @@ pub struct UnknownCode {
     pub value: u32,
 }
 
-/// Answer to a request; every rejection has its own code and changes nothing.
+/// The status of an answer. Every rejection has a separate code and changes nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u32)]
 pub enum Status {
     /// Done.
     Ok = 0,
-    /// The request's version is not the server's; detail: the server's version.
+    /// The request has another version than the server; detail: the server's version.
     VersionMismatch = 1,
     /// No such operation; detail: the operation received.
     UnknownOperation = 2,
     /// Not a well-formed control message.
     Malformed = 3,
-    /// A world outside the server's; detail: number of worlds.
+    /// The server has no such world; detail: number of worlds.
     NoSuchWorld = 4,
-    /// The payload is not as long as the header says; detail: bytes expected.
+    /// The payload does not have the length in the header; detail: bytes expected.
     WrongLength = 5,
-    /// Not the server's number of moves in a path; detail: moves expected.
+    /// The path does not have the server's number of moves; detail: moves expected.
     WrongPathLength = 6,
-    /// A byte that is no move; detail: its position in the payload.
+    /// A byte is not a move; detail: its position in the payload.
     BadMove = 7,
     /// The lease does not cover these robots, or was never given; detail: the first such robot.
     NoLease = 8,
-    /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
-    /// robot since, 0 if no client does.
+    /// The lease was taken over, expired or released; detail: pid of the client that took over the robot or holds it, 0
+    /// if there is none.
     LeaseLost = 9,
     /// Another client holds a robot; detail: its pid.
     Busy = 10,
@@ -69,30 +69,29 @@ pub enum Status {
     Resetting = 11,
     /// A world was truncated and must be reset first; detail: the world.
     EpisodeOver = 12,
-    /// Full frames were asked of a server that gives none, or acting of a replay; detail: 0.
+    /// A request for full frames to a server that does not provide them, or an action in a replay; detail: 0.
     NotPermitted = 13,
-    /// A flag that the server does not know; detail: the flags received.
+    /// An unknown flag; detail: the flags received.
     UnknownFlags = 14,
-    /// A file that cannot be read or written, or is refused; detail: 0.
+    /// The file cannot be read or written, or its contents are rejected; detail: 0.
     BadFile = 17,
-    /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
+    /// The server no longer has the frame or belief; detail: the nearest step that it has, or the current step.
     NotKept = 18,
-    /// The world has moved on from the step k of a path; detail: its present step. `Observe` tells whether the path
-    /// was flown.
+    /// The world is past the step k of a path; detail: its current step. `Observe` shows whether the path was flown.
     Late = 19,
-    /// The step k of a path is ahead of its world; detail: the world's present step.
+    /// The step k of a path is ahead of its world; detail: the world's current step.
     Early = 20,
-    /// A step leaves out a robot that its client holds in the world, or names several worlds in one of which another
-    /// client holds a robot; detail: the first such robot.
+    /// A step leaves out a robot of its client in the world, or names several worlds and another client holds a robot
+    /// in one of them; detail: the first such robot.
     Incomplete = 21,
-    /// A robot outside the server's; detail: number of robots of all worlds.
+    /// The server has no such robot; detail: number of robots of all worlds.
     NoSuchRobot = 22,
-    /// There is too little memory for the answer; detail: bytes of a step's answer, or 0 if it is shared memory.
+    /// There is too little memory for the answer; detail: size of the step's answer in bytes, or 0 for shared memory.
     NoMemory = 23,
 }
 
 impl Status {
-    /// Every status, in the order of its code.
+    /// All statuses, in the order of their codes.
     pub const ALL: [Self; 22] = [
         Self::Ok,
         Self::VersionMismatch,
@@ -118,15 +117,15 @@ impl Status {
         Self::NoMemory,
     ];
 
-    /// What to tell a client of another version.
+    /// Returns the message for a client of another version.
     pub fn version_mismatch(client: u32, server: u64) -> String {
         format!(
             "protocol version mismatch: the client speaks {client}, the server {server}; \
-             use a client and a server of one release"
+             use a client and a server of the same release"
         )
     }
 
-    /// One sentence for people: what the status with this detail says and what to do.
+    /// Explains the status with this detail in one sentence, with advice on what to do.
     pub fn explain(self, detail: u64) -> String {
         match self {
             Self::Ok => "ok".into(),
@@ -141,7 +140,7 @@ impl Status {
             ),
             Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
             Self::WrongPathLength => {
-                format!("wrong path length: the server flies {detail} moves a step")
+                format!("wrong path length: expected {detail} moves per step")
             }
             Self::BadMove => format!("byte {detail} of the payload: expected a move in 0..=3"),
             Self::NoLease => format!("no lease on robot {detail}: acquire it first"),
@@ -149,7 +148,7 @@ impl Status {
                 "lease lost: it expired or was released; acquire the robots again".into()
             }
             Self::LeaseLost => format!(
-                "lease lost to pid {detail}, which took the robot over or acquired it since"
+                "lease lost to pid {detail}, which took over the robot or acquired it later"
             ),
             Self::Busy => format!(
                 "busy: held by pid {detail}; wait for its release, or acquire with \"takeover\": true"
@@ -169,15 +168,15 @@ impl Status {
             Self::BadFile => "the file cannot be used".into(),
             Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
             Self::Late => format!(
-                "late: the world is at step {detail} already; observe it, and send a path for that step"
+                "late: the world is already at step {detail}; observe it, and send a path for that step"
             ),
-            Self::Early => format!("early: the world is at step {detail} only"),
+            Self::Early => format!("early: the world is only at step {detail}"),
             Self::Incomplete => format!(
-                "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
-                 a step of several worlds needs them all"
+                "incomplete: robot {detail} is missing; a step must name all robots that its client holds in a world, \
+                 and a step of several worlds must name all their robots"
             ),
             Self::NoMemory if detail == 0 => {
-                "shared memory is full: free some, and ask again".into()
+                "shared memory is full: free some, and try again".into()
             }
             Self::NoMemory => format!(
                 "memory: expected {} for the answer, got less; ask for fewer robots at a time",

@@ -1,4 +1,4 @@
-//! The messages of the `control` channel: JSON text both ways, rare and readable.
+//! The messages of the `control` channel: requests and replies as JSON text, for everything that is rare.
 
 use super::codes::{Status, VERSION};
 use emberwatch_model::frame::Coverage;
@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 pub use super::hello::{AirspaceInfo, CoverageRule, RecordedWorld, ServerInfo, ZonesInfo};
 pub use super::json::{MAX_CONTROL_BYTES, parse};
 
-/// Most bytes of a belief in one message, before they are written in base64.
+/// Maximum size of a part of a belief in one message, in bytes before the base64 encoding.
 pub const MAX_BELIEF_PART: usize = 1 << 19;
 
-/// What a client asks on the control channel.
+/// A request on the control channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
-    /// Handshake: which server is this, and which protocol version does it speak?
+    /// Start the handshake: ask for the server's settings and protocol version.
     Hello {
         /// The client's protocol version.
         protocol: u32,
@@ -27,32 +27,32 @@ pub enum Request {
         first_robot: u32,
         /// Number of robots, at least 1.
         n_robots: u32,
-        /// Whether to take the robots from their holders.
+        /// Whether to take the robots from other clients that hold them.
         #[serde(default)]
         takeover: bool,
-        /// The lease ends this long after its last use; `None` asks for the server's default.
+        /// Time after its last use when the lease ends; `None` for the server's default.
         #[serde(default)]
         ttl_millis: Option<u64>,
     },
-    /// Extend a lease without acting.
+    /// Extend a lease without flying.
     Renew {
         /// The lease.
         lease: u64,
     },
-    /// Give the robots of a lease back.
+    /// Return the robots of a lease.
     Release {
         /// The lease.
         lease: u64,
     },
-    /// Start new episodes; answered when burn-in is done. Like `Restore` and `Fork` it needs a lease on all robots of
-    /// these worlds that are held, and on at least one.
+    /// Start new episodes; the answer is sent when the burn-in is done. Like `Restore` and `Fork`, needs a lease on at
+    /// least one robot of these worlds, and on all their robots that are held.
     Reset {
         /// The lease.
         lease: u64,
         /// The worlds and their seeds.
         worlds: Vec<WorldSeed>,
     },
-    /// Write worlds to a file on the server's host.
+    /// Write worlds to a file on the server's machine.
     Snapshot {
         /// First world.
         first_world: u32,
@@ -61,7 +61,7 @@ pub enum Request {
         /// The file, an absolute path.
         path: String,
     },
-    /// Replace worlds of one's lease by those of such a file.
+    /// Replace worlds of the lease by worlds from a snapshot file.
     Restore {
         /// The lease.
         lease: u64,
@@ -69,33 +69,33 @@ pub enum Request {
         first_world: u32,
         /// Number of worlds, at least 1.
         n_worlds: u32,
-        /// The first of the file's worlds that is read.
+        /// The first world to read, as an index in the file.
         #[serde(default)]
         from: u32,
         /// The file, an absolute path.
         path: String,
     },
-    /// Replace a world of one's lease by a copy of another.
+    /// Replace a world of the lease by a copy of another world.
     Fork {
-        /// The lease, of the world that is replaced.
+        /// The lease on the replaced world.
         lease: u64,
-        /// The world that is copied.
+        /// The world to copy.
         from: u32,
-        /// The world that is replaced.
+        /// The world to replace.
         to: u32,
     },
-    /// Leave the next part of a belief about a robot's world to the next client that flies the robot.
+    /// Store the next part of a belief about a robot's world, for the next client that flies the robot.
     LeaveBelief(LeftPart),
-    /// What belief was left for who flies a robot in its world as it is now?
+    /// Load the belief that was stored for a robot, if it is about the current step of the robot's world.
     Belief {
         /// Number of the robot.
         robot: u32,
-        /// Where the part asked for begins.
+        /// The offset of the requested part.
         #[serde(default)]
         offset: u64,
     },
-    /// What is the state of the server and its worlds?
-    // A variant with braces: serde refuses unknown keys of it, but not of a unit variant.
+    /// Ask for the state of the server and its worlds.
+    // The variant has braces because serde rejects unknown keys in it, but not in a unit variant.
     Status {},
     /// Stop the server.
     Shutdown {},
@@ -107,77 +107,77 @@ pub enum Request {
 pub struct WorldSeed {
     /// The world.
     pub world: u32,
-    /// Its new seed; `None` lets the server derive one from the world's last.
+    /// The new seed; `None` lets the server derive one from the previous seed.
     #[serde(default)]
     pub seed: Option<u64>,
 }
 
-/// What the server answers.
+/// A reply of the server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "reply", rename_all = "snake_case")]
 pub enum Reply {
-    /// To `hello`.
+    /// Answers `hello`.
     Hello(Box<ServerInfo>),
-    /// To `acquire` and `renew`.
+    /// Answers `acquire` and `renew`.
     Lease(LeaseInfo),
-    /// To `release`, `leave_belief` and `shutdown`.
+    /// Answers `release`, `leave_belief` and `shutdown`.
     Done,
-    /// To `reset`: the worlds as they are now.
+    /// Answers `reset`: the worlds after the reset.
     Reset {
-        /// One entry per world that was reset, in the order asked.
+        /// One entry per reset world, in the order of the request.
         worlds: Vec<WorldInfo>,
     },
-    /// To `snapshot`: the file was written.
+    /// Answers `snapshot`: the file was written.
     Snapshot {
         /// The file.
         path: String,
-        /// Its length.
+        /// The length of the file in bytes.
         n_bytes: u64,
-        /// The worlds in it, as they were.
+        /// The worlds in the file, as they were written.
         worlds: Vec<WorldInfo>,
     },
-    /// To `restore` and `fork`: the worlds as they are now.
+    /// Answers `restore` and `fork`: the worlds after the replacement.
     Restored {
-        /// One entry per world that was replaced.
+        /// One entry per replaced world.
         worlds: Vec<WorldInfo>,
     },
-    /// To `belief`.
+    /// Answers `belief`.
     Belief {
-        /// What it is, and about which step.
+        /// Kind of the belief, and the step that it is about.
         #[serde(flatten)]
         info: BeliefInfo,
-        /// Where the part begins.
+        /// The offset of the part.
         offset: u64,
-        /// The part in base64; empty at the end.
+        /// The part in base64; empty at the end of the belief.
         data: String,
     },
-    /// To `status`.
+    /// Answers `status`.
     Status(ServerStatus),
-    /// To anything that was refused; nothing was changed.
+    /// Reports that a request was refused; nothing was changed.
     Error {
-        /// Reason for programs.
+        /// The status code.
         status: Status,
-        /// See [`Status`].
+        /// The detail of the status; see [`Status`].
         detail: u64,
-        /// Reason for people.
+        /// The reason in words.
         message: String,
     },
 }
 
-/// A lease that was given or extended.
+/// A lease that was granted or extended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeaseInfo {
-    /// The lease: goes into each step request.
+    /// The lease's number, which each step request contains.
     pub lease: u64,
-    /// It ends this long after its last use.
+    /// Time after its last use when the lease ends.
     pub ttl_millis: u64,
-    /// Numbers of the robots that it still holds.
+    /// Numbers of the robots that the lease still holds.
     pub robots: Vec<u32>,
-    /// The worlds of these, as they are now.
+    /// The worlds of these robots.
     pub worlds: Vec<WorldInfo>,
 }
 
-/// A part of a belief that is left, and the step of its world.
+/// A part of a belief to store, and the step of its world.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LeftPart {
@@ -187,45 +187,45 @@ pub struct LeftPart {
     pub robot: u32,
     /// The episode.
     pub episode: u64,
-    /// Its present step.
+    /// The current step of the world.
     pub step: u64,
-    /// What the bytes are; at most 256 bytes.
+    /// The format of the bytes, in at most 256 bytes.
     pub kind: String,
-    /// Where the part begins: 0 begins a new belief.
+    /// The offset of the part; 0 begins a new belief.
     pub offset: u64,
-    /// Length of the whole.
+    /// Length of the whole belief in bytes.
     pub length: u64,
     /// The part in base64, at most [`MAX_BELIEF_PART`] bytes.
     pub data: String,
 }
 
-/// A belief that was left.
+/// A belief that was stored for a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BeliefInfo {
-    /// What the bytes are.
+    /// The format of the bytes.
     pub kind: String,
-    /// Seed of the episode it is about.
+    /// Seed of the episode that the belief is about.
     pub seed: u64,
-    /// That episode.
+    /// The episode that the belief is about.
     pub episode: u64,
-    /// The step at which it was left.
+    /// The step at which the belief was stored.
     pub step: u64,
-    /// Its length in bytes.
+    /// Length of the belief in bytes.
     pub length: u64,
 }
 
-/// The present step of a world.
+/// The current episode and step of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WorldInfo {
     /// The world.
     pub world: u32,
     /// Step index k.
     pub step: u64,
-    /// Seed of its episode.
+    /// Seed of the episode.
     pub seed: u64,
-    /// Number of its resets since the server started.
+    /// Number of resets of the world since the server started.
     pub episode: u64,
-    /// `[row, col]` of each of its robots.
+    /// `[row, col]` of each of the world's robots.
     pub robots: Vec<[u32; 2]>,
 }
 
@@ -236,41 +236,41 @@ pub struct ServerStatus {
     pub pid: u32,
     /// Time since the server started.
     pub uptime_millis: u64,
-    /// World steps since the server started, over all worlds.
+    /// Number of world steps since the server started, over all worlds.
     pub n_steps: u64,
-    /// World steps a second, over the last second or so.
+    /// World steps per second, over about the last second.
     pub steps_per_second: f64,
-    /// Requests refused since the server started.
+    /// Number of refused requests since the server started.
     pub n_refused: u64,
-    /// Clients connected to the step channel.
+    /// Number of clients connected to the step channel.
     pub n_clients: usize,
-    /// Observers of the frames channel.
+    /// Number of observers of the frames channel.
     pub n_observers: usize,
-    /// Every world.
+    /// The status of each world.
     pub worlds: Vec<WorldStatus>,
 }
 
-/// One world in the answer to `status`.
+/// The status of one world in the answer to `status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WorldStatus {
-    /// Where it stands.
+    /// The world's episode and step.
     #[serde(flatten)]
     pub info: WorldInfo,
-    /// The process that holds each of its robots.
+    /// The pid of the client that holds each robot, if any.
     pub holder_pids: Vec<Option<u32>>,
-    /// Robots that have a path for the next step.
+    /// Number of robots that have a path for the next step.
     pub n_paths: u32,
-    /// Whether it is being reset.
+    /// Whether the world is being reset.
     pub resetting: bool,
 }
 
 impl Reply {
-    /// A refusal with its standard sentence.
+    /// Returns a refusal with the standard sentence of its status.
     pub fn refusal(status: Status, detail: u64) -> Self {
         Self::error(status, detail, status.explain(detail))
     }
 
-    /// A refusal with a sentence of its own.
+    /// Returns a refusal with a specific sentence.
     pub fn error(status: Status, detail: u64, message: String) -> Self {
         Self::Error {
             status,
@@ -279,13 +279,13 @@ impl Reply {
         }
     }
 
-    /// The refusal of a client that speaks another version.
+    /// Returns the refusal of a client that speaks another protocol version.
     pub fn version_mismatch(client: u32) -> Self {
         let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
         Self::error(status, detail, Status::version_mismatch(client, detail))
     }
 
-    /// The status for the binary header.
+    /// Returns the status for the binary header.
     pub fn status(&self) -> Status {
         match self {
             Self::Error { status, .. } => *status,
@@ -295,10 +295,10 @@ impl Reply {
 }
 
 impl CoverageRule {
-    /// The coverage of a step under this rule.
+    /// Returns the coverage of a step under this rule.
     ///
     /// # Errors
-    /// [`Status::NotPermitted`] if the client asks for full frames that the rule does not give.
+    /// [`Status::NotPermitted`] if the client asks for full frames and the rule does not allow them.
     pub fn coverage(self, asks_full: bool) -> Result<Coverage, Status> {
         match (self, asks_full) {
             (Self::Full, _) | (Self::Client, true) => Ok(Coverage::Full),

@@ -1,4 +1,4 @@
-//! Why a channel could not be opened or used, and why a request got no good answer.
+//! The errors of channels and requests.
 
 use crate::limits::memory::NoMemory;
 use crate::message::{Status, VERSION};
@@ -6,11 +6,11 @@ use std::fmt::Debug;
 use std::time::Duration;
 use thiserror::Error;
 
-/// Why a channel could not be opened or used.
+/// The reason why a channel could not be opened or used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ChannelError {
-    /// A name that cannot be an instance's.
+    /// An invalid name of an instance.
     #[error("instance name: expected 1 to 64 letters, digits, '-' or '_', got {0:?}")]
     InstanceName(String),
     /// The directory for the channels' files cannot be used.
@@ -18,19 +18,19 @@ pub enum ChannelError {
     Directory {
         /// The directory, or the file in it.
         path: String,
-        /// What was expected, and what is there.
+        /// What was expected and what was found.
         problem: String,
     },
-    /// Another process had the lock of the channels' directory for too long.
+    /// Another process held the lock of the channels' directory for too long.
     #[error(
         "channel directory {path}: expected the lock within {limit:?}, got it held by {holder}"
     )]
     Locked {
-        /// The lock's file.
+        /// The lock file.
         path: String,
-        /// How long it was waited for.
+        /// How long the process waited for the lock.
         limit: Duration,
-        /// Who has it.
+        /// The process that holds the lock.
         holder: String,
     },
     /// No server runs on the instance.
@@ -41,9 +41,9 @@ pub enum ChannelError {
         /// Name of the instance.
         instance: String,
     },
-    /// This system has no channels.
+    /// The operating system does not support channels.
     #[error(
-        "instance {instance:?}: servers are attached to on Linux only, got {}; without an instance, worlds run in this \
+        "instance {instance:?}: attaching to a server works only on Linux, got {}; without an instance, worlds run in this \
          process on every system",
         std::env::consts::OS
     )]
@@ -53,17 +53,17 @@ pub enum ChannelError {
     },
     /// A server runs on the instance, but it speaks another version of the protocol.
     #[error(
-        "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of one \
-         release"
+        "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of the \
+         same release"
     )]
     OtherVersion {
-        /// What the server speaks.
+        /// The server's protocol version.
         version: u32,
     },
-    /// Its server is in another PID namespace, where process ids mean other processes.
+    /// The server is in another PID namespace, where process ids refer to other processes.
     #[error(
         "instance {instance:?} is served from another PID namespace: run both programs in one (docker: \
-         --pid=container:NAME; Kubernetes: shareProcessNamespace: true), or give each container a /dev/shm of its own \
+         --pid=container:NAME; Kubernetes: shareProcessNamespace: true), or give each container a separate /dev/shm \
          (docker: --ipc=private)"
     )]
     OtherPidNamespace {
@@ -73,31 +73,31 @@ pub enum ChannelError {
     /// There is too little shared memory.
     #[error("shared memory: {problem}")]
     NoRoom {
-        /// What was expected, what there is, and what to do.
+        /// What was expected, what is available, and what to do.
         problem: String,
     },
-    /// All places that a channel has are taken.
+    /// The channel already has its maximum number of users.
     #[error("{what}: expected at most {most} at a time, got one more")]
     NoPlace {
-        /// What was attempted.
+        /// The attempted operation.
         what: &'static str,
-        /// How many there may be of whom.
+        /// The maximum number, with its unit.
         most: &'static str,
     },
-    /// The process may open no more files.
+    /// The process cannot open more files.
     #[error(
-        "{what}: expected {needed} file descriptors, got fewer of the limit of {limit}; close some, or raise the limit \
+        "{what}: expected {needed} free file descriptors, got fewer (the limit is {limit}); close some, or raise the limit \
          (`ulimit -n`; docker: --ulimit nofile)"
     )]
     NoDescriptors {
-        /// What was attempted.
+        /// The attempted operation.
         what: &'static str,
-        /// How many it takes.
+        /// Number of file descriptors that it needs.
         needed: usize,
-        /// How many the process may have.
+        /// Maximum number of file descriptors of the process.
         limit: String,
     },
-    /// The system refuses a call that channels need, as a container's seccomp profile does.
+    /// The system refuses a call that channels need, for example because of a container's seccomp profile.
     #[error(
         "{call}: expected the system to allow this call, got: {problem}; allow it in the seccomp profile of the container \
          (docker: --security-opt seccomp=PROFILE), or use a newer kernel if it lacks the call"
@@ -105,39 +105,39 @@ pub enum ChannelError {
     RefusedCall {
         /// The system call.
         call: &'static str,
-        /// The system's words.
+        /// The system's error.
         problem: String,
     },
-    /// The check of [`crate::interrupt::interrupt_when`] ended a wait.
+    /// The check given to [`crate::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]
     Interrupted,
-    /// iceoryx2 refused.
-    #[error("{what}: iceoryx2 says {problem}")]
+    /// iceoryx2 returned an error.
+    #[error("{what}: iceoryx2 reports {problem}")]
     Ipc {
-        /// What was attempted.
+        /// The attempted operation.
         what: &'static str,
-        /// iceoryx2's reason.
+        /// The error of iceoryx2.
         problem: String,
     },
 }
 
-/// Why a request got no good answer.
+/// The reason why a request failed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConnectionError {
     /// The channel could not be used.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// There is too little memory for the answer, which has come.
+    /// An answer was received, but there is too little memory for it.
     #[error(transparent)]
     Memory(#[from] NoMemory),
-    /// The server ended while, or before, it was asked.
+    /// The server ended before or during the request.
     #[error("the server on instance {instance:?} is gone")]
     ServerGone {
         /// Name of the instance.
         instance: String,
     },
-    /// No answer in time. A step may have been made nevertheless: observe before the next one.
+    /// No answer came in time. The step may have been made nevertheless: observe before the next one.
     #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
     Timeout {
         /// Kind of the request.
@@ -147,30 +147,31 @@ pub enum ConnectionError {
         /// How long the client waited.
         timeout: Duration,
     },
-    /// The server refused, and changed nothing.
+    /// The server refused the request, and changed nothing.
     #[error("{message}")]
     Refused {
-        /// Reason for programs.
+        /// The status code.
         status: Status,
-        /// See [`Status`].
+        /// The detail of the status; see [`Status`].
         detail: u64,
-        /// Reason for people.
+        /// The reason in words.
         message: String,
     },
-    /// The answer makes no sense: client and server are not of one release.
+    /// The answer is invalid, because client and server are of different releases.
     #[error("answer to {what}: {problem}")]
     Garbled {
         /// Kind of the request.
         what: &'static str,
-        /// What is wrong with the answer.
+        /// The error in the answer.
         problem: String,
     },
 }
 
-/// Checks that the status of an answer to `what` is `Ok`; `message` is that of the refusal, if it has one.
+/// Checks that the status of an answer to `what` is `Ok`. `message` is the server's reason for a refusal, if it sent
+/// one.
 ///
 /// # Errors
-/// [`ConnectionError::Refused`], or [`ConnectionError::Garbled`] for a status that is unknown.
+/// [`ConnectionError::Refused`], or [`ConnectionError::Garbled`] for an unknown status.
 pub fn check_status(
     what: &'static str,
     code: u32,
@@ -181,7 +182,7 @@ pub fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // Names the flag of the commands that connect this way; not all of them have it.
+                // Names a flag of the agent, the usual caller. Other programs that connect this way may lack it.
                 Status::Busy => format!(
                     "busy: held by pid {detail}; wait for its release, or take over with the flag \
                      --takeover of `emberwatch-agent run`"
@@ -198,7 +199,7 @@ pub fn check_status(
     }
 }
 
-/// Checks that an answer is of our version and to our request: `(got, expected)` sequence numbers.
+/// Checks that an answer has our protocol version, and answers our request: `(got, expected)` are sequence numbers.
 pub fn check_answer(
     what: &'static str,
     version: u32,
@@ -214,7 +215,7 @@ pub fn check_answer(
     Err(garbled(what, problem))
 }
 
-/// The refusal that a server would give.
+/// Returns the error for a refusal that the server would send.
 pub fn refused(status: Status, detail: u64) -> ConnectionError {
     ConnectionError::Refused {
         status,
@@ -223,7 +224,7 @@ pub fn refused(status: Status, detail: u64) -> ConnectionError {
     }
 }
 
-/// The error of an answer that makes no sense.
+/// Returns the error for an invalid answer.
 pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
     ConnectionError::Garbled {
         what,
@@ -231,7 +232,7 @@ pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
     }
 }
 
-/// The error for a reply that answers another question.
+/// Returns the error for a reply to another kind of request.
 pub fn unexpected(what: &'static str, reply: &impl Debug) -> ConnectionError {
-    garbled(what, format!("got the reply to something else: {reply:?}"))
+    garbled(what, format!("expected its reply, got {reply:?}"))
 }

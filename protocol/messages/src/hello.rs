@@ -1,72 +1,72 @@
-//! The answer to `hello`: what a server says of itself, of airspace and land.
+//! The answer to `hello`: a server's settings, airspace and land.
 
 use emberwatch_model::grid::{Grid, Shape, ShapeError};
 use emberwatch_model::{Airspace, MAX_RADIUS, Pays, parse_color};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// The handshake: everything a client needs to know to act.
+/// The settings of a server: everything that a client needs to know to fly robots.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ServerInfo {
     /// The server's protocol version.
     pub protocol: u32,
     /// The server's release.
     pub build: String,
-    /// The server's process.
+    /// The server's process id.
     pub pid: u32,
-    /// The PID namespace of this number, as Linux numbers it; only there a client can watch the process.
+    /// The number of the PID namespace of `pid` on Linux. Only in this namespace can a client watch the process.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pid_namespace: Option<u64>,
     /// Grid height H.
     pub height: usize,
     /// Grid width W.
     pub width: usize,
-    /// Moves in a path.
+    /// Number of moves in a path.
     pub n_moves: usize,
     /// Number of worlds.
     pub n_worlds: u32,
-    /// Robots of each world R.
+    /// Number of robots of each world R.
     pub n_robots: u32,
-    /// Number of observations O; frames hold values below it, or 255.
+    /// Number of observations O. Frames hold values below it, or 255 for unobserved cells.
     pub n_observations: usize,
     /// Names of the observations.
     pub observations: Vec<String>,
     /// The model as TOML, if there is one and the server reveals it.
     pub model: Option<String>,
-    /// The task that the worlds are, by its name.
+    /// The name of the worlds' task, if they have one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
-    /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that a reward depends on, besides the
-    /// seed and the policy. Absent from servers before release 0.3.
+    /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that affects rewards, except the seed
+    /// and the policy. Servers before release 0.3 do not have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub worlds_fingerprint: Option<String>,
-    /// Where robots may fly and what they see; without it, everywhere, and the cells of their path.
+    /// Where robots may fly and what they see. Without it, they may fly everywhere and see the cells of their path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,
-    /// Which land each cell is, where lands differ. For pictures: learners do not read it.
+    /// The zone of each cell, if lands differ. It is for pictures: learners do not read it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zones: Option<ZonesInfo>,
-    /// What worlds show whose hidden states were recorded.
+    /// The recorded sequences, if the hidden states were recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_world: Option<RecordedWorld>,
-    /// Steps simulated from the initial distribution before k = 0.
+    /// Number of steps simulated from the initial distribution before k = 0.
     pub burn_in: u64,
-    /// Episode length; 0: never truncated.
+    /// Length of an episode in steps; 0 if episodes are never truncated.
     pub max_steps: u64,
-    /// Most clients at a time.
+    /// Maximum number of clients at a time.
     pub max_clients: usize,
-    /// Which cells a step observes.
+    /// The rule for which cells a step observes.
     pub coverage: CoverageRule,
     /// Whether the `truth` channel exists.
     pub publish_truth: bool,
-    /// How long a lease lives without use, by default.
+    /// Default time after its last use when a lease ends.
     pub lease_millis: u64,
-    /// How long a world waits for the paths of its other held robots from the first path on; 0: no deadline.
+    /// Time that a world waits for the paths of its other held robots after the first path; 0 for no deadline.
     pub deadline_millis: u64,
 }
 
 impl ServerInfo {
-    /// Height and width of the grid.
+    /// Returns the height and width of the grid.
     ///
     /// # Errors
     /// If a side is outside `1..=MAX_SIDE`.
@@ -74,10 +74,10 @@ impl ServerInfo {
         Shape::new(self.height, self.width)
     }
 
-    /// Where robots may fly and what they see.
+    /// Returns where robots may fly and what they see.
     ///
     /// # Errors
-    /// If that is not of the grid, or out of range; the error says what was expected.
+    /// If the map does not fit the grid, or a number is out of range. The error has the expected value.
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
         let airspace = self.airspace.as_ref();
@@ -92,7 +92,7 @@ impl ServerInfo {
         airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
     }
 
-    /// Steps of the shortest episode, if any is truncated.
+    /// Returns the number of steps of the shortest episode, if any is truncated.
     pub fn shortest_episode(&self) -> Option<u64> {
         let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);
         let truncated = Some(self.max_steps).filter(|&steps| steps > 0);
@@ -107,11 +107,11 @@ pub struct RecordedWorld {
     pub description: Option<String>,
     /// Number of sequences.
     pub n_sequences: usize,
-    /// Steps of the shortest episode.
+    /// Number of steps of the shortest episode.
     pub n_steps: u64,
 }
 
-/// Which cells a server's steps observe.
+/// The rule for which cells a server's steps observe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CoverageRule {
@@ -126,34 +126,34 @@ pub enum CoverageRule {
 /// Where robots may fly and what they see.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AirspaceInfo {
-    /// Rows and columns that robots see beyond each cell of their path, 0 to 8.
+    /// Number of rows and columns that robots see beyond each cell of their path, 0 to 8.
     pub radius: usize,
-    /// Observation matrices: of the path, then of each ring around it; the last holds for the rings beyond. An
-    /// observation of matrix m has the number `m * n_observations / n_rings` plus that which it would have on the path.
+    /// Number of observation matrices: one for the path, then one per ring around it. The last holds for all further
+    /// rings. Observation y of matrix m has the number `m * n_observations / n_rings + y`.
     pub n_rings: usize,
-    /// Which distinct cells pay.
+    /// Whether visited or seen cells earn rewards.
     pub pays: Pays,
     /// 1 for each cell where no robot may be, row by row.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<Vec<Vec<u8>>>,
 }
 
-/// Zones of land, which differ in how states change.
+/// The zones of a land, in which states change differently.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ZonesInfo {
     /// The name of each zone.
     pub names: Vec<String>,
-    /// Its colour in pictures, `#rrggbb`.
+    /// The colour of each zone in pictures, `#rrggbb`.
     pub colors: Vec<String>,
     /// The zone of each cell, row by row.
     pub map: Vec<Vec<u8>>,
 }
 
 impl AirspaceInfo {
-    /// Where robots of a grid may fly and what they see.
+    /// Returns where robots on a grid may fly and what they see.
     ///
     /// # Errors
-    /// If that is not of the grid, or out of range; the error says what was expected.
+    /// If the map does not fit the grid, or a number is out of range. The error has the expected value.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, String> {
         let (radius, n_rings) = (self.radius, self.n_rings);
         if radius > MAX_RADIUS || !(1..=radius + 1).contains(&n_rings) {
@@ -172,10 +172,10 @@ impl AirspaceInfo {
 }
 
 impl ZonesInfo {
-    /// The zone of each cell of a grid, shape `[H, W]`.
+    /// Returns the zone of each cell of a grid, shape `[H, W]`.
     ///
     /// # Errors
-    /// If that is not of the grid, or a zone has no name; the error says what was expected.
+    /// If the map does not fit the grid, or a zone has no name or colour. The error has the expected value.
     pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
         let map = of_grid("zones", shape, &self.map)?;
         let n_zones = self.names.len();
@@ -193,7 +193,7 @@ impl ZonesInfo {
     }
 }
 
-/// The numbers of a map, if it is of a grid.
+/// Returns the numbers of a map, if it fits the grid.
 fn of_grid(what: &str, shape: Shape, rows: &[Vec<u8>]) -> Result<Grid<u8>, String> {
     let fits = rows.len() == shape.height() && rows.iter().all(|row| row.len() == shape.width());
     if !fits {

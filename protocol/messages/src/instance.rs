@@ -2,7 +2,7 @@
 
 use crate::errors::ChannelError;
 
-/// The name of one running server, on which its channels are.
+/// The name of one running server, by which clients find its channels.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Instance(String);
 
@@ -20,19 +20,19 @@ impl Instance {
         }
     }
 
-    /// As users write it.
+    /// Returns the name as users write it.
     pub fn name(&self) -> &str {
         &self.0
     }
 
-    /// The error for an instance without a server.
+    /// Returns the error for an instance without a server.
     pub fn no_server(&self) -> ChannelError {
         ChannelError::NoServer {
             instance: self.0.clone(),
         }
     }
 
-    /// The error for an instance whose server is in another PID namespace.
+    /// Returns the error for an instance whose server is in another PID namespace.
     pub fn elsewhere(&self) -> ChannelError {
         ChannelError::OtherPidNamespace {
             instance: self.0.clone(),

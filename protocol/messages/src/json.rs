@@ -1,18 +1,18 @@
-//! Reads requests in JSON, of `control`.
+//! Parses the JSON requests of `control`.
 
 use super::codes::Status;
 use serde::de::DeserializeOwned;
 
-/// Longest control message accepted: 1 MiB.
+/// Maximum size of a control message in bytes: 1 MiB.
 pub const MAX_CONTROL_BYTES: usize = 1 << 20;
 
-/// Longest reason in a refusal, characters: it may quote a word of the request, which may be long.
+/// Maximum length of the reason in a refusal, in characters: it may quote a long word of the request.
 const MAX_REASON: usize = 300;
 
-/// Reads a request in JSON.
+/// Parses a request in JSON.
 ///
 /// # Errors
-/// If it is too long or malformed; the error is the message of a refusal as [`Status::Malformed`].
+/// If the request is too long or malformed. The error is the message of a [`Status::Malformed`] refusal.
 pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
     let malformed = |problem: String| format!("{}: {problem}", Status::Malformed.explain(0));
     if text.len() > MAX_CONTROL_BYTES {

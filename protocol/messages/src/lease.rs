@@ -1,4 +1,4 @@
-//! A lease on robots: for which step k of its world each path is meant, and whether the path was flown.
+//! A lease on robots, with the step k of its world that each path is for, and whether the path was flown.
 
 use crate::backend::{Backend, StepAnswer};
 use crate::control::{ServerInfo, WorldInfo};
@@ -11,47 +11,48 @@ use std::time::Duration;
 
 /// The right to fly consecutive robots, and the step of each of their worlds.
 ///
-/// Threads may share it, if one at a time calls [`Self::send`].
+/// Threads may share a lease if only one at a time calls [`Self::send`].
 #[derive(Debug)]
 pub struct Lease {
     number: u64,
-    /// Robots of each world.
+    /// Number of robots of each world.
     team: u32,
     n_moves: u32,
-    /// How long a step waits for teammates.
+    /// Time that a step waits for teammates.
     deadline: Duration,
     worlds: Range<u32>,
     known: Vec<Known>,
-    /// Number of times that paths were sent.
+    /// Number of times that paths were sent. It orders the calls.
     n_sent: AtomicU64,
 }
 
-/// What a lease knows of a world.
+/// The last known state of a world.
 #[derive(Debug, Default)]
 struct Known {
-    /// Step at which it was last seen.
+    /// The last step observed.
     step: AtomicU64,
-    /// The last paths for it that were not refused, counted as `n_sent` does: only these may have moved it.
+    /// The `n_sent` of the last paths for the world that were not refused. Only these can have moved the world.
     sent: AtomicU64,
 }
 
-/// A step request of a lease. Sent again, its paths are for the same steps.
+/// A step request of a lease. If it is sent again, its paths are for the same steps.
 #[derive(Debug)]
 pub struct Call<'a> {
     request: StepRequest,
     /// The moves of all paths.
     moves: &'a [u8],
-    /// The step of each world for which the paths are meant; empty until they are first sent.
+    /// The step of each world that the paths are for; empty until they are first sent.
     steps: Vec<u64>,
     timeout: Duration,
-    /// When the paths were last sent, as `n_sent` counts; of an observation, those that it is to show.
+    /// The `n_sent` at which these paths were last sent. For an observation, the `n_sent` of the paths whose effect it
+    /// is to show.
     sent: u64,
-    /// Whether an observation may show a step of other paths of the lease instead.
+    /// Whether the observation may show a step of other paths of the lease instead.
     shows_others: bool,
 }
 
 impl<'a> Call<'a> {
-    /// A request of [`Lease::request`], with the moves of all paths.
+    /// Makes a call from a request of [`Lease::request`] and the moves of all paths.
     pub fn new(request: StepRequest, moves: &'a [u8], timeout: Duration) -> Self {
         Self {
             request,
@@ -63,20 +64,20 @@ impl<'a> Call<'a> {
         }
     }
 
-    /// A request about these steps of the worlds.
+    /// Makes a call about earlier steps of the worlds.
     pub fn of_past(request: StepRequest, steps: Vec<u64>, timeout: Duration) -> Self {
         let call = Self::new(request, &[], timeout);
         Self { steps, ..call }
     }
 
-    /// The request, without what [`Backend::step`] fills in.
+    /// Returns the request, without the fields that [`Backend::step`] fills in.
     pub fn request(&self) -> &StepRequest {
         &self.request
     }
 }
 
 impl Lease {
-    /// The lease of this number, on robots of a server.
+    /// Makes the lease with this number, on robots of a server.
     pub fn new(info: &ServerInfo, number: u64, robots: &Range<u32>) -> Self {
         let worlds = worlds_of(robots.start, robots.len() as u32, info.n_robots);
         Self {
@@ -90,36 +91,36 @@ impl Lease {
         }
     }
 
-    /// The server's number of the lease.
+    /// Returns the server's number of the lease.
     pub fn number(&self) -> u64 {
         self.number
     }
 
-    /// The worlds that its robots are in.
+    /// Returns the worlds of the lease's robots.
     pub fn worlds(&self) -> Range<u32> {
         self.worlds.clone()
     }
 
-    /// The step of each world.
+    /// Returns the last known step of each world.
     pub fn steps(&self) -> Vec<u64> {
         self.steps_of(self.worlds()).collect()
     }
 
-    /// Notes the step of a world after a reset or the like; ignores other leases' worlds.
+    /// Records the step of a world after a reset or a similar request. Ignores worlds outside the lease.
     pub fn note(&self, world: u32, step: u64) {
         if let Some(known) = self.known(world) {
             known.step.store(step, Ordering::Relaxed);
         }
     }
 
-    /// As [`Self::note`], for each world.
+    /// Records the step of each world, like [`Self::note`].
     pub fn note_all(&self, worlds: &[WorldInfo]) {
         for world in worlds {
             self.note(world.world, world.step);
         }
     }
 
-    /// A request for robots of the server.
+    /// Makes a request for robots of the server.
     pub fn request(&self, operation: Operation, robots: &Range<u32>, flags: u32) -> StepRequest {
         let flies = operation == Operation::Step;
         StepRequest {
@@ -133,11 +134,11 @@ impl Lease {
         }
     }
 
-    /// Sends a request once, and notes the steps that its answer shows. Paths are for the steps at which their worlds
-    /// were seen last before the call was first sent.
+    /// Sends a request once, and records the steps in its answer. Paths are for the last known steps of their worlds
+    /// when the call was first sent.
     ///
     /// # Errors
-    /// As [`Backend::step`].
+    /// Like [`Backend::step`].
     pub fn send(
         &self,
         backend: &mut dyn Backend,
@@ -158,7 +159,7 @@ impl Lease {
         if flies && !matches!(answer, Err(ConnectionError::Refused { .. })) {
             self.note_sent(worlds.clone(), call);
         } else {
-            // Robots outside the lease may be observed, too.
+            // An observation may include robots outside the lease.
             let known = worlds.clone().filter_map(|world| self.known(world));
             let mut sent = known.map(|known| known.sent.load(Ordering::Relaxed));
             call.shows_others = sent.any(|sent| sent != call.sent);
@@ -172,15 +173,16 @@ impl Lease {
         Ok(answer)
     }
 
-    /// Sends paths until their worlds have moved: after each timeout it looks whether they have, and if not, sends the
-    /// paths again. A slow teammate is waited for, a silent server is not. Returns the answer, and how many steps passed
-    /// unseen before the one that it shows; `None` if `gives_up` after a look.
+    /// Sends paths until their worlds have moved. After each timeout it observes the worlds, and sends the paths again
+    /// if they have not moved. So it waits for a slow teammate, but not for a silent server. Returns the answer, and
+    /// the number of steps that passed unseen before its step. Returns `None` if `gives_up` is true after an
+    /// observation.
     ///
-    /// `send` is [`Self::send`] with the backend. With `accepts_late` the answer shows how the worlds stand, even where
-    /// they moved on without the paths.
+    /// `send` calls [`Self::send`] with the backend. With `accepts_late`, the answer shows the current worlds even if
+    /// they moved without these paths.
     ///
     /// # Errors
-    /// As of `send` and `gives_up`; a refusal as `Late` if worlds have moved on without the paths.
+    /// The errors of `send` and `gives_up`, and a `Late` refusal if worlds moved without the paths.
     pub fn fly<'a>(
         &self,
         mut paths: Call<'a>,
@@ -189,7 +191,7 @@ impl Lease {
         mut gives_up: impl FnMut() -> Result<bool, ConnectionError>,
     ) -> Result<Option<(StepAnswer, u64)>, ConnectionError> {
         let mut look = self.look(&paths);
-        // Sooner would take back the path with which the deadline began.
+        // A shorter timeout would withdraw the path that started the deadline.
         paths.timeout = paths.timeout.saturating_add(self.deadline);
         loop {
             match send(&mut paths) {
@@ -216,7 +218,8 @@ impl Lease {
         }
     }
 
-    /// Notes paths that were not refused, unless their worlds are known to have moved before: a refusal may be lost.
+    /// Records paths that were not refused, unless their worlds are known to have moved before: the refusal may have
+    /// been lost.
     fn note_sent(&self, worlds: Range<u32>, paths: &Call<'_>) {
         for (world, step) in worlds.zip(&paths.steps) {
             let known = self.known(world);
@@ -226,7 +229,7 @@ impl Lease {
         }
     }
 
-    /// The observation of the robots of paths.
+    /// Makes a call that observes the robots of `paths`.
     fn look<'a>(&self, paths: &Call<'a>) -> Call<'a> {
         let request = StepRequest {
             operation: Operation::Observe as u32,
@@ -237,7 +240,7 @@ impl Lease {
         Call::new(request, &[], paths.timeout)
     }
 
-    /// Checks that these very paths took their worlds from the steps that they are meant for to those seen.
+    /// Checks that these paths, and no others, moved their worlds from the steps they were for to the steps observed.
     fn check_flown(
         &self,
         paths: &Call<'_>,
@@ -259,7 +262,7 @@ impl Lease {
     }
 
     fn steps_of(&self, worlds: Range<u32>) -> impl Iterator<Item = u64> {
-        // The server refuses robots that are not the lease's.
+        // For a robot outside the lease, 0 will do: the server refuses it.
         let step = |known: &Known| known.step.load(Ordering::Relaxed);
         worlds.map(move |world| self.known(world).map_or(0, step))
     }
@@ -270,7 +273,7 @@ impl Lease {
     }
 }
 
-/// The results of the worlds of an answer.
+/// Iterates over the worlds' results in an answer.
 fn results((reply, payload): &StepAnswer) -> impl Iterator<Item = WorldResult> {
     let results = payload
         .chunks_exact(WORLD_BYTES)

@@ -1,9 +1,9 @@
-//! The bytes and the JSON of PROTOCOL.md: what a server and its clients say to each other, and why a request fails.
+//! The messages of PROTOCOL.md, as bytes and JSON, and the errors of requests.
 //!
-//! [`message`] and [`payload`] are the bytes of steps and samples, [`control`] is the JSON of everything rare,
-//! [`recording`] keeps samples in a file. A [`client::Client`] flies robots of a [`backend`]: a server, or worlds in the
-//! same process. Nothing here opens a channel. [`limits`] refuses more memory and threads than
-//! the system has; [`interrupt`] ends waits.
+//! [`message`] and [`payload`] are the bytes of steps and samples. [`control`] is the JSON of rarer requests, and
+//! [`recording`] stores samples in a file. A [`client::Client`] flies the robots of a [`backend`]: a server, or worlds
+//! in the same process. This crate opens no channels. [`limits`] rejects requests for more memory or threads than the
+//! system allows, and [`interrupt`] ends waits.
 
 pub mod agent_belief;
 pub mod backend;

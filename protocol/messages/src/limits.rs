@@ -1,7 +1,7 @@
-//! What the system allows this process: memory and threads, by the machine, cgroups and `ulimit`.
+//! Limits on the memory and threads of this process, set by the machine, cgroups and `ulimit`.
 //!
-//! What a user can make large asks here before it allocates. Without that, a process under `ulimit -v` aborts, and one in
-//! a container is killed.
+//! Code whose memory or threads depend on a user's settings checks here first. Otherwise a process under `ulimit -v`
+//! would abort, and one in a container would be killed.
 
 mod cgroups;
 pub mod memory;

@@ -1,8 +1,7 @@
-//! The binary messages: `#[repr(C)]` headers of every channel. PROTOCOL.md holds their byte tables.
+//! The binary messages: `#[repr(C)]` headers of every channel, with byte tables in PROTOCOL.md.
 //!
-//! Headers hold integers and floats only, in the byte order of the host; everything with fewer
-//! valid values than bit patterns is converted with `TryFrom` and checked. Variable parts travel
-//! as the `[u8]` payload behind the header.
+//! Headers hold only integers and floats, in the byte order of the host. Values with fewer valid values than bit
+//! patterns are checked by `TryFrom`. Parts of variable length follow the header as a `[u8]` payload.
 
 use bytemuck::{Pod, Zeroable};
 use emberwatch_model::grid::Cell;
@@ -12,13 +11,13 @@ pub use super::codes::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, UnknownCode, VERSION,
 };
 
-/// A header of plain bytes, which can lie in shared memory.
+/// A header of plain bytes, which can be stored in shared memory.
 pub trait Header: std::fmt::Debug + Default + Pod + Send + Sync {
-    /// The name by which channels tell types apart.
+    /// The name that distinguishes the types of channels.
     const TYPE_NAME: &'static str;
 }
 
-/// Names the headers as PROTOCOL.md does.
+/// Names the headers as in PROTOCOL.md.
 macro_rules! headers {
     ($($header:ident),* $(,)?) => {$(
         impl Header for $header {
@@ -39,10 +38,10 @@ headers!(
     AgentHeader,
 );
 
-/// Header of a `step` request. The payload of `Step` is the present step k of each world (`u64`), then a path of
-/// `n_moves` bytes for each robot; that of `Recall` is the step of each world; that of `Observe` is empty.
+/// Header of a `step` request. The payload of `Step` is the current step k of each world (`u64`), then a path of
+/// `n_moves` bytes for each robot. The payload of `Recall` is the step of each world; `Observe` has none.
 ///
-/// The robots of a server are numbered through: robot r of world w is number `w * R + r`.
+/// Robots are numbered across all worlds of a server: robot r of world w has the number `w * R + r`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct StepRequest {
@@ -52,17 +51,17 @@ pub struct StepRequest {
     pub operation: u32,
     /// The lease from `acquire`; ignored by `Observe` and `Recall`.
     pub lease: u64,
-    /// Chosen by the client, returned in the answer.
+    /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
     /// Number of the first robot.
     pub first_robot: u32,
     /// Number of consecutive robots, at least 1.
     pub n_robots: u32,
-    /// Moves in each path; 0 for `Observe` and `Recall`.
+    /// Number of moves in each path; 0 for `Observe` and `Recall`.
     pub n_moves: u32,
     /// [`FLAG_FULL_COVERAGE`], [`FLAG_TEAM_FRAMES`], both or 0.
     pub flags: u32,
-    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
+    /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,
@@ -80,11 +79,11 @@ pub struct StepReply {
     pub status: u32,
     /// The request's sequence number.
     pub sequence: u64,
-    /// Number of the first robot, as asked.
+    /// Number of the first robot, from the request.
     pub first_robot: u32,
     /// Number of robots in the payload; 0 unless the status is `Ok`.
     pub n_robots: u32,
-    /// Number of worlds that these robots are in; 0 unless the status is `Ok`.
+    /// Number of worlds of these robots; 0 unless the status is `Ok`.
     pub n_worlds: u32,
     /// The request's flags.
     pub flags: u32,
@@ -92,14 +91,14 @@ pub struct StepReply {
     pub height: u32,
     /// Grid width W.
     pub width: u32,
-    /// Time that the server worked on the request, nanoseconds: checks, simulation, copying. The wait for other
+    /// Time that the server spent on the request in nanoseconds, for checks, simulation and copying. The wait for other
     /// clients' paths does not count.
     pub simulation_nanos: u64,
-    /// See [`Status`].
+    /// The detail of the status; see [`Status`].
     pub detail: u64,
 }
 
-/// A world after a step or a reset, and what the step gave its robots together.
+/// The state of a world after a step or a reset, and the step's results for its robots together.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct WorldResult {
@@ -109,52 +108,52 @@ pub struct WorldResult {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of rewards, in `X_{k+1}`, over the distinct cells that any robot visited.
+    /// Sum of the rewards in `X_{k+1}` of the distinct cells that any robot visited.
     pub reward: f64,
-    /// Bit r is set if nobody held robot r of the world: it stayed and saw nothing.
+    /// Bit r is set if no client held robot r of the world: it stayed and saw nothing.
     pub hovered: u64,
-    /// Bit r is set if robot r was held, but its path had not come by the deadline: it stayed and saw nothing.
+    /// Bit r is set if robot r was held, but its path was not received by the deadline: it stayed and saw nothing.
     pub late: u64,
-    /// Cells of the whole grid in the state that pays most (burning cells).
+    /// Number of cells of the whole grid in the state with the highest reward (burning cells).
     pub n_target_cells: u32,
-    /// Distinct cells that any robot visited.
+    /// Number of distinct cells that any robot visited.
     pub n_visited: u32,
-    /// Distinct visited cells in the state that pays most.
+    /// Number of distinct visited cells in the state with the highest reward.
     pub n_hits: u32,
-    /// 1 if the episode ended by itself (never, in this model), else 0.
+    /// 1 if the episode ended by itself (never, in this model), otherwise 0.
     pub terminated: u16,
-    /// 1 if the episode reached the server's `max_steps`, else 0.
+    /// 1 if the episode reached the server's `max_steps`, otherwise 0.
     pub truncated: u16,
 }
 
-/// What a step gave one robot; also its place after a reset.
+/// The result of a step for one robot, or its position after a reset.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct RobotResult {
-    /// Its share of the team's reward: a cell that v robots visited pays each of them 1/v.
+    /// The robot's share of the team's reward: a cell that v robots visited pays 1/v of its reward to each.
     pub reward: f64,
-    /// What the team's reward would lack without this robot.
+    /// The difference that the robot made: the team's reward minus the reward without this robot.
     pub marginal: f64,
-    /// Distinct cells that it visited.
+    /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
-    /// Of these, cells in the state that pays most.
+    /// Number of these cells in the state with the highest reward.
     pub n_hits: u32,
-    /// Row where its path began, or where it stays.
+    /// Row where the path began, or where the robot stays.
     pub start_row: u32,
-    /// Column where its path began, or where it stays.
+    /// Column where the path began, or where the robot stays.
     pub start_col: u32,
-    /// Its row.
+    /// The robot's row.
     pub row: u32,
-    /// Its column.
+    /// The robot's column.
     pub col: u32,
     /// A [`emberwatch_model::frame::Coverage`].
     pub coverage: u32,
-    /// Moves that it flew; 0 after a reset, and in a step in which it hovered or was late.
+    /// Number of moves flown; 0 after a reset, and in a step in which the robot hovered or was late.
     pub n_moves: u32,
 }
 
 impl RobotResult {
-    /// Where it is.
+    /// Returns the robot's cell.
     pub fn cell(&self) -> Cell {
         Cell {
             row: self.row as usize,
@@ -162,7 +161,7 @@ impl RobotResult {
         }
     }
 
-    /// Where its path began, or where it stays.
+    /// Returns the cell where the path began, or where the robot stays.
     pub fn start(&self) -> Cell {
         Cell {
             row: self.start_row as usize,
@@ -179,9 +178,9 @@ pub struct ControlRequest {
     pub version: u32,
     /// 0.
     pub reserved: u32,
-    /// Chosen by the client, returned in the answer.
+    /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
-    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
+    /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,
@@ -199,8 +198,8 @@ pub struct ControlReply {
     pub sequence: u64,
 }
 
-/// Header of a sample on `frames`: one step of one world. The payload is `n_robots` [`RobotResult`]s, as many frames
-/// of `height * width` bytes, then each robot's path of [`RobotResult::n_moves`] bytes.
+/// Header of a sample on `frames`: one step of one world. The payload is `n_robots` [`RobotResult`]s, one frame of
+/// `height * width` bytes per robot, then each robot's path of [`RobotResult::n_moves`] bytes.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct FrameHeader {
@@ -208,11 +207,11 @@ pub struct FrameHeader {
     pub version: u32,
     /// The world.
     pub world: u32,
-    /// Number of samples published on this channel before this one: a gap is a loss.
+    /// Number of earlier samples on this channel. A gap means lost samples.
     pub sequence: u64,
     /// Number of the world's first robot.
     pub first_robot: u32,
-    /// Robots of the world R.
+    /// Number of robots of the world R.
     pub n_robots: u32,
     /// Grid height H.
     pub height: u32,
@@ -230,11 +229,11 @@ pub struct TruthHeader {
     pub version: u32,
     /// The world.
     pub world: u32,
-    /// Number of samples published on this channel before this one: a gap is a loss.
+    /// Number of earlier samples on this channel. A gap means lost samples.
     pub sequence: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Step index k of the state shown.
+    /// Step index k of the state.
     pub step: u64,
     /// Seed of the episode.
     pub seed: u64,
@@ -253,7 +252,7 @@ pub struct AgentHeader {
     pub version: u32,
     /// The world.
     pub world: u32,
-    /// Number of samples that this agent published before this one: a gap is a loss.
+    /// Number of earlier samples of this agent. A gap means lost samples.
     pub sequence: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
@@ -267,15 +266,15 @@ pub struct AgentHeader {
     pub width: u32,
     /// Number of states S of the belief.
     pub n_states: u32,
-    /// The agent's process.
+    /// The agent's process id.
     pub pid: u32,
     /// Number of the first robot that the agent flies.
     pub first_robot: u32,
-    /// Number of consecutive robots that it flies, at least 1.
+    /// Number of consecutive robots that the agent flies, at least 1.
     pub n_robots: u32,
 }
 
-/// The worlds of consecutive robots, with `team` robots in each world.
+/// Returns the worlds of consecutive robots, with `team` robots in each world.
 pub fn worlds_of(first_robot: u32, n_robots: u32, team: u32) -> Range<u32> {
     let (team, end) = (team.max(1), first_robot.saturating_add(n_robots));
     first_robot / team..end.div_ceil(team)

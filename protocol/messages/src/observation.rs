@@ -1,15 +1,15 @@
-//! What a robot's world shows.
+//! A robot's observation of its world.
 
 use crate::message::{RobotResult, WorldResult};
 use emberwatch_model::frame::Frame;
 
-/// What a robot's world shows after a step, or when the robot is acquired.
+/// A robot's observation of its world after a step, or when the robot is acquired.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
     /// The world at its step k.
     pub world: WorldResult,
-    /// The robot: where it is, and what the step gave it.
+    /// The robot's cell, and its result of the step.
     pub robot: RobotResult,
-    /// What the robot saw, or all robots of its world where a client asks for that; shape `[H, W]`.
+    /// What the robot saw, or with shared frames what all robots of its world saw; shape `[H, W]`.
     pub frame: Frame,
 }

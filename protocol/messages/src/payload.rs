@@ -1,4 +1,4 @@
-//! The variable parts of steps and frames: from bytes to results, frames and paths, and back.
+//! The payloads of steps and frames: converts bytes to results, frames and paths, and back.
 
 use super::capacity::MAX_ROBOTS;
 use super::control::ServerInfo;
@@ -8,10 +8,10 @@ use emberwatch_model::frame::UNOBSERVED;
 use emberwatch_model::grid::Shape;
 use emberwatch_model::path::MAX_MOVES;
 
-/// Bytes of one [`WorldResult`] in a payload.
+/// Size of one [`WorldResult`] in a payload in bytes.
 pub const WORLD_BYTES: usize = size_of::<WorldResult>();
 
-/// Bytes of one [`RobotResult`] in a payload.
+/// Size of one [`RobotResult`] in a payload in bytes.
 pub const ROBOT_BYTES: usize = size_of::<RobotResult>();
 
 /// The payload of a successful step answer.
@@ -21,29 +21,29 @@ pub struct StepParts<'a> {
     pub worlds: Vec<WorldResult>,
     /// One result per robot.
     pub robots: Vec<RobotResult>,
-    /// Frames of `height * width` bytes: one per robot, or with [`FLAG_TEAM_FRAMES`] one per world.
+    /// Frames of `height * width` bytes: one per robot, or one per world with [`FLAG_TEAM_FRAMES`].
     pub frames: &'a [u8],
 }
 
 /// The payload of a sample on `frames`: the robots of a world, in order.
 pub type FrameParts<'a> = Vec<RobotSample<'a>>;
 
-/// What a sample on `frames` says of one robot.
+/// The part of a sample on `frames` that is about one robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobotSample<'a> {
-    /// What the step gave it.
+    /// The robot's result of the step.
     pub result: RobotResult,
-    /// What it saw, `height * width` bytes.
+    /// The robot's frame, `height * width` bytes.
     pub frame: &'a [u8],
-    /// The path that it flew, one byte a move; empty if it did not fly.
+    /// The path that the robot flew, one byte per move; empty if it did not fly.
     pub path: &'a [u8],
 }
 
 impl StepParts<'_> {
-    /// Checks the values: no robot stayed that a world does not have, paths are whole, and frames hold observations.
+    /// Checks that only existing robots stayed, that paths are complete, and that frames hold observations.
     ///
     /// # Errors
-    /// Says what is wrong.
+    /// Describes the first wrong value.
     pub fn check(&self, info: &ServerInfo) -> Result<(), String> {
         let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
         let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
@@ -58,7 +58,7 @@ impl StepParts<'_> {
             let expected = info.n_moves;
             return Err(format!("n_moves: expected 0 or {expected}, got {got}"));
         }
-        // 255 becomes 0, observation o becomes o + 1: one maximum, of many values at once, checks all.
+        // With 255 mapped to 0 and observation o to o + 1, one vectorised maximum checks all values.
         let values = self.frames.iter().map(|value| value.wrapping_add(1));
         let highest = values.fold(0, u8::max);
         if usize::from(highest) > info.n_observations {
@@ -74,7 +74,7 @@ impl StepParts<'_> {
 /// Splits the payload of a step answer.
 ///
 /// # Errors
-/// The number of bytes expected, if the payload is not as long as its header says.
+/// Returns the expected number of bytes if the payload's length differs from it.
 pub fn split_step_payload<'a>(
     reply: &StepReply,
     payload: &'a [u8],
@@ -102,7 +102,7 @@ pub fn split_step_payload<'a>(
 /// Splits the payload of a sample on `frames`.
 ///
 /// # Errors
-/// If header and payload do not fit each other; the error says what was expected.
+/// If the payload does not fit the header. The error has the expected value.
 pub fn split_frame_payload<'a>(
     header: &FrameHeader,
     payload: &'a [u8],
@@ -156,7 +156,7 @@ pub fn split_frame_payload<'a>(
         .collect()
 }
 
-/// Appends the payload of a `Step` request, steps and paths, or with no paths that of a `Recall`.
+/// Appends the payload of a `Step` request, steps and paths. Without paths, this is the payload of a `Recall`.
 pub fn write_step_body(steps: &[u64], paths: &[u8], body: &mut Vec<u8>) {
     body.extend_from_slice(bytemuck::cast_slice(steps));
     body.extend_from_slice(paths);

@@ -1,8 +1,8 @@
-//! A recording: what a server published, in a file. PROTOCOL.md section 13 has its byte tables.
+//! A recording: the samples that a server published, in a file. PROTOCOL.md section 13 has the byte tables.
 //!
-//! A file begins with a [`FileHeader`]; records follow, each a [`RecordHeader`] and a compressed body,
-//! and the last one says how many there are. So a file itself shows what it lacks: samples that the
-//! recorder missed, records that are damaged, a missing end.
+//! A file begins with a [`FileHeader`]. Records follow, each a [`RecordHeader`] and a compressed body. The last record
+//! has the number of records. So the file itself reveals samples that the recorder missed, damaged records, and a
+//! missing end.
 
 mod format;
 mod progress;

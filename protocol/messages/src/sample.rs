@@ -1,10 +1,10 @@
-//! What is published, as a reader has it.
+//! A published sample, as a reader receives it.
 
-/// A sample of a channel that is published: copied out of shared memory, or read from a recording.
+/// A sample of a publish-subscribe channel, copied out of shared memory or read from a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample<H> {
     /// The binary header.
     pub header: H,
-    /// The bytes behind it.
+    /// The bytes after the header.
     pub payload: Vec<u8>,
 }

@@ -1,4 +1,4 @@
-//! Paths of a lease, on a backend that answers what a test says.
+//! Paths of a lease, on a backend with scripted answers.
 
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::ServerInfo;
@@ -8,16 +8,16 @@ use emberwatch_messages::message::{Operation, Status, StepReply, StepRequest, Wo
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// What is asked, and for which step.
+/// A request's operation, and the step that it is for.
 type Asked = (Operation, Option<u64>);
 
-/// What the backend answers.
+/// An answer of the backend.
 #[derive(Clone, Copy)]
 enum Say {
     Nothing,
     Late,
     Step(u64),
-    /// A step, and the robots that hovered and were late.
+    /// A step, and the bits of the robots that hovered and were late.
     Stayed(u64, u64, u64),
 }
 use Say::{Late, Nothing, Stayed, Step};
@@ -75,7 +75,7 @@ impl Backend for Script {
     }
 }
 
-/// A lease on robot 1, whose world is at step 4, and what its backend answers.
+/// Returns a lease on robot 1, whose world is at step 4, and a backend with these answers.
 fn lease(says: &[Say]) -> (Lease, Script) {
     let info = crate::server(1, 3, 1, 1);
     let lease = Lease::new(&info, 7, &(1..2));
@@ -92,7 +92,8 @@ fn call(lease: &Lease, operation: Operation) -> Call<'static> {
     Call::new(request, moves, Duration::ZERO)
 }
 
-/// Flies until the worlds have moved or `patience` looks have passed; returns the step seen and how many passed unseen.
+/// Flies until the worlds have moved, or gives up after two observations. Returns the observed step and the number of
+/// steps that passed unseen.
 fn fly(
     lease: &Lease,
     script: &mut Script,
@@ -132,7 +133,7 @@ fn paths_are_sent_until_the_world_has_moved() {
     assert_eq!(asked, [sent, look, sent], "for the same step");
     check(&[Nothing, Step(5)], false, Ok(Some((5, 0))));
     check(&[Nothing, Stayed(5, 0b01, 0)], false, Ok(Some((5, 0))));
-    // It can be given up.
+    // The flight can be given up.
     check(&[Nothing, Step(4), Nothing, Step(4)], false, Ok(None));
 }
 
@@ -142,13 +143,13 @@ fn paths_that_did_not_move_the_world_are_late() {
         check(&[Nothing, seen], false, Err(Status::Late));
     }
     check(&[Late], false, Err(Status::Late));
-    // Who accepts that sees how the world stands.
+    // With `accepts_late`, the answer shows the current world.
     check(&[Late, Step(7)], true, Ok(Some((7, 2))));
     check(&[Nothing, Step(6)], true, Ok(Some((6, 1))));
     check(&[Nothing, Stayed(5, 0, 0b10)], true, Ok(Some((5, 0))));
 }
 
-/// Flies while another thread sends a request after so many of the first one's.
+/// Flies while another thread sends a request after the first one's `after`-th request.
 fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status> {
     let (lease, mut script) = lease(says);
     let mut others = call(&lease, other);
@@ -174,10 +175,10 @@ fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status
 fn a_step_with_paths_of_another_thread_is_not_its_own() {
     let beside = |says: &[Say]| fly_beside(Operation::Step, 1, says);
     assert_eq!(beside(&[Nothing, Step(5), Step(5)]), Err(Status::Late));
-    // The other's answer is lost.
+    // The other thread's answer is lost.
     assert_eq!(beside(&[Nothing, Nothing, Step(5)]), Err(Status::Late));
     assert_eq!(beside(&[Nothing, Late, Step(5)]), Ok(()));
-    // Its own refusal is lost.
+    // The first thread's refusal is lost.
     let says = [Nothing, Step(4), Step(5), Nothing, Step(5)];
     let refused = fly_beside(Operation::Step, 2, &says);
     assert_eq!(refused, Err(Status::Late));

@@ -1,4 +1,4 @@
-//! One program: each would link the crate.
+//! One test program: each separate one would have to link the crate.
 
 mod lease;
 mod payload;
@@ -6,7 +6,7 @@ mod recording;
 
 use emberwatch_messages::control::ServerInfo;
 
-/// What a server of two robots a world says of itself.
+/// Returns the settings of a server with two robots in each world.
 fn server(height: usize, width: usize, n_moves: usize, n_worlds: u32) -> ServerInfo {
     let text = r#"{"protocol": 2, "build": "0.1.0", "pid": 7, "height": 0, "width": 0, "n_moves": 0, "n_worlds": 0,
         "n_robots": 2, "n_observations": 3, "observations": ["normal", "latent", "fire"], "model": null, "burn_in": 20,

@@ -1,4 +1,4 @@
-//! Payloads of steps and frames: split at their exact length, and no value that cannot be.
+//! Payloads of steps and frames: they are split at their exact length, and impossible values are refused.
 
 use emberwatch_messages::message::{
     FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult,
@@ -17,7 +17,7 @@ fn a_step_payload_of_the_wrong_length_is_refused() {
     let (mut team, mut huge) = (reply, reply);
     team.flags = FLAG_TEAM_FRAMES;
     for (reply, expected) in [(reply, 64 + 2 * (48 + 15)), (team, 64 + 2 * 48 + 15)] {
-        // In shared memory a payload begins at any address.
+        // In shared memory a payload can begin at any address.
         assert!(split_step_payload(&reply, &vec![0; expected + 1][1..]).is_ok());
         for wrong in [3, expected - 1, expected + 1] {
             assert_eq!(split_step_payload(&reply, &vec![0; wrong]), Err(expected));
@@ -79,7 +79,7 @@ fn a_sample_gives_each_robot_its_frame_and_path() {
         &[255, 255, 255, 0, 255, 2, 3, 3],
     ]
     .concat();
-    // In shared memory a payload begins at any address.
+    // In shared memory a payload can begin at any address.
     let memory = [&[0], &payload[..]].concat();
     let robots = split_frame_payload(&header, &memory[1..]).expect("well-formed");
     assert_eq!((robots[0].frame, robots[0].path), (&[255; 3][..], &[][..]));

@@ -1,4 +1,4 @@
-//! Recordings: what was written is what is read, and what is missing or damaged is said.
+//! Recordings: what was written is read again, and missing or damaged parts are reported.
 
 use emberwatch_messages::message::{FrameHeader, RobotResult, TruthHeader, VERSION};
 use emberwatch_messages::recording::{
@@ -7,14 +7,14 @@ use emberwatch_messages::recording::{
 use emberwatch_messages::sample::Sample;
 use std::io::Write;
 
-/// Robots of a world.
+/// Number of robots of a world.
 const N_ROBOTS: usize = 2;
 
 fn server(height: usize, width: usize, n_moves: usize) -> Event {
     Event::Server(Box::new(crate::server(height, width, n_moves, 3)))
 }
 
-/// A sample of robots that flew so many moves; `bytes` are their frames and paths.
+/// Makes a sample of robots that flew `n_moves` moves. `bytes` are their frames and paths.
 fn frame(
     sequence: u64,
     (height, width): (u32, u32),
@@ -41,7 +41,7 @@ fn frame(
     Sample { header, payload }
 }
 
-/// Hidden states of a grid of 2 x 3 cells.
+/// Makes a sample of hidden states of a grid of 2 x 3 cells.
 fn truth(world: u32, payload: Vec<u8>) -> Sample<TruthHeader> {
     let header = TruthHeader {
         version: VERSION,
@@ -61,7 +61,7 @@ fn record(nanos: u64, n_lost: u32, event: Event) -> Record {
     }
 }
 
-/// A server, hidden states, frames, and a second server of another grid.
+/// Returns records of a server, hidden states and frames, and of a second server with another grid.
 fn example() -> Vec<Record> {
     let flown =
         |sequence, grid, n_moves, bytes: &[u8]| Event::Frame(frame(sequence, grid, n_moves, bytes));
@@ -75,7 +75,7 @@ fn example() -> Vec<Record> {
     ]
 }
 
-/// A recording of the example, and where each of its records begins and the last one ends.
+/// Returns a recording of the example, with the offset where each record begins and where the last one ends.
 fn written() -> (Vec<u8>, Vec<usize>) {
     let mut bytes = Vec::new();
     let mut writer = Writer::new(&mut bytes).expect("begin");
@@ -90,7 +90,7 @@ fn written() -> (Vec<u8>, Vec<usize>) {
     (bytes, places)
 }
 
-/// The records that can be read, and the error that ends them, if any.
+/// Returns the readable records, and the error that ends them, if any.
 fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
     let mut records = Vec::new();
     match Reader::new(bytes) {
@@ -107,7 +107,7 @@ fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
     }
 }
 
-/// Frames of steps; none of the example's comes twice.
+/// Counts the frames of steps. No step occurs twice in the example.
 fn count_steps(records: &[Record]) -> u64 {
     let is_step = |record: &&Record| matches!(&record.event, Event::Frame(sample) if sample.header.result.step > 0);
     records.iter().filter(is_step).count() as u64
@@ -119,7 +119,7 @@ fn check_refused(bytes: &[u8], words: &str) {
     assert!(said.contains(words), "{said:?} does not say {words:?}");
 }
 
-/// A record of these bytes, with the right checksum.
+/// Returns a record with this body and the right checksum.
 fn raw_record(kind: u32, body: &[u8]) -> Vec<u8> {
     let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::fast());
     encoder.write_all(body).expect("compress");
@@ -206,7 +206,7 @@ fn other_files_are_refused_by_what_they_begin_with() {
     let words = "cut short: expected a whole record at byte 0, got 1 bytes";
     check_refused(b"E", words);
     let (mut bytes, places) = written();
-    // A record that is missing is noticed at the end.
+    // A missing record is noticed at the end.
     let without = [&bytes[..places[2]], &bytes[places[3]..]].concat();
     check_refused(&without, "totals: expected");
     bytes[8..12].copy_from_slice(&2u32.to_be_bytes());
@@ -234,18 +234,18 @@ fn a_hostile_record_is_refused_by_where_it_is() {
     check(&raw_record(2, &vec![0; 100 << 20]), "bytes, got more");
     check(&sealed(2, b"\xff\xff"), "expected deflate");
     let twice = [&raw_record(1, b"")[24..], b"more"].concat();
-    check(&sealed(1, &twice), "4 bytes behind it");
+    check(&sealed(1, &twice), "4 bytes after it");
     check(&raw_record(5, b""), "kind: expected 1 to 4, got 5");
     check(&raw_record(1, b"{\"protocol\":1}"), "JSON: missing field");
     check(&raw_record(2, &[0; 95]), "expected 96 bytes, got 95");
     check(&raw_record(3, &[0; 48]), "expected a server before");
     check(&raw_record(4, b"{}"), "JSON: missing field");
     for behind in [b"x", &whole[16..]] {
-        check_refused(&[&whole, behind].concat(), "nothing behind the end");
+        check_refused(&[&whole, behind].concat(), "nothing after the end");
     }
 }
 
-/// Rows of changes to a sample, and what is said of each.
+/// Rows of changes to a sample, and part of the error for each.
 macro_rules! changes {
     ($of:ty, $sample:ident: $($change:block $words:literal)*) => {{
         let changes: &[(fn(&mut Sample<$of>), &str)] = &[$((|$sample| $change, $words)),*];

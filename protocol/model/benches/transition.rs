@@ -1,19 +1,20 @@
-//! One world transition and one predictor step, on one core.
+//! One transition of a world, and one prediction of a belief, on one core.
 //!
-//! Peer: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
+//! For comparison: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
+//!
 //! `cargo bench -p emberwatch-model --bench transition -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use emberwatch_model::{Dynamics, Model, Probabilities, Shape, Transition};
 
-/// Steps before measuring: enough for all three states, in clusters, as in a world in use.
+/// Steps before measuring: enough for all three states to form clusters, as in a world in use.
 const BURN_IN: u64 = 2_000;
 
 fn square(side: usize) -> Shape {
     Shape::new(side, side).expect("bench shape")
 }
 
-/// The default model, one whose kernels see the cell's own state, and that on land of 35 zones, which has 64 x 64 cells.
+/// Returns the default model, a model with own-state kernels and, on 64 x 64 cells, that model on a land of 35 zones.
 fn models(side: usize) -> impl Iterator<Item = (Model, &'static str)> {
     let named = |name| Model::built_in(name).expect("bench model");
     let all = [

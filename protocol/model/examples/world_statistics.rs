@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p emberwatch-model --example world_statistics -- --runs 32`
 //!
-//! Exits with 1 if any statistic differs by more than 3 combined standard errors. The reference has 7
-//! runs, and the statistics hang together: with other seeds, one just above 3 is no proof of an error.
+//! Exits with 1 if any statistic differs by more than 3 combined standard errors. The reference has only 7 runs, and
+//! the statistics are correlated. With other seeds, one just above 3 does not prove an error.
 
 #![expect(clippy::print_stdout, reason = "the table is the output")]
 
@@ -12,7 +12,7 @@ mod statistics;
 
 use std::process::ExitCode;
 
-/// Largest difference in combined standard errors.
+/// Maximum difference in combined standard errors.
 const BOUND: f64 = 3.0;
 
 fn main() -> ExitCode {

@@ -1,15 +1,15 @@
-//! An [`Airspace`]: where the robots of a grid may fly, and which cells they see from a path.
+//! An [`Airspace`]: the cells where robots may fly, and the cells that they see from a path.
 
 use super::file::Pays;
 use super::grid::{Cell, Grid, Shape};
 use super::path::{Flight, Move, fly_by};
 use std::sync::Arc;
 
-/// Where robots may fly, and what their sensor sees from there.
+/// The cells where robots may fly, and the reach of their sensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Airspace {
     shape: Shape,
-    /// Where no robot may be.
+    /// Whether each cell is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
     radius: usize,
     n_rings: usize,
@@ -19,23 +19,25 @@ pub struct Airspace {
 /// A cell that is seen from a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SeenCell {
-    /// Its row-major index.
+    /// The row-major index of the cell.
     pub cell: usize,
-    /// The observation matrix that it is seen by: the best of all from the path.
+    /// The index of its observation matrix: the smallest ring in which any cell of the path sees it.
     pub ring: u8,
 }
 
 impl Airspace {
-    /// All of a grid, with a sensor that sees the cells of the path.
+    /// Makes the airspace of a whole grid, with a sensor that sees only the cells of the path.
     pub fn open(shape: Shape) -> Self {
         Self::new(shape, None, 0, 1, Pays::Visited)
     }
 
-    /// A grid without the cells of `no_fly` (shape `[H, W]`), whose sensor sees `radius` rows and columns beyond each
-    /// cell of the path by `n_rings` observation matrices. With a radius of 0, what is seen is what is visited.
+    /// Makes the airspace of a grid without the cells of `no_fly` (shape `[H, W]`).
+    ///
+    /// The sensor sees `radius` rows and columns beyond each cell of the path, with `n_rings` observation matrices.
+    /// With a radius of 0, a robot sees exactly the cells that it visits.
     ///
     /// # Panics
-    /// If the map is of another grid.
+    /// If the map has another shape than the grid.
     pub fn new(
         shape: Shape,
         no_fly: Option<Arc<Grid<bool>>>,
@@ -54,37 +56,37 @@ impl Airspace {
         }
     }
 
-    /// The grid.
+    /// Returns the shape of the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// Rows and columns that the sensor sees beyond each cell of the path, 0 to 8.
+    /// Returns the number of rows and columns that the sensor sees beyond each cell of the path, 0 to 8.
     pub fn radius(&self) -> usize {
         self.radius
     }
 
-    /// Observation matrices: of the path, then of the rings around it.
+    /// Returns the number of observation matrices: one for the path, then one per ring around it.
     pub fn n_rings(&self) -> usize {
         self.n_rings
     }
 
-    /// Which distinct cells pay.
+    /// Returns whether visited or seen cells earn rewards.
     pub fn pays(&self) -> Pays {
         self.pays
     }
 
-    /// Whether all of the grid may be flown over.
+    /// Returns whether robots may fly over every cell of the grid.
     pub fn is_open(&self) -> bool {
         self.no_fly.is_none()
     }
 
-    /// Where no robot may be, shape `[H, W]`, if there is such a cell.
+    /// Returns whether each cell is closed to robots, shape `[H, W]`, if any cell is.
     pub fn no_fly(&self) -> Option<&Arc<Grid<bool>>> {
         self.no_fly.as_ref()
     }
 
-    /// Whether a robot may be at a cell of the grid.
+    /// Returns whether a robot may be at a cell of the grid.
     #[inline]
     pub fn is_free(&self, cell: Cell) -> bool {
         !self
@@ -93,14 +95,15 @@ impl Airspace {
             .is_some_and(|map| map[[cell.row, cell.col]])
     }
 
-    /// The cell that a move leads to; one off the grid or into a no-fly cell leaves the robot in place.
+    /// Returns the cell that a move leads to. A move off the grid or into a no-fly cell leaves the robot in place.
     #[inline]
     pub fn after(&self, step: Move, cell: Cell) -> Cell {
         let next = step.apply(cell, self.shape);
         if self.is_free(next) { next } else { cell }
     }
 
-    /// A move, or the next in [`Move::ALL`] if it leads into a no-fly cell: one that a planner may plan.
+    /// Returns the move, or, if it leads into a no-fly cell, the next one in [`Move::ALL`] that does not. Planners use
+    /// it to avoid wasted moves.
     #[inline]
     pub fn around(&self, step: Move, cell: Cell) -> Move {
         let may_be = |step: &Move| self.is_free(step.apply(cell, self.shape));
@@ -108,7 +111,7 @@ impl Airspace {
         steps.find(may_be).unwrap_or(step)
     }
 
-    /// Replaces the moves of a path that lead into no-fly cells, as [`Self::around`].
+    /// Replaces the moves of a path that lead into no-fly cells, with [`Self::around`].
     pub fn fly_around(&self, start: Cell, path: &mut [Move]) {
         if self.is_open() {
             return;
@@ -120,15 +123,16 @@ impl Airspace {
         }
     }
 
-    /// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, unless that is off the grid or a no-fly cell).
+    /// Flies a path from `start` (paper eq. 12). Each move is `z_{t+1} = z_t + v_t`, unless that is off the grid or a
+    /// no-fly cell.
     pub fn fly(&self, start: Cell, path: &[Move]) -> Flight {
         let mut visited = Vec::new();
         let end = self.fly_into(start, path, &mut visited, &mut Vec::new());
         Flight { visited, end }
     }
 
-    /// [`Self::fly`] without new memory: the visited cells go to `visited`; `seen` is scratch of any content. Returns
-    /// the robot's last cell.
+    /// Flies a path like [`Self::fly`], without allocating. Writes the visited cells to `visited`; `seen` is a scratch
+    /// buffer with any content. Returns the robot's last cell.
     pub fn fly_into(
         &self,
         start: Cell,
@@ -145,7 +149,8 @@ impl Airspace {
         }
     }
 
-    /// Lists the cells in sight of visited ones (row-major indices), each once; `rings` is scratch of any content.
+    /// Lists each cell in sight of the visited cells once. `visited` holds row-major indices, and `rings` is a scratch
+    /// buffer with any content.
     pub fn see_into(&self, visited: &[usize], seen: &mut Vec<SeenCell>, rings: &mut Vec<u8>) {
         const UNSEEN: u8 = u8::MAX;
         seen.clear();
@@ -177,7 +182,7 @@ impl Airspace {
         seen.iter_mut().for_each(|it| it.ring = rings[it.cell]);
     }
 
-    /// The distinct cells that pay on a path, by row-major index.
+    /// Returns the row-major indices of the distinct cells that earn a reward on a path.
     pub fn paying(&self, start: Cell, path: &[Move]) -> Vec<usize> {
         let visited = self.fly(start, path).visited;
         match self.pays {
@@ -186,7 +191,7 @@ impl Airspace {
         }
     }
 
-    /// [`Self::see_into`] with new memory.
+    /// Returns the cells in sight of the visited cells, like [`Self::see_into`].
     pub fn see(&self, visited: &[usize]) -> Vec<SeenCell> {
         let mut seen = Vec::new();
         self.see_into(visited, &mut seen, &mut Vec::new());

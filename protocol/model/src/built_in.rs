@@ -1,21 +1,21 @@
-//! Models, tasks and recorded states that ship: each file of `config/models` and `config/tasks`, each folder of
-//! `config/landscapes`, by its name. `build.rs` lists them.
+//! The models, tasks and recorded states that ship with the programs: each file of `config/models` and `config/tasks`,
+//! and each folder of `config/landscapes`, by its name. `build.rs` lists them.
 
-/// Models: the text of the file.
+/// Built-in models, as `(name, text of the file)`.
 pub(crate) static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
 
-/// Tasks: the text of the file.
+/// Built-in tasks, as `(name, text of the file)`.
 pub(crate) static TASKS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/tasks.rs"));
 
-/// Recorded states: the archive of sequences, and the description.
+/// Built-in recorded states, as `(name, archive of sequences, text of the description)`.
 pub static STATES: &[(&str, &[u8], &str)] = include!(concat!(env!("OUT_DIR"), "/states.rs"));
 
-/// The names of the recorded states.
+/// Lists the names of the built-in recorded states.
 pub fn state_names() -> impl Iterator<Item = &'static str> {
     STATES.iter().map(|(name, ..)| *name)
 }
 
-/// Names as errors and `--help` list them: `wildfire, small`.
+/// Joins names as errors and `--help` list them: `wildfire, small`.
 pub fn listed(names: impl Iterator<Item = &'static str>) -> String {
     names.collect::<Vec<_>>().join(", ")
 }

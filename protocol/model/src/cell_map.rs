@@ -1,4 +1,4 @@
-//! Maps in a model file: a number for each cell, written out or in a file beside it.
+//! Maps in a model file: a number for each cell, written in the file or in a `.npy` file next to it.
 
 use super::grid::{Grid, Shape};
 use crate::text::MAX_TEXT_BYTES;
@@ -10,7 +10,8 @@ use std::fs::File;
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
-/// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
+/// Maximum size of an array's header. NumPy writes 128 bytes; nested brackets in a long header could overflow the
+/// parser's stack.
 const MAX_HEADER_BYTES: u16 = 512;
 
 /// A number for each cell of a grid.
@@ -22,12 +23,12 @@ const MAX_HEADER_BYTES: u16 = 512;
 pub enum CellMap {
     /// Row by row.
     Rows(Vec<Vec<u8>>),
-    /// The name of a `.npy` file beside the model file: `[H, W]`, `uint8` or `bool`.
+    /// The name of a `.npy` file next to the model file, with shape `[H, W]` and type `uint8` or `bool`.
     File(String),
 }
 
 impl CellMap {
-    /// The numbers row by row, unless they are in a file that was not read.
+    /// Returns the numbers row by row, or `None` if their file was not loaded.
     pub fn rows(&self) -> Option<Vec<Vec<u8>>> {
         match self {
             Self::Rows(rows) => Some(rows.clone()),
@@ -35,16 +36,16 @@ impl CellMap {
         }
     }
 
-    /// The numbers, shape `[H, W]`.
+    /// Returns the numbers, shape `[H, W]`.
     ///
     /// # Errors
-    /// If rows differ in length, no grid has so many, or they are in a file that was not read; the error says what was
-    /// expected and what was got.
+    /// If rows differ in length, the map exceeds the largest grid, or its file was not loaded. The error has the
+    /// expected and the given value.
     pub fn grid(&self) -> Result<Grid<u8>, (String, String)> {
         let rows = match self {
             Self::Rows(rows) => rows,
             Self::File(name) => {
-                let expected = "rows of numbers (files are read beside a model file alone)";
+                let expected = "rows of numbers, because this model was not read from a file";
                 return Err((expected.into(), format!("{name:?}")));
             }
         };
@@ -58,10 +59,10 @@ impl CellMap {
         Ok(grid.expect("invariant: as many numbers as cells"))
     }
 
-    /// Reads the file beside a model file, if it names one, and puts its rows here.
+    /// Replaces the name of a file by the numbers in it. The file is next to the model file.
     ///
     /// # Errors
-    /// The file, and why it was not read.
+    /// Returns the file, and the reason why it cannot be read.
     pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
         let Self::File(name) = &*self else {
             return Ok(());
@@ -93,7 +94,7 @@ fn read_array(path: &Path) -> Result<Array2<u8>, String> {
         let expected = format!("expected a header of at most {MAX_HEADER_BYTES} bytes");
         return Err(format!("{expected}, got {header}"));
     }
-    // An array is made as large as its header says before it is read.
+    // The parser allocates the size that the header claims, so check it against the size of the file first.
     let mut rest = Cursor::new(&bytes);
     let header = Header::from_reader(&mut rest).map_err(|error| words(&error))?;
     let n_values = bytes.len() as u64 - rest.position();

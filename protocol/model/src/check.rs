@@ -10,14 +10,14 @@ use ndarray::{Array1, Array2, Array4, ArrayViewMut1, s};
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 
-/// Range of the size of weights, biases and rewards that are not zero. Their sums and products neither overflow nor
+/// Allowed magnitudes of weights, biases and rewards that are not zero. Their sums and products neither overflow nor
 /// vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
 /// Maximum number of weights of all kernels, 512 MiB in total. 64 own-state kernels of 15 x 15 cells have 59 million.
 const MAX_WEIGHTS: usize = 1 << 26;
 
-/// Names that no state may have. A policy's goal is the name of a state or one of these.
+/// Names that no state may have, because a policy's goal is the name of a state or one of these.
 const RESERVED: [&str; 5] = ["coverage", "exploit", "exploit_only", "explore", "learned"];
 
 /// Maximum distance from 1 of the sum of a distribution in a model file.
@@ -120,7 +120,8 @@ impl Checker<'_> {
         if is_zero || RANGE.contains(&got.abs()) {
             return Ok(());
         }
-        let expected = format!("0, or a size of {:e} to {:e}", RANGE.start(), RANGE.end());
+        let (least, most) = (RANGE.start(), RANGE.end());
+        let expected = format!("0, or a magnitude of {least:e} to {most:e}");
         self.wrong(what, &expected, format!("{got:e}"))
     }
 
@@ -146,7 +147,7 @@ impl Checker<'_> {
         }
         let (n_rings, got) = (1 + sensor.rings.len(), sensor.rings.len());
         if got > sensor.radius {
-            let expected = format!("at most {} rings, as the radius is", sensor.radius);
+            let expected = format!("at most {} rings, the sensor's radius", sensor.radius);
             return self.wrong("sensor: rings".into(), &expected, got);
         }
         if n_named * n_rings > MAX_VALUES {
@@ -204,7 +205,7 @@ impl Checker<'_> {
         match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
             None => Ok(Some(map)),
             Some(got) => {
-                let expected = format!("zones below {n_zones}, as `zones` has");
+                let expected = format!("zones below {n_zones}, the number of `zones`");
                 self.wrong("zone_map".into(), &expected, got)
             }
         }
@@ -286,7 +287,7 @@ impl Checker<'_> {
             let fits = zone.map_or(names.is_empty(), |zone| names.contains(zone));
             if !fits {
                 let expected = if names.is_empty() {
-                    "no zone, as `zones` has none"
+                    "no zone, because the model has no `zones`"
                 } else {
                     "the name of one of `zones`"
                 };

@@ -1,4 +1,4 @@
-//! The description of a recorded world in TOML: a model file without a transition.
+//! The description of a recorded world in TOML: like a model file, but without a transition.
 
 use super::cell_map::CellMap;
 use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, SensorEntry, StateEntry};
@@ -41,7 +41,7 @@ pub struct DescribedState {
 }
 
 impl Description {
-    /// Builds the model with these states, observations and rewards, in which no cell changes its state.
+    /// Builds a model with these states, observations and rewards, in which no cell changes its state.
     ///
     /// # Errors
     /// If an entry is wrong. The error names it, the expected value and the given one.
@@ -80,7 +80,7 @@ impl Description {
     /// Parses a description and builds its unchanging model.
     ///
     /// # Errors
-    /// If the text is not a description, or an entry is wrong.
+    /// If the text is not a valid description, or an entry is wrong.
     pub fn model_of(text: &str) -> Result<Model, ModelError> {
         let description: Self =
             toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;

@@ -1,20 +1,23 @@
-//! The hidden world's own step: `X_{k+1}` drawn cell by cell from `Phi(one-hot X_k)` (paper eqs. 2-4).
+//! The transition of the hidden world: draws each cell of `X_{k+1}` from `Phi(one-hot X_k)` (paper eqs. 2 to 4).
 //!
-//! A pure function of (model, seed, step): no thread, platform or observer changes a cell.
+//! The result depends only on the model, the seed and the step, not on threads, platform or observers.
 //!
 //! # What is drawn
-//! A kernel gives each neighbour of a cell a vote: with the neighbour under tap `t` in state `n_t`, the next state
-//! `m` has the weight `b[m] + sum_t w[m, n_t, t]` (eq. 2). A cell turns into `m` with a probability in proportion to
-//! it (eqs. 3 and 4). `Tables::weights` and `Dynamics::sum_kernels` do exactly this.
+//! A *tap* is a position in the kernel, and so an offset from a cell to a neighbour. A neighbour's weights are its
+//! *vote*: with the neighbour at tap `t` in state `n_t`, the weight of next state `m` is `b[m] + sum_t w[m, n_t, t]`
+//! (eq. 2). The cell changes to `m` with a probability proportional to this weight (eqs. 3 and 4). `Tables::weights`
+//! and `Dynamics::sum_kernels` compute exactly this.
 //!
 //! # How it is fast
-//! Two faster ways go before it, each with the same distribution. `bytes.rs` decides most cells of a whole row by one
-//! random byte each. `parents.rs` draws one neighbour of a cell, and the vote of this neighbour, up to eight times. The
-//! cells that both leave undecided are summed: hardly any in the wildfire, all where a model has too many weights.
+//! Two faster methods with the same distribution come first. `bytes.rs` decides most cells of a row with one random
+//! byte each. `parents.rs` then draws one neighbour of each remaining cell, and the vote of this neighbour, up to eight
+//! times. Only cells that are still undecided need the full sum: hardly any in the wildfire, and all in models with too
+//! many weights for tables.
 //!
 //! # Random numbers
-//! Two words of the step's ChaCha8 stream key two SplitMix64 generators, as in the sensor: one gives the bytes, the
-//! other the draws, band by band. (ChaCha8 throughout took 2.0 of 7.1 us on a 64 x 64 grid.)
+//! Two words of the step's ChaCha8 stream are the keys of two SplitMix64 generators, as in the sensor. One generates
+//! the bytes, the other the numbers of the draws, band by band. (ChaCha8 throughout took 2.0 of 7.1 us on a 64 x 64
+//! grid.)
 
 mod bytes;
 mod kernel;
@@ -37,38 +40,38 @@ use places::{OFF_GRID, Places, centre};
 use rand::Rng;
 use std::sync::Arc;
 
-/// Cells finished before the next are begun: what a band works on (bytes, states, lists) stays in a
-/// 32 KiB cache. A multiple of [`LANES`].
+/// Number of cells finished before the next ones are begun. The bytes, states and lists of a band stay in a 32 KiB
+/// cache. A multiple of [`LANES`].
 const BAND: usize = 8192;
 
-/// The world's transition for one model on one grid, with its work space (which no result depends
-/// on): give each thread its own clone.
+/// The transition of a world for one model on one grid, with its buffers. Results do not depend on the buffers'
+/// content. Each thread needs a clone.
 #[derive(Debug, Clone)]
 pub struct Dynamics {
     shape: Shape,
     tables: Arc<Tables>,
     places: Places,
-    /// Homes of the cells of a band that are not decided yet.
+    /// Homes (see `places.rs`) of the undecided cells of a band.
     undecided: Vec<u32>,
-    /// Their random numbers.
+    /// Random numbers for the undecided cells.
     randoms: Vec<u8>,
 }
 
-/// What follows from the model and the grid: the same for every world.
+/// The tables computed from the model and the grid, which all worlds share.
 #[derive(Debug)]
 struct Tables {
     n_states: usize,
     initial: Vec<f64>,
-    /// One, or one for each state that a cell itself can be in; as many for each zone.
+    /// The kernels, zone by zone. Each zone has one kernel, or one per own state of the cell.
     kernels: Vec<Kernel>,
-    /// Kernels of a zone.
+    /// Number of kernels per zone.
     n_own: usize,
-    /// The zone of each home, where zones differ.
+    /// The zone of each home, if the model has several zones.
     zones: Option<Vec<u8>>,
-    /// Where each tap reads, relative to a cell's home.
+    /// The place that each tap reads, relative to a cell's home.
     offsets: Vec<usize>,
     bytes: Bytes,
-    /// `None` if the model has too many weights for tables: then all kernels are summed.
+    /// `None` if the model has too many weights for tables. Then the kernels of every cell are summed.
     parents: Option<Parents>,
 }
 
@@ -90,14 +93,14 @@ impl Dynamics {
         })
     }
 
-    /// The memory of the work space of a model on a grid, which each clone has, bytes.
+    /// Returns the size of the buffers for a model on a grid in bytes. Each clone has separate buffers.
     pub fn n_bytes(model: &Model, shape: Shape) -> usize {
         let (n_places, n_homes) = Places::lengths(model, shape);
         let in_band = n_homes.min(BAND);
         n_places + n_homes + (2 * in_band + LANES) * size_of::<u32>()
     }
 
-    /// The states at step 0 of a world: each cell drawn from the model's initial distribution.
+    /// Draws the states at step 0 of a world, each cell from the model's initial distribution.
     pub fn initial(&self, seed: u64) -> Grid<u8> {
         let mut rng = stream(seed, Purpose::Initial, 0);
         Grid::from_shape_simple_fn(self.shape.dim(), || {
@@ -105,7 +108,7 @@ impl Dynamics {
         })
     }
 
-    /// Moves the states of a world from step `n` to step `n + 1`.
+    /// Advances the states of a world from step `n` to step `n + 1`.
     ///
     /// # Panics
     /// If `states` has another shape, is not row-major, or holds a value that is no state.
@@ -119,7 +122,7 @@ impl Dynamics {
         );
     }
 
-    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
+    #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
     fn advance(&mut self, [byte_key, draw_key]: [u64; 2], cells: &mut [u8]) {
         let largest = cells.iter().fold(0, |most, &state| state.max(most));
         assert!(
@@ -146,7 +149,7 @@ impl Dynamics {
         self.places.store(cells);
     }
 
-    /// Decides cells by the formula as it stands.
+    /// Decides the remaining cells by the full sum of eq. 2.
     fn sum_kernels(&mut self, n_undecided: usize, words: &mut Words) {
         for &home in &self.undecided[..n_undecided] {
             let home = home as usize;
@@ -163,7 +166,7 @@ impl Tables {
         let mixtures = Mixture::of_kernels(&kernels, model.n_zones(), model.sees_own_state());
         let (offsets, zones) = (places.offsets(model), places.zones(model));
         let parents = Parents::new(&mixtures, &offsets, zones.as_deref());
-        // Summed kernels follow the whole distribution: no byte may stand for part of it.
+        // If kernels are summed, bytes may decide no cell: the sum has the whole distribution, not what bytes leave.
         let by_bytes = if parents.is_some() {
             &mixtures[..]
         } else {
@@ -181,7 +184,7 @@ impl Tables {
         }
     }
 
-    /// Eq. 2: the weight of each next state of a cell, by the states from its home on.
+    /// Computes eq. 2: the weight of each next state of a cell. `states` begins at the cell's home.
     fn weights(&self, home: usize, states: &[u8]) -> [f64; MAX_VALUES] {
         let zone = self.zones.as_ref().map_or(0, |zones| zones[home]);
         let of_zone = &self.kernels[usize::from(zone) * self.n_own..][..self.n_own];
@@ -201,7 +204,7 @@ impl Tables {
     }
 }
 
-/// What keys the bytes and the draws of a step.
+/// Returns the keys of the two generators of a step: for the bytes and for the draws.
 fn keys(seed: u64, n: u64) -> [u64; 2] {
     let mut rng = stream(seed, Purpose::Transition, n);
     [rng.next_u64(), rng.next_u64()]

@@ -1,4 +1,4 @@
-//! The model file in TOML, and the errors in one.
+//! The format of a model file in TOML, and its errors.
 
 use super::cell_map::CellMap;
 use super::grid::{Cell, Shape};
@@ -172,7 +172,7 @@ pub enum ModelError {
         got: usize,
     },
     /// Two entries have the same name.
-    #[error("model {model:?}: {what} name {name:?} stands twice")]
+    #[error("model {model:?}: {what} name {name:?} appears twice")]
     DuplicateName {
         /// The model's name.
         model: String,

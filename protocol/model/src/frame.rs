@@ -1,4 +1,4 @@
-//! A [`Frame`]: what a robot saw in one step, the masked observation `y ⊙ m` of paper eq. 11.
+//! A [`Frame`]: a robot's observations in one step, the masked observation `y ⊙ m` of paper eq. 11.
 
 use super::grid::{Grid, Shape};
 use ndarray::ArrayView2;
@@ -7,7 +7,7 @@ use thiserror::Error;
 /// The value of a cell that was not observed.
 pub const UNOBSERVED: u8 = 255;
 
-/// What part of the grid a frame claims to show.
+/// The part of the grid that a frame shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[repr(u32)]
@@ -22,22 +22,22 @@ pub enum Coverage {
 
 /// One observed value per cell, [`UNOBSERVED`] where the robot did not look.
 ///
-/// Values are below the model's number of observations; decoding checks it, so that a `Frame` may
-/// index a likelihood table.
+/// Values are below the model's number of observations O. Decoding checks this, so that a `Frame` can index a
+/// likelihood table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Frame {
     values: Grid<u8>,
 }
 
-/// Bytes that are no frame of the expected grid.
+/// The error for bytes that are not a frame of the expected grid.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum FrameError {
     /// Wrong number of bytes.
     #[error("frame: expected {expected} bytes for a {shape} grid, got {got}")]
     Length {
-        /// Bytes the grid needs.
+        /// Number of bytes of a frame of the grid.
         expected: usize,
-        /// Bytes received.
+        /// Number of bytes received.
         got: usize,
         /// The grid.
         shape: Shape,
@@ -57,17 +57,17 @@ pub enum FrameError {
 }
 
 impl Frame {
-    /// A frame in which nothing was observed.
+    /// Makes a frame in which nothing was observed.
     pub fn empty(shape: Shape) -> Self {
         Self {
             values: Grid::from_elem(shape.dim(), UNOBSERVED),
         }
     }
 
-    /// Decodes `H * W` row-major bytes, whole or not at all.
+    /// Decodes `H * W` row-major bytes. Accepts all of them or none.
     ///
     /// # Errors
-    /// [`FrameError`] for a wrong length or a value that is no observation.
+    /// [`FrameError`] for a wrong length or a value that is not an observation.
     pub fn from_bytes(
         shape: Shape,
         n_observations: usize,
@@ -99,30 +99,31 @@ impl Frame {
         })
     }
 
-    /// The values, shape `[H, W]`.
+    /// Returns the values, shape `[H, W]`.
     pub fn values(&self) -> ArrayView2<'_, u8> {
         self.values.view()
     }
 
-    /// The values as `H * W` row-major bytes.
+    /// Returns the values as `H * W` row-major bytes.
     pub fn as_bytes(&self) -> &[u8] {
         self.values
             .as_slice()
             .expect("invariant: frames are row-major")
     }
 
-    /// Observed cells in row-major order: `(cell index, value)`.
+    /// Iterates over the observed cells in row-major order, as `(cell index, value)`.
     pub fn observed(&self) -> impl Iterator<Item = (usize, u8)> + '_ {
         let cells = self.as_bytes().iter().copied().enumerate();
         cells.filter(|&(_, value)| value != UNOBSERVED)
     }
 
-    /// Forgets every observation.
+    /// Marks every cell as unobserved.
     pub fn clear(&mut self) {
         self.values.fill(UNOBSERVED);
     }
 
-    /// Records one observation; `value` must be below the model's number of observations.
+    /// Records an observation of the cell at a row-major index. `value` must be below the model's number of
+    /// observations.
     pub fn observe(&mut self, index: usize, value: u8) {
         debug_assert_ne!(value, UNOBSERVED);
         self.values

@@ -1,4 +1,4 @@
-//! The grid every other module indexes: its [`Shape`], its [`Cell`]s and [`Grid`]s over it.
+//! The grid that every other module indexes: its [`Shape`], its [`Cell`]s, and [`Grid`]s of values over it.
 //!
 //! Cells are `[row, col]`, rows grow downward, storage is row-major.
 
@@ -11,10 +11,10 @@ pub type Grid<T> = Array2<T>;
 
 /// One probability per state and cell, shape `[S, H, W]`; sums to one over the first axis.
 ///
-/// Planar, so that the kernels of eq. 2 run over contiguous rows of one state.
+/// The states are the outer axis, so that the kernels of eq. 2 run over contiguous rows of one state.
 pub type Probabilities = Array3<f32>;
 
-/// Largest height and width: 4096, so that one frame stays below 16 MiB.
+/// Maximum height and width: 4096, so that one frame is at most 16 MiB.
 pub const MAX_SIDE: usize = 4096;
 
 /// Height and width of a grid, each in `1..=MAX_SIDE`.
@@ -34,7 +34,7 @@ pub struct Cell {
     pub col: usize,
 }
 
-/// A height or width outside `1..=MAX_SIDE`.
+/// The error for a height or width outside `1..=MAX_SIDE`.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("grid shape: expected height and width in 1..={MAX_SIDE}, got {height} x {width}")]
 pub struct ShapeError {
@@ -43,7 +43,7 @@ pub struct ShapeError {
 }
 
 impl Shape {
-    /// Checks both sides.
+    /// Checks both sides and makes a shape.
     ///
     /// # Errors
     /// [`ShapeError`] when a side is outside `1..=MAX_SIDE`.
@@ -56,33 +56,33 @@ impl Shape {
         }
     }
 
-    /// Number of rows.
+    /// Returns the number of rows.
     pub fn height(self) -> usize {
         self.height
     }
 
-    /// Number of columns.
+    /// Returns the number of columns.
     pub fn width(self) -> usize {
         self.width
     }
 
-    /// `H * W`.
+    /// Returns the number of cells, `H * W`.
     pub fn n_cells(self) -> usize {
         self.height * self.width
     }
 
-    /// Whether the cell lies on the grid.
+    /// Returns whether the cell lies on the grid.
     pub fn contains(self, cell: Cell) -> bool {
         cell.row < self.height && cell.col < self.width
     }
 
-    /// Row-major index of a cell on the grid, in `0..n_cells()`.
+    /// Returns the row-major index of a cell on the grid, in `0..n_cells()`.
     pub fn index(self, cell: Cell) -> usize {
         debug_assert!(self.contains(cell));
         cell.row * self.width + cell.col
     }
 
-    /// The cell at a row-major index.
+    /// Returns the cell at a row-major index.
     pub fn cell(self, index: usize) -> Cell {
         debug_assert!(index < self.n_cells());
         Cell {
@@ -91,7 +91,7 @@ impl Shape {
         }
     }
 
-    /// The cell in the middle (the lower right of the middle four on even sides).
+    /// Returns the cell in the middle (the lower right of the middle four on even sides).
     pub fn centre(self) -> Cell {
         Cell {
             row: self.height / 2,
@@ -99,7 +99,7 @@ impl Shape {
         }
     }
 
-    /// `(H, W)`, the shape of a [`Grid`].
+    /// Returns `(H, W)`, the shape of a [`Grid`].
     pub fn dim(self) -> (usize, usize) {
         (self.height, self.width)
     }

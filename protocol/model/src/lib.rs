@@ -1,8 +1,9 @@
-//! The hidden Markov model of the paper: its parameters, its mathematics, and what a robot does and sees.
+//! The hidden Markov model of the paper: its parameters, its mathematics, and a robot's moves and observations.
 //!
-//! Nothing here knows messages. [`grid`] is what every other file indexes; [`dynamics`] draws hidden states,
-//! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
-//! A [`task`] is a world with a name; [`built_in`] has those that ship. [`text`] reads settings and model files.
+//! This crate knows nothing of messages. All other modules index a [`grid`]. [`dynamics`] draws hidden states, and
+//! [`transition`] applies the same operator to beliefs. [`path`] and [`frame`] are a robot's moves and observations. A
+//! [`task`] is a world with a name, and [`built_in`] has the models, tasks and recorded states that ship with the
+//! programs. [`text`] reads settings and model files.
 
 mod airspace;
 pub mod built_in;

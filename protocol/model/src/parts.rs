@@ -4,7 +4,7 @@ use super::airspace::Airspace;
 use super::grid::Cell;
 use super::path::Move;
 
-/// The part of a cell that is in none.
+/// Marks a cell that is in no part.
 const NONE: u32 = u32::MAX;
 
 /// The free cells of an airspace by connected part. A robot never leaves the part in which it starts.
@@ -35,7 +35,7 @@ impl Parts {
         parts
     }
 
-    /// Adds the part of a cell: all that moves lead to.
+    /// Adds the part of a free cell: all cells that moves lead to from it.
     fn add(&mut self, airspace: &Airspace, first: Cell) {
         let (shape, part) = (airspace.shape(), self.sizes.len() as u32);
         let (mut reached, mut size) = (vec![first], 1);
@@ -53,24 +53,24 @@ impl Parts {
         self.sizes.push(size);
     }
 
-    /// Number of free cells.
+    /// Returns the number of free cells.
     pub fn n_free(&self) -> usize {
         self.sizes.iter().sum()
     }
 
-    /// Number of cells of the largest part.
+    /// Returns the number of cells of the largest part.
     pub fn n_largest(&self) -> usize {
         self.sizes.iter().copied().max().unwrap_or(0)
     }
 
-    /// Number of cells of the part of a free cell; 0 for a no-fly cell.
+    /// Returns the number of cells of a free cell's part, and 0 for a no-fly cell.
     pub fn n_around(&self, cell: Cell) -> usize {
         let part = self.of_cells[cell.row * self.width + cell.col];
         self.sizes.get(part as usize).copied().unwrap_or(0)
     }
 
-    /// The cells of random starts, by ascending row-major index: the largest part, the first of several. Empty if no move
-    /// leads out of any cell.
+    /// Returns the possible cells of random starts, by ascending row-major index: the largest part, or the first of
+    /// several largest. Empty if no move leads out of any cell.
     pub fn starts(&self) -> Vec<usize> {
         let n_largest = self.n_largest();
         let largest = self.sizes.iter().position(|&size| size == n_largest);

@@ -1,13 +1,13 @@
-//! Seeded random streams: one seed per world, one named stream per purpose.
+//! Seeded random streams: one seed per world, and one named stream per purpose.
 //!
-//! A stream is ChaCha8 with the key `seed (8 bytes, little endian) ‖ purpose (24 bytes, padded with
-//! zeros)` and the stream index as nonce, so any point of any stream is reached without running
-//! through what comes before. ChaCha is defined on integers alone: the same on every platform.
+//! A stream is ChaCha8 with the key `seed (8 bytes, little endian) ‖ purpose (24 bytes, padded with zeros)` and the
+//! stream index as nonce. So each stream can be generated without the streams before it. ChaCha uses only integers, so
+//! streams are the same on every platform.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-/// What a random stream is drawn for.
+/// The purpose of a random stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// The states at the start of burn-in.
@@ -16,7 +16,7 @@ pub enum Purpose {
     Transition,
     /// Sensor noise; indexed by the world's absolute step.
     Sensor,
-    /// The robot's start cell, where it is random.
+    /// The robot's start cell, if it is random.
     Start,
     /// The recorded step at which a recorded world begins.
     Offset,
@@ -24,19 +24,19 @@ pub enum Purpose {
     Planner,
     /// Worlds simulated to find a filter's first prior.
     Prior,
-    /// The order in which a learner replays what it has seen; indexed by lap.
+    /// The order in which a learner replays its data; indexed by pass.
     Learner,
-    /// The seed of the next episode, where a reset names none; indexed by episode.
+    /// The seed of the next episode if a reset gives none; indexed by episode.
     Episode,
-    /// A network's first weights; indexed by tensor.
+    /// A network's initial weights; indexed by tensor.
     Weights,
-    /// The channels that dropout takes; indexed by update.
+    /// The channels that dropout sets to zero; indexed by update.
     Dropout,
     /// The hidden vector at the start of a window or run; indexed by update.
     Hidden,
-    /// Which part of a replay is learnt from; indexed by update.
+    /// The samples that an update draws from a replay buffer; indexed by update.
     Replay,
-    /// A learnt policy's random actions; indexed by step.
+    /// A learned policy's random actions; indexed by step.
     Exploration,
 }
 
@@ -61,7 +61,7 @@ impl Purpose {
     }
 }
 
-/// The stream `index` for a purpose under a seed.
+/// Returns stream `index` of a purpose under a seed.
 pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());
@@ -72,8 +72,8 @@ pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     rng
 }
 
-/// Output `index` of the SplitMix64 generator seeded with `key` (Steele, Lea, Flood, OOPSLA 2014):
-/// random access by index for one multiply-xorshift chain, for noise that is read at few cells.
+/// Returns output `index` of the SplitMix64 generator seeded with `key` (Steele, Lea, Flood, OOPSLA 2014). Any index
+/// costs one multiply-xorshift chain, which suits noise that is read at few cells.
 pub fn split_mix(key: u64, index: u64) -> u64 {
     const GOLDEN_GAMMA: u64 = 0x9e37_79b9_7f4a_7c15;
     let z = key.wrapping_add(index.wrapping_add(1).wrapping_mul(GOLDEN_GAMMA));

@@ -1,4 +1,4 @@
-//! Tasks: worlds with a name, fixed completely, on which results can be compared.
+//! Tasks: named sets of worlds with completely fixed settings, on which results can be compared.
 
 use crate::built_in::{TASKS, listed, state_names};
 use crate::grid::Cell;
@@ -9,89 +9,90 @@ use std::ops::Range;
 use std::path::Path;
 use thiserror::Error;
 
-/// Most seeds of worlds that are compared on.
+/// Maximum number of test seeds.
 pub const MAX_SEEDS: u64 = 100_000;
 
-/// Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+/// The first seed of worlds for training. Lower seeds are for tests: nothing may be trained or tuned on them.
 pub const FIRST_TRAINING_SEED: u64 = 1000;
 
-/// The settings of a server that make a task's worlds, by their names there, and the seeds to test on.
+/// The server settings that define a task's worlds, by their names in `config/server.toml`, and the seeds to test on.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Task {
-    /// What was asked for: a built-in name, or the path of a file.
+    /// The built-in name or the path of the file that the task was loaded by.
     #[serde(skip)]
     pub source: String,
-    /// Its own name.
+    /// Name of the task.
     pub name: String,
-    /// A built-in model or a model file; empty where states were recorded.
+    /// A built-in model or a model file. Empty if the states were recorded.
     #[serde(default)]
     pub model: String,
-    /// Recorded states, built in or a file; empty where a model makes them.
+    /// Recorded states, built in or a file. Empty if a model simulates the worlds.
     #[serde(default)]
     pub states: String,
-    /// Whether seeds choose among the symmetries of the grid, too.
+    /// Whether seeds also choose among the symmetries of the grid.
     #[serde(default)]
     pub states_symmetries: bool,
-    /// Episodes begin at a recorded step of 0 to this.
+    /// The maximum recorded step at which an episode begins; the seed draws one from 0 to this.
     #[serde(default)]
     pub states_offset: u64,
-    /// Grid height in cells; 0 where states were recorded, which decide it.
+    /// Grid height in cells; 0 if the recorded states determine it.
     #[serde(default)]
     pub height: usize,
-    /// Grid width, likewise.
+    /// Grid width in cells; 0 if the recorded states determine it.
     #[serde(default)]
     pub width: usize,
-    /// Rows and columns that robots see beyond each cell of their path; -1: as the model says.
+    /// Number of rows and columns that robots see beyond each cell of their path; -1 for the model's sensor.
     #[serde(default = "as_model_says")]
     pub sensor_radius: i64,
-    /// Moves in a path.
+    /// Number of moves in a path.
     pub moves: usize,
-    /// Robots of each world.
+    /// Number of robots in each world.
     #[serde(default = "one")]
     pub robots: u32,
-    /// Steps simulated before k = 0.
+    /// Number of steps simulated before k = 0.
     #[serde(default)]
     pub burn_in: u64,
-    /// Where the robots begin.
+    /// The robots' first cells.
     #[serde(default)]
     pub start: Start,
-    /// Steps of an episode.
+    /// Number of steps in an episode.
     pub max_steps: u64,
     /// Seeds of the worlds to test on.
     pub test_seeds: Range<u64>,
-    /// How it is listed, if it is built in.
+    /// The entry in lists of the built-in tasks.
     #[serde(default)]
     pub listing: Option<Listing>,
 }
 
-/// What lists of the built-in tasks say of one.
+/// The entry of a built-in task in lists.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Listing {
-    /// Its place in lists.
+    /// Position in lists; smaller numbers come first.
     pub place: u32,
-    /// What the ids of its Python environments begin with.
+    /// Prefix of the ids of the task's Python environments.
     pub ids: String,
 }
 
-/// Where the robots of a world are after a reset.
+/// The robots' cells after a reset.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Start {
-    /// The corners (0, 0), the opposite one, upper right, lower left; then the middles of the sides; and again.
+    /// The corners, in the order (0, 0), opposite, upper right, lower left. Further robots start at the middles of the
+    /// sides, then at the corners again.
     #[default]
     Corner,
-    /// All in the middle.
+    /// All robots in the middle.
     Centre,
-    /// Cells drawn from the seed.
+    /// Cells drawn from the world's seed.
     Random,
-    /// All in this cell.
+    /// All robots in this cell.
     #[serde(untagged)]
     At(Cell),
 }
 
-/// A task that is refused.
+/// The error for a task that cannot be loaded.
 #[derive(Debug, Error)]
 #[error("task {task}: {problem}")]
 pub struct TaskError {
@@ -100,15 +101,15 @@ pub struct TaskError {
 }
 
 impl Task {
-    /// The radius of the sensor, if it is not as the model says.
+    /// Returns the radius of the sensor, unless it is the model's.
     pub fn radius(&self) -> Option<usize> {
         self.sensor_radius.try_into().ok()
     }
 
-    /// The built-in task of a name, or that of a file.
+    /// Loads the built-in task with this name, or the task file at this path.
     ///
     /// # Errors
-    /// If there is no such file, or it is no task.
+    /// If there is no such task or file, or the file is not a valid task.
     pub fn named(name: &str) -> Result<Self, TaskError> {
         let read = match TASKS.iter().find(|(known, _)| *known == name) {
             Some((_, text)) => Self::from_toml(text),
@@ -125,12 +126,12 @@ impl Task {
         })
     }
 
-    /// The names of the built-in tasks.
+    /// Lists the names of the built-in tasks.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
         Self::built_in_files().map(|(name, _)| name)
     }
 
-    /// The built-in tasks in the order of their places: name, and text of the file.
+    /// Lists the built-in tasks by their position in lists: the name, and the text of the file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
         let mut files = TASKS.to_vec();
         files.sort_by_cached_key(|(_, text)| {
@@ -141,7 +142,7 @@ impl Task {
         files.into_iter()
     }
 
-    /// Whether its hidden states were recorded.
+    /// Returns whether the hidden states were recorded.
     pub fn is_recorded(&self) -> bool {
         !self.states.is_empty()
     }
@@ -165,7 +166,7 @@ impl Task {
         let same_name = TASKS.iter().find(|(name, _)| *name == task.name);
         if same_name.is_some_and(|(_, text)| unlisted(text).as_ref() != Ok(&task)) {
             return Err(format!(
-                "name: expected one of its own, got {}, which is built in",
+                "name: expected a name that no built-in task has, got {}",
                 task.name
             ));
         }
@@ -182,7 +183,7 @@ impl Task {
             }
             if is_built_in {
                 return Err(format!(
-                    "{setting}: expected a file with a name of its own, got {file}, which is built in (./{file} is the file)"
+                    "{setting}: expected a file whose name is not a built-in one, got {file}: rename it, or write ./{file}"
                 ));
             }
             check_kind(&beside).map_err(|problem| format!("{setting}: {problem}"))?;
@@ -197,7 +198,7 @@ impl Task {
         Ok(task)
     }
 
-    /// Checks what the server cannot: it takes a setting that is not given for its default.
+    /// Checks what the server cannot, because a server replaces a missing setting by its default.
     fn check(&self) -> Result<(), String> {
         let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
             Err(format!("{setting}: expected {expected}, got {got}"))
@@ -211,7 +212,7 @@ impl Task {
         }
         if self.model.is_empty() != self.is_recorded() {
             let got = format!("{:?} and {:?}", self.model, self.states);
-            return needs("model and states", "one of them", &got);
+            return needs("model and states", "exactly one of them", &got);
         }
         let simulated = [
             ("height", self.height as u64),
@@ -220,7 +221,7 @@ impl Task {
         ];
         for (setting, got) in simulated.into_iter().filter(|_| self.is_recorded()) {
             if got != 0 {
-                return needs(setting, "none beside states, which decide it", &got);
+                return needs(setting, "0, because the states determine it", &got);
             }
         }
         if self.max_steps == 0 {
@@ -234,7 +235,7 @@ impl Task {
     }
 }
 
-/// Refuses pipes and devices, which may keep a reader waiting and cannot be read twice.
+/// Rejects pipes and devices: reading one may block, and it cannot be read twice.
 fn check_kind(path: &Path) -> Result<(), String> {
     match path.metadata() {
         Ok(found) if !found.is_file() && !found.is_dir() => Err(format!(
@@ -245,7 +246,7 @@ fn check_kind(path: &Path) -> Result<(), String> {
     }
 }
 
-/// Whether a name can be that of a file anywhere: 1 to 64 letters, digits, hyphens, underscores and dots within.
+/// Returns whether a name is safe as a file name: 1 to 64 letters, digits, `-`, `_` and `.`, not starting with a dot.
 pub fn is_file_name(name: &str) -> bool {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     (1..=64).contains(&name.len()) && name.bytes().all(is_plain) && !name.starts_with('.')
@@ -282,13 +283,13 @@ mod tests {
         assert!(places.is_sorted_by(|a, b| a < b), "{places:?}");
     }
 
-    /// A built-in task, what replaces a part of it, and what is said then.
+    /// Built-in task => part of its file => replacement => part of the error.
     const WRONG: &str = r#"
 small => height => heigth => unknown field `heigth`
 small => moves = 16 =>  => missing field `moves`
-small => model => states = "a.npz", model => model and states: expected one
-jacksboro => moves = 64 => moves = 64, height = 3 => height: expected none
-jacksboro => moves = 64 => moves = 64, burn_in = 3 => burn_in: expected none
+small => model => states = "a.npz", model => model and states: expected exactly one
+jacksboro => moves = 64 => moves = 64, height = 3 => height: expected 0, because
+jacksboro => moves = 64 => moves = 64, burn_in = 3 => burn_in: expected 0, because
 small => max_steps = 300 => max_steps = 0 => max_steps: expected at least 1, got 0
 small => name = "small" => name = "" => name: expected 1 to 64
 small => name = "small" => name = "../small" => name: expected 1 to 64

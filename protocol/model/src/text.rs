@@ -4,13 +4,13 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
+/// Maximum size of a settings or model file in bytes. A model of 64 states with kernels of 15 x 15 cells has 5 MB.
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
 
-/// The text of a settings or model file, which may be a pipe but not endless.
+/// Reads the text of a settings or model file. The file may be a pipe.
 ///
 /// # Errors
-/// If the file cannot be read, is too long, or is not UTF-8.
+/// If the file cannot be read, is larger than [`MAX_TEXT_BYTES`], or is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let mut bytes = Vec::new();
     let mut file = File::open(path)?.take(MAX_TEXT_BYTES + 1);
@@ -21,7 +21,7 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
     decoded(&bytes).map_err(std::io::Error::other)
 }
 
-/// Text without its byte order mark, which editors on Windows write.
+/// Decodes UTF-8 without the byte order mark, which editors on Windows write.
 fn decoded(bytes: &[u8]) -> Result<String, String> {
     let begins_wide = bytes
         .iter()

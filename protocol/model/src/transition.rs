@@ -1,8 +1,8 @@
 //! The transition operator `Phi` on beliefs: the predictor `u_{k+1} = Phi(p_k)` of paper eqs. 2-4.
 //!
 //! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` with `(A, C)` the centre of the
-//! kernel (eq. 2: a cross-correlation, not a flipped convolution). Outside the grid `x` is zero, or certain of the
-//! model's `edge` state. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the same
+//! kernel (eq. 2: a cross-correlation, not a flipped convolution). Outside the grid `x` is 1 for the model's `edge`
+//! state and 0 otherwise. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the same
 //! operator.
 //!
 //! If the kernels depend on the cell's own state `o`, `phi[m | o]` has the weights of `o`, and the cell at the centre
@@ -14,8 +14,8 @@
 //! `tests/model/models.rs` computes these sums directly, and `transition.rs` there compares them for random models and
 //! grids.
 //!
-//! Two optimisations keep the results. The belief is copied into planes with a margin, so that all cells are computed
-//! alike and many at once. And the beliefs of taps with equal weights are added before they are multiplied
+//! Two optimisations leave the results unchanged. The belief is copied into planes with a margin, so that all cells are
+//! computed alike and many at once. And the beliefs at taps with equal weights are added before they are multiplied
 //! (`rows.rs`). Every lane does the same operations in the same order and none is fused, so results are bit-identical
 //! on every platform.
 
@@ -32,15 +32,15 @@ use ndarray::{Array3, Array4, NdFloat};
 use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
 use std::sync::Arc;
 
-/// The operator `Phi` for one model on one grid, with its work space. Each thread needs a clone.
+/// The operator `Phi` for one model on one grid, with its buffers. Each thread needs a clone.
 ///
-/// Programs use `f32`, and tests also `f64`.
+/// The programs use `f32`; tests also use `f64`.
 #[derive(Debug, Clone)]
 pub struct Transition<T = f32> {
     shape: Shape,
     n_states: usize,
     layout: Layout,
-    /// Groups of taps with equal weights. Each tap is a distance from a cell's place in `planes`.
+    /// Groups of taps with equal weights. Each tap is an offset from a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
     /// The weights that differ between zones.
@@ -81,7 +81,8 @@ impl<T: NdFloat> Transition<T> {
         Self::on_land(kernels, bias, shape, (None, 1))
     }
 
-    /// Like [`Self::of_weights`], with kernels for each zone. The map has the zone of each cell, shape `[H, W]`.
+    /// Lays out weights like [`Self::of_weights`], with kernels for each zone. The map has the zone of each cell, shape
+    /// `[H, W]`.
     fn on_land(
         kernels: &[Array4<f64>],
         bias: &[f64],
@@ -156,7 +157,7 @@ impl<T: NdFloat> Transition<T> {
     }
 
     /// Computes eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
-    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
+    #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
     fn weigh(&mut self, at: usize, chunk: usize) {
         let slots = self.slots.of_chunk(chunk);
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
@@ -208,7 +209,7 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Returns about how many bytes of memory it takes: the belief with margins, and work space.
+    /// Returns the approximate memory in bytes: the belief with margins, and the buffers.
     pub fn memory_bytes(&self) -> usize {
         let n_lanes = self.sums.len() + self.weights.len() + self.own_weights.len();
         let work = n_lanes * size_of::<[T; LANES]>();

@@ -4,17 +4,17 @@ use super::grid::Grid;
 use super::vectors::LANES;
 use std::collections::HashMap;
 
-/// Numbers that each cell has by its zone, such as the weights of its kernel.
+/// Numbers that each cell has according to its zone, such as the weights of its kernel.
 ///
 /// A *chunk* is [`LANES`] consecutive cells of a row. Chunks are counted row by row; the last one of a row may be
 /// shorter. Chunks with the same zones share their numbers.
 #[derive(Debug, Clone)]
 pub struct ZonedNumbers<T> {
-    /// Count of numbers per cell.
+    /// Number of values per cell.
     n_numbers: usize,
     /// For each chunk, the index of its pattern of zones. Empty if all chunks have the same pattern.
     patterns: Vec<u32>,
-    /// For each pattern, each number of its cells.
+    /// For each pattern, the lanes of each number.
     lanes: Vec<[T; LANES]>,
 }
 

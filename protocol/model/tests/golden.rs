@@ -1,4 +1,4 @@
-//! Against vectors made by the authors' unmodified PyTorch code (`tests/data`): the operator `Phi`, the
+//! Comparison with vectors made by the authors' unmodified PyTorch code (`tests/data`): the operator `Phi`, the
 //! observation matrix, the reward and flown paths.
 
 use emberwatch_model::path::fly;
@@ -24,7 +24,7 @@ fn array<T: ReadableElement, D: ndarray::Dimension>(
 #[test]
 fn the_wildfire_is_the_authors() {
     let model = Model::wildfire();
-    // Theirs is f32: equal up to its rounding.
+    // The authors' kernel is f32: equal up to its rounding.
     let reference: Array4<f32> = array(&mut npz("a1_transition.npz"), "kernel");
     for (ours, theirs) in model.kernel().iter().zip(&reference) {
         let bound = 1.2e-7 * ours.abs();
@@ -45,7 +45,7 @@ fn the_wildfire_is_the_authors() {
     assert_eq!(model.target_state(), 2);
 }
 
-/// Compares `Phi` of states and of beliefs with the reference.
+/// Compares `Phi` of states and of beliefs with the reference, for some grid sizes.
 fn check_phi<T: NdFloat + ReadableElement>(model: &Model, sizes: &[&str], end: &str, bound: f64) {
     let mut file = npz("a1_transition.npz");
     let number = |it: f64| T::from(it).expect("a number");
@@ -75,8 +75,8 @@ fn check_phi<T: NdFloat + ReadableElement>(model: &Model, sizes: &[&str], end: &
 #[test]
 fn phi_matches_the_reference_on_states_and_beliefs() {
     let mut sizes = vec!["1x1", "2x2", "3x3", "5x5", "4x7", "1x6"];
-    // Double precision with the reference's own kernel, which is converted from f32: the exact parameters miss it by
-    // 6e-9.
+    // In double precision, use the reference's own kernel, which was converted from f32: the exact parameters differ
+    // from it by 6e-9.
     let mut file = Model::wildfire().file().clone();
     let kernel: Array4<f32> = array(&mut npz("a1_transition.npz"), "kernel");
     for entry in &mut file.kernel {

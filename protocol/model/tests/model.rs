@@ -1,5 +1,5 @@
-//! The model's mathematics against its formulas and the authors' worlds. All seeds are fixed: a test passes always or
-//! never.
+//! The model's mathematics, compared with its formulas and with the authors' worlds. All seeds are fixed, so a test
+//! always passes or always fails.
 
 mod airspace;
 mod dynamics;

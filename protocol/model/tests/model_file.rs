@@ -1,4 +1,4 @@
-//! docs/model-file.md: its examples are models, and it names every key with its limits.
+//! docs/model-file.md: the examples are valid models, and the page names every key and its limits.
 
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::text::MAX_TEXT_BYTES;
@@ -14,7 +14,7 @@ fn examples(page: &'static str) -> impl Iterator<Item = &'static str> {
     begun.map(|rest| rest.split_once("```").expect("its end").0)
 }
 
-/// The keys of a table and of the tables in it; those below are named with what they are of.
+/// Returns the keys of a table and of its nested tables. Nested keys are prefixed with the key of their table.
 fn keys(of: &str, table: &Table) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for (key, value) in table {

@@ -1,7 +1,7 @@
-//! The channel `agent`: the beliefs that agents publish, for displays.
+//! The channel `agent`: the beliefs that agents publish for displays.
 //!
-//! An agent has a [`BeliefPublisher`], which costs next to nothing without readers. A reader gets an [`AgentBelief`]
-//! from each sample.
+//! An agent has a [`BeliefPublisher`], which costs almost nothing without readers. A reader decodes each sample to an
+//! [`AgentBelief`].
 
 use super::channels::{
     AGENT_BUFFER, AgentService, ChannelError, Entries, Instance, Ipc, MAX_AGENT_READERS, Services,
@@ -32,14 +32,14 @@ pub struct BeliefPublisher {
 struct Ports {
     service: AgentService,
     memory: MessageMemory,
-    /// Length of a sample for which there is memory.
+    /// Size of a sample that memory is allocated for, in bytes.
     n_bytes: usize,
     publisher: Publisher<Ipc, [u8], WireHeader<AgentHeader>>,
     _node: Node<Ipc>,
 }
 
 impl BeliefPublisher {
-    /// Opens the channel; `n_bytes` is the length of a sample, which may grow.
+    /// Opens the channel. `n_bytes` is the size of a sample in bytes, which may grow.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many agents.
@@ -78,16 +78,17 @@ impl BeliefPublisher {
         })
     }
 
-    /// Whether there are readers, or its files were removed, so that there can be none.
+    /// Returns whether there are readers. Also true if the channel's files were removed, so that readers cannot find
+    /// it.
     pub fn is_watched(&self) -> bool {
         self.ports.check().is_err()
             || self.ports.service.dynamic_config().number_of_subscribers() > 0
     }
 
-    /// Publishes a belief of shape `[S, H, W]`; the header needs world, episode, step and seed.
+    /// Publishes a belief of shape `[S, H, W]`. `about` needs the world, robots, episode, step and seed.
     ///
     /// # Errors
-    /// If iceoryx2 cannot publish it, or its files were removed.
+    /// If iceoryx2 cannot publish it, or the channel's files were removed.
     pub fn show(
         &mut self,
         about: AgentHeader,
@@ -102,7 +103,7 @@ impl BeliefPublisher {
             let n_readers = self.ports.service.dynamic_config().number_of_subscribers();
             self.ports.memory.make_ready(n_messages(n_readers))?;
         } else {
-            check_room_for_ports(n_bytes)?; // It will be in a new file.
+            check_room_for_ports(n_bytes)?; // The sample needs a new file.
         }
         let mut sample = self
             .ports
@@ -129,7 +130,8 @@ impl BeliefPublisher {
     }
 }
 
-/// Samples in use at a time with so many readers: a buffer and one that is read for each, the last and the next.
+/// Returns the number of samples in use at a time: for each reader a buffer and one being read, and the last and the
+/// next.
 fn n_messages(n_readers: usize) -> usize {
     n_readers * (AGENT_BUFFER + 1) + 2
 }

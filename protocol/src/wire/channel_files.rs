@@ -1,8 +1,8 @@
-//! The files behind channels, and what they say: which node, port or service each is of, whether its process lives,
-//! whether it is finished.
+//! The files of channels, and what they reveal: the node, port or service that each belongs to, whether its process
+//! lives, and whether the file is finished.
 //!
-//! iceoryx2 puts nodes and services into a directory and segments of memory beside it. A port's id says which process
-//! began it, and when.
+//! iceoryx2 stores nodes and services in a directory, and memory segments next to it. A port's id contains the process
+//! that created it, and the time.
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::ipc::Ipc;
@@ -20,17 +20,18 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// What is younger and of a living process may be in the making, by a client that takes no turns.
+/// Minimum age of leftovers of a living process. Younger files may still be in creation, by a client that takes no
+/// turns.
 const MAKING: Duration = Duration::from_secs(1);
 
-/// Where channels' files are, and what their names begin with.
+/// The folders of channel files, and the prefix of their names.
 pub(super) struct ChannelFiles {
     pub(super) root: PathBuf,
     pub(super) shared: PathBuf,
     pub(super) prefix: String,
 }
 
-/// What living nodes use: ids of their ports and services, hashes of the services' names.
+/// The ids of the ports and services of living nodes, and the hashes of the services' names.
 #[derive(Debug, Default)]
 pub(super) struct Used {
     pub(super) ids: HashSet<u128>,
@@ -55,8 +56,8 @@ impl ChannelFiles {
         Ok(None)
     }
 
-    /// A segment can be read only when it is finished. A living port's memory grows without a turn, and is not opened
-    /// before.
+    /// Returns whether a segment is unfinished: it is empty, or not yet readable. The memory of a living port grows
+    /// without a turn and is opened only when it is finished, so it does not count.
     pub(super) fn is_unfinished(&self, segment: &Path) -> Result<bool, Error> {
         let unfinished = |found: Metadata| found.len() == 0 || found.mode() & 0o400 == 0;
         let grows =
@@ -79,7 +80,7 @@ impl ChannelFiles {
         self.root.join("nodes").join(node.to_string())
     }
 
-    /// What a node's folder has finished tags of one kind for.
+    /// Returns the finished tags of one kind in a node's folder.
     pub(super) fn tags(&self, node: u128, suffix: &str) -> Result<HashSet<String>, Error> {
         let mut tags = HashSet::new();
         for path in entries(&self.folder(node))? {
@@ -96,7 +97,7 @@ impl ChannelFiles {
         Ok(tags)
     }
 
-    /// The ids of services in use, as their files say.
+    /// Returns the ids of the services in use, from their files.
     pub(super) fn service_ids(&self, used: &Used) -> Result<HashSet<u128>, Error> {
         let mut ids = HashSet::new();
         for path in entries(&self.root.join("services"))? {
@@ -118,19 +119,20 @@ impl ChannelFiles {
         Some(hash.to_owned())
     }
 
-    /// The ids in the name of a segment, `<prefix><hash>_<id>[_<id>].<kind>`, or a socket, `<prefix><id>.event`.
+    /// Returns the ids in the name of a segment, `<prefix><hash>_<id>[_<id>].<kind>`, or of a socket,
+    /// `<prefix><id>.event`.
     pub(super) fn ids(&self, path: &Path) -> Vec<u128> {
         let name = name(path);
         let stem = name
             .strip_prefix(&self.prefix)
             .and_then(|name| name.split_once('.'));
         let words = stem.map_or("", |(stem, _)| stem).split('_');
-        // The segments of one port are numbered.
+        // Short numbers are the numbers of a port's segments.
         let ids = words.filter(|word| word.len() > 10);
         ids.filter_map(|word| word.parse().ok()).collect()
     }
 
-    /// The id of the node that a folder, or a file beside it, is of.
+    /// Returns the id of the node of a folder, or of a file next to it.
     pub(super) fn node(&self, path: &Path) -> Option<u128> {
         let name = name(path);
         let monitor = name.strip_prefix(&self.prefix);
@@ -149,7 +151,7 @@ impl ChannelFiles {
     }
 }
 
-/// Ids of living nodes, and dead nodes.
+/// Returns the ids of living nodes, and the dead nodes.
 pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<Ipc>>), Error> {
     let (mut living, mut unclear, mut dead) = (HashSet::new(), Vec::new(), Vec::new());
     let sort = |state| {
@@ -157,7 +159,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
             NodeState::Alive(node) => _ = living.insert(node.id().value()),
             NodeState::Inaccessible(id) => _ = living.insert(id.value()),
             NodeState::Dead(node) => dead.push(node),
-            // Its process died while it started, or its files cannot be read.
+            // The process died while it started, or the files cannot be read.
             NodeState::Undefined(id) => unclear.push(id.value()),
         }
         CallbackProgression::Continue
@@ -172,10 +174,11 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
     Ok((living, dead))
 }
 
-/// Whether a node lives in another PID namespace: the process that holds its lock has another number here, or none.
+/// Returns whether a node lives in another PID namespace: the process that holds its lock has another number here, or
+/// none.
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
-    // The lock of a node of this process would end if its file were opened and closed here.
+    // Opening and closing the file here would release the lock of a node of this process.
     if own_nodes::has(node) {
         return false;
     }
@@ -191,14 +194,15 @@ fn service_id(text: &str) -> Option<u128> {
     Some(half("unique_value")? << 64 | half("payload_value")?)
 }
 
-/// Whether what an id stands for may be in the making: an id has the time when, and the process that, began it.
+/// Returns whether the object with this id may still be in creation. An id contains the time, and the process that
+/// began it.
 pub(super) fn is_in_the_making(id: u128) -> Result<bool, Error> {
     let (seconds, nanos) = (id as u32, (id >> 32) as u32);
     let age = since_boot().saturating_sub(Duration::new(seconds.into(), nanos));
     Ok(age < MAKING && lives(id)?)
 }
 
-/// Whether the process that began an id lives, or another one of its number.
+/// Returns whether the process that created an id lives, or another process with its number.
 pub(super) fn lives(id: u128) -> Result<bool, Error> {
     Ok(!matches!(
         process_state(node_pid(id))?,
@@ -206,13 +210,13 @@ pub(super) fn lives(id: u128) -> Result<bool, Error> {
     ))
 }
 
-/// The clock of ids.
+/// Returns the time of the clock that ids use.
 pub(super) fn since_boot() -> Duration {
     let now = clock_gettime(ClockId::Monotonic);
     Duration::new(now.tv_sec as u64, now.tv_nsec as u32)
 }
 
-/// A tag, or a node's details, can be written to until it is finished.
+/// Returns whether a file is writable, as a tag or a node's details are until they are finished.
 pub(super) fn is_writable(file: &Path) -> Result<bool, Error> {
     Ok(metadata(file)?.is_some_and(|found| found.mode() & 0o200 != 0))
 }
@@ -228,8 +232,8 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     }
 }
 
-/// The version of the protocol in which a channel of an instance exists, if in another than ours. Of the files themselves:
-/// iceoryx2 would open each service, and may wait for one without end.
+/// Returns the protocol version of a channel of an instance, if it is not ours. Reads the files directly, because
+/// iceoryx2 would open each service, and could wait for one forever.
 pub(super) fn other_version(instance: &str, channel: &str) -> Option<u32> {
     let end = format!("/{instance}/{channel}\"");
     let version = |text: &str| {

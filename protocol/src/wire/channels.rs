@@ -1,7 +1,7 @@
-//! The channels of one instance: names, services and their limits.
+//! The channels of one instance: names, services and limits.
 //!
-//! All channels of an instance live under `emberwatch/v2/<instance>/`, in a directory and under a
-//! prefix of the user's own, so that users never meet and no stray configuration file is read.
+//! All channels of an instance are under `emberwatch/v2/<instance>/`. Each user has a separate directory and prefix, so
+//! that users never collide and no stray configuration file is read.
 
 use super::channel_files::other_version;
 use emberwatch_messages::message::{
@@ -28,28 +28,28 @@ pub use emberwatch_messages::capacity::{
 pub use emberwatch_messages::errors::ChannelError;
 pub use emberwatch_messages::instance::Instance;
 
-/// Most observers of `frames` at a time.
+/// Maximum number of observers of `frames` at a time.
 pub const MAX_OBSERVERS: usize = 16;
 
-/// Most readers of `truth` at a time.
+/// Maximum number of readers of `truth` at a time.
 pub const MAX_TRUTH_READERS: usize = 4;
 
-/// Frames that an observer may fall behind before it loses the oldest.
+/// Number of frames that an observer may be behind before it loses the oldest.
 pub const FRAME_BUFFER: usize = 64;
 
-/// Hidden states that a reader may fall behind: a batch of this many worlds is never lost.
+/// Number of hidden states that a reader may be behind: a batch of this many worlds is never lost.
 pub const TRUTH_BUFFER: usize = 128;
 
-/// Most readers of `agent` at a time.
+/// Maximum number of readers of `agent` at a time.
 pub const MAX_AGENT_READERS: usize = 4;
 
-/// Beliefs that a reader may fall behind before it loses the oldest: pictures want the newest only.
+/// Number of beliefs that a reader may be behind before it loses the oldest. Pictures need only the newest.
 pub const AGENT_BUFFER: usize = 4;
 
-/// Most processes attached to an instance at a time.
+/// Maximum number of processes attached to an instance at a time.
 pub const MAX_NODES: usize = 64;
 
-/// A request-response service of bytes behind headers `Q` and `R`.
+/// A request-response service of bytes with headers `Q` and `R`.
 pub type RequestResponse<Q, R> =
     request_response::PortFactory<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
@@ -59,7 +59,7 @@ pub type StepService = RequestResponse<StepRequest, StepReply>;
 /// The `control` service.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
-/// A publish-subscribe service of bytes behind header `H`.
+/// A publish-subscribe service of bytes with header `H`.
 pub type Publications<H> = publish_subscribe::PortFactory<Ipc, [u8], WireHeader<H>>;
 
 /// The `frames` service.
@@ -79,13 +79,13 @@ pub type WakeService = event::PortFactory<Ipc>;
 pub enum Channel {
     /// Steps, request-response.
     Step,
-    /// Everything rare, request-response.
+    /// Rarer requests, request-response.
     Control,
-    /// What robots saw, publish-subscribe.
+    /// Frames of the robots, publish-subscribe.
     Frames,
     /// Hidden states, publish-subscribe.
     Truth,
-    /// What agents believe, publish-subscribe.
+    /// Beliefs of agents, publish-subscribe.
     Agent,
     /// Wakes the server, event.
     WakeServer,
@@ -107,13 +107,13 @@ impl Channel {
     }
 }
 
-/// The service name of a channel.
+/// Returns the service name of a channel.
 pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
     let name = format!("emberwatch/v2/{}/{}", instance.name(), channel.name());
     ServiceName::new(&name).expect("invariant: instance names are short and plain")
 }
 
-/// The error for a channel that does not exist in this version of the protocol.
+/// Returns the error for a channel that does not exist in this protocol version.
 fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     match other_version(instance.name(), channel.name()) {
         Some(version) => ChannelError::OtherVersion { version },
@@ -121,7 +121,7 @@ fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     }
 }
 
-/// Opens, or creates with its limits, each service of an instance.
+/// The services of an instance, which its methods open or create with their limits.
 pub struct Services<'a> {
     /// The process's node.
     pub node: &'a Node<Ipc>,
@@ -130,69 +130,69 @@ pub struct Services<'a> {
 }
 
 impl Services<'_> {
-    /// The `step` service, created if need be; for the server.
+    /// Opens the `step` service, or creates it; for the server.
     ///
     /// # Errors
-    /// If iceoryx2 cannot make it, also because old clients hold a service of other limits.
+    /// If iceoryx2 cannot create it, for example because old clients hold a service with other limits.
     pub fn create_step(&self) -> Result<StepService, ChannelError> {
         self.create(Channel::Step)
     }
 
-    /// The `control` service, created if need be; for the server.
+    /// Opens the `control` service, or creates it; for the server.
     ///
     /// # Errors
-    /// As [`Self::create_step`].
+    /// Like [`Self::create_step`].
     pub fn create_control(&self) -> Result<ControlService, ChannelError> {
         self.create(Channel::Control)
     }
 
-    /// The `step` service of a running server.
+    /// Opens the `step` service of a running server.
     ///
     /// # Errors
-    /// If there is none.
+    /// If no server is running.
     pub fn open_step(&self) -> Result<StepService, ChannelError> {
         self.open(Channel::Step)
     }
 
-    /// The `control` service of a running server.
+    /// Opens the `control` service of a running server.
     ///
     /// # Errors
-    /// If there is none.
+    /// If no server is running.
     pub fn open_control(&self) -> Result<ControlService, ChannelError> {
         self.open(Channel::Control)
     }
 
-    /// The `frames` service; observers may create it before the server starts.
+    /// Opens or creates the `frames` service. Observers may create it before the server starts.
     ///
     /// # Errors
-    /// If iceoryx2 can neither open nor make it.
+    /// If iceoryx2 can neither open nor create it.
     pub fn frames(&self) -> Result<FrameService, ChannelError> {
         self.publications(Channel::Frames, 1, MAX_OBSERVERS, FRAME_BUFFER)
             .map_err(ipc_error("open the frames channel"))
     }
 
-    /// The `truth` service; for evaluation and pictures, never for learners.
+    /// Opens or creates the `truth` service, for evaluation and pictures, never for learners.
     ///
     /// # Errors
-    /// If iceoryx2 can neither open nor make it.
+    /// If iceoryx2 can neither open nor create it.
     pub fn truth(&self) -> Result<TruthService, ChannelError> {
         self.publications(Channel::Truth, 1, MAX_TRUTH_READERS, TRUTH_BUFFER)
             .map_err(ipc_error("open the truth channel"))
     }
 
-    /// The `agent` service, which agents and readers create alike.
+    /// Opens or creates the `agent` service. Both agents and readers may create it.
     ///
     /// # Errors
-    /// If iceoryx2 can neither open nor make it.
+    /// If iceoryx2 can neither open nor create it.
     pub fn agent(&self) -> Result<AgentService, ChannelError> {
         self.publications(Channel::Agent, MAX_CLIENTS, MAX_AGENT_READERS, AGENT_BUFFER)
             .map_err(ipc_error("open the agent channel"))
     }
 
-    /// A wake service.
+    /// Opens or creates a wake service.
     ///
     /// # Errors
-    /// If iceoryx2 can neither open nor make it.
+    /// If iceoryx2 can neither open nor create it.
     pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
         let builder = self
             .node
@@ -207,13 +207,13 @@ impl Services<'_> {
             .map_err(ipc_error("open a wake channel"))
     }
 
-    /// A listener on a wake service.
+    /// Creates a listener on a wake service.
     ///
     /// # Errors
-    /// If iceoryx2 can neither open nor make it.
+    /// If iceoryx2 can neither open nor create it.
     pub fn listener(&self, channel: Channel) -> Result<Listener<Ipc>, ChannelError> {
-        // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket: of two
-        // threads at once, the second would put back what the first had changed it to, for good.
+        // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket. If two threads did this at
+        // once, the second would restore the umask that the first had set, permanently.
         static BINDING: Mutex<()> = Mutex::new(());
         let wake = self.wake(channel)?;
         let _alone = BINDING.lock().unwrap_or_else(PoisonError::into_inner);
@@ -298,7 +298,7 @@ impl Services<'_> {
     }
 }
 
-/// The node of the service's server, running or dead.
+/// Returns the node of the service's server, running or dead.
 pub(crate) fn server_node<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<u128> {
     let mut node = None;
     service.dynamic_config().list_servers(|server| {

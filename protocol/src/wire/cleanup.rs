@@ -1,8 +1,26 @@
-//! Removes the files of dead processes, which may have died at any instruction, also while they started or ended.
+//! Removes the files of dead processes, which may have died at any instruction, even while they started or ended.
 //!
-//! During a [`Turn`] no other process makes or removes anything, so every file is one of three: part of a node whose
-//! process lives, of a service that such a node uses, or left over. iceoryx2 itself removes dead nodes from services that
-//! live on; it cannot remove what was never finished, and it waits without end for an empty segment to become larger.
+//! During a [`Turn`] no other process creates or removes anything. So every file either belongs to a node whose process
+//! lives, or to a service that such a node uses, or it is left over. iceoryx2 itself removes dead nodes from services
+//! that are still in use. But it cannot remove unfinished files, and it waits forever for an empty segment to grow.
+//!
+//! Names of files:
+//!
+//! - A node's folder `nodes/<id>/` has a finished `.port_tag` and `.service_tag` for each of its ports and services
+//!   before these exist.
+//! - Segments are `<prefix><hash>_<id>[_<id>].<kind>`, sockets `<prefix><id>.event`. A hash has letters or at least 40
+//!   digits; an id has at most 39 decimal digits. The low three 32-bit words of an id are seconds and nanoseconds of
+//!   `CLOCK_MONOTONIC` when it was created, and the process that created it.
+//! - A finished tag cannot be written to. A finished segment can be read and is not empty, but the `.data` of a living
+//!   port grows without a turn.
+//!
+//! The order is: list files before nodes and tags, and leave what appeared later, as well as ids that a living process
+//! created less than a second ago. Remove unfinished segments, except `.data` of living processes and of living nodes'
+//! ports. Once their unfinished tags are gone, let iceoryx2 remove dead nodes that have their details and share a
+//! service with a living node. Remove folders and `.node_monitor*` files of other dead nodes, `services/*.service`
+//! without the tag of a living node, and segments and sockets whose ids belong to no living port or remaining service
+//! (`unique_service_id` in its file). A node in an undefined state lives as long as the process in its id. A file that
+//! cannot be listed or read may belong to a living process, so an error ends the cleanup.
 
 use super::channel_files::{
     ChannelFiles, Used, any, entries, is_in_the_making, is_writable, metadata, nodes,
@@ -20,16 +38,16 @@ use std::io::Error;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// How long to wait for a segment to be finished, or to be left over.
+/// Maximum wait until a segment is finished, or counts as left over.
 const UNFINISHED: Duration = Duration::from_millis(1500);
 
-/// How often to check that.
+/// Interval between two checks of an unfinished segment.
 const INTERVAL: Duration = Duration::from_millis(10);
 
-/// Removes what dead processes left; returns how many files and folders that were.
+/// Removes the files of dead processes, and returns the number of removed files and folders.
 ///
 /// # Errors
-/// If others hold the turn for too long, or something cannot be read: its process may live, so the rest stays.
+/// If another process keeps the turn for too long, or a file cannot be read. Its process may live, so the rest is kept.
 pub fn remove_leftovers() -> Result<usize, ChannelError> {
     let turn = Turn::take_to_end()?;
     if !turn.is_alone() {
@@ -39,17 +57,17 @@ pub fn remove_leftovers() -> Result<usize, ChannelError> {
     removed.map_err(|error| not_usable(&channel_directory(), error))
 }
 
-/// Removes what dead processes left, and waits for what processes without turns are making: iceoryx2 waits without
-/// end for an unfinished segment.
+/// Removes the files of dead processes, and waits for segments that processes without turns are creating: iceoryx2
+/// waits forever for an unfinished segment.
 pub(crate) fn make_way() -> Result<(), ChannelError> {
     await_finished(&ChannelFiles::of_user(), || {
         if let Err(error) = remove_leftovers() {
-            tracing::debug!("not removed what dead processes left: {error}");
+            tracing::debug!("files of dead processes were not removed: {error}");
         }
     })
 }
 
-/// Waits until no segment is unfinished; `remove` those of dead processes.
+/// Waits until no segment is unfinished. `remove` removes the segments of dead processes.
 fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), ChannelError> {
     let start = Instant::now();
     loop {
@@ -60,7 +78,7 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
             return Ok(());
         };
         if start.elapsed() > UNFINISHED {
-            let problem = "a process is making it, perhaps a stopped one: continue or kill that";
+            let problem = "a process is creating it, or is stopped: continue or kill the process";
             return Err(directory_error(&segment, problem.into()));
         }
         std::thread::sleep(INTERVAL);
@@ -69,9 +87,11 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
 }
 
 impl ChannelFiles {
-    /// The first error ends it: what cannot be read may belong to a process that lives.
+    /// Removes the files of dead processes. Stops at the first error, because an unreadable file may belong to a living
+    /// process.
     fn remove_leftovers(&self, config: &Config) -> Result<usize, Error> {
-        // Files are listed before nodes and tags, so that files made meanwhile by a client without turns are not in the list.
+        // Files are listed before nodes and tags, so that the list has no files that a client without turns creates
+        // meanwhile.
         let list = |folder: &str| entries(&self.root.join(folder));
         let (node_files, services) = (list("nodes")?, list("services")?);
         let mut ports = self.segments()?;
@@ -81,16 +101,16 @@ impl ChannelFiles {
         let mut n_removed = self.remove_unfinished(&used)?;
         for node in dead {
             let id = node.id().value();
-            // iceoryx2 cannot remove a folder with unfinished tags; no service uses these yet.
+            // iceoryx2 cannot remove a folder with unfinished tags. No service uses these tags yet.
             n_removed += remove_if(entries(&self.folder(id))?, is_writable)?;
             let has_details = node.details().is_some();
             let details = self.folder(id).join(format!("{}node.details", self.prefix));
-            // Without details it uses no service, as these are removed last.
+            // A node without details uses no service, because the details are removed last.
             let is_shared =
                 has_details && !used.hashes.is_disjoint(&self.tags(id, ".service_tag")?);
             let is_unread = !has_details && metadata(&details)?.is_some();
             if is_unread || is_shared && node.try_remove_stale_resources().is_err() {
-                tracing::debug!(id, "a dead node stays");
+                tracing::debug!(id, "a dead node could not be removed");
                 living.insert(id);
             }
         }
@@ -100,11 +120,11 @@ impl ChannelFiles {
         Ok(n_removed + self.remove_ports(ports, &used)?)
     }
 
-    /// Unfinished segments of dead processes: to open one could take without end.
+    /// Removes unfinished segments of dead processes, because opening one may block forever.
     fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
             let ids = self.ids(path);
-            // Living ports may be making it now in another PID namespace, whose processes cannot be checked.
+            // Living ports in another PID namespace may be creating it, and their processes cannot be checked.
             let is_of_living = !ids.is_empty() && ids.iter().all(|id| used.ids.contains(id));
             Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
@@ -122,7 +142,7 @@ impl ChannelFiles {
         remove_if(files, |path| Ok(self.hash(path).is_some_and(is_left)))
     }
 
-    /// Segments and sockets that belong to no living port and to no service.
+    /// Removes segments and sockets that belong to no living port and to no service.
     fn remove_ports(&self, files: Vec<PathBuf>, used: &Used) -> Result<usize, Error> {
         let services = self.service_ids(used)?;
         remove_if(files, |path| {
@@ -133,7 +153,7 @@ impl ChannelFiles {
     }
 }
 
-/// Removes files and folders of files; returns how many.
+/// Removes the files and folders that are left over, and returns their number.
 fn remove_if(
     paths: Vec<PathBuf>,
     is_left: impl Fn(&Path) -> Result<bool, Error>,
@@ -162,7 +182,7 @@ mod tests {
     use std::fs::{Permissions, create_dir, remove_dir_all, set_permissions};
     use std::os::unix::fs::PermissionsExt;
 
-    /// A process that there cannot be: ids end below 2^22.
+    /// An impossible process id: ids are below 2^22.
     const NOBODY: u32 = 1 << 30;
 
     fn id(pid: u32, age: Duration) -> u128 {
@@ -205,7 +225,7 @@ mod tests {
 
     #[test]
     fn an_unfinished_segment_is_waited_for_but_not_without_end() {
-        // In the temporary folder: what is left there if this process is killed harms nobody.
+        // The temporary folder is used so that leftovers do no harm if this process is killed.
         let files = ChannelFiles {
             shared: std::env::temp_dir(),
             ..files_of_test("unfinished")
@@ -278,7 +298,8 @@ mod tests {
         assert!(is_young, "ids are of our clock: {port}");
         let hash = "0123456789abcdef".repeat(3)[..40].to_owned();
         let segment = |name: String| files.shared.join(format!("{prefix}{hash}_{name}"));
-        // Three that stay: of a port that grows, of one that a client without turns makes, of a connection to a living one.
+        // Three files that must stay: of a port that grows, of a port that a client without turns creates, and of a
+        // connection to a living port.
         make(segment(format!("{port}__2.data")), 0o200);
         make(segment(format!("{new}.dynamic")), 0o200);
         create_dir(root.join(format!("nodes/{new}"))).expect("a folder");

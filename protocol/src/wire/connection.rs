@@ -1,6 +1,6 @@
-//! A client's side of `step` and `control`: one request at a time, each with a deadline.
+//! The client's side of `step` and `control`: one request at a time, each with a deadline.
 //!
-//! Nothing returned points into shared memory.
+//! No returned value points into shared memory.
 
 use super::channels::{Entries, Instance, Services, StepService, create_node, limited_error};
 use super::exchange::{RequestClient, copied};
@@ -31,16 +31,17 @@ type StepClient = RequestClient<StepRequest, StepReply>;
 
 struct Ports {
     step: Option<StepClient>,
-    /// One of the entries: if it were closed before the ports, these would look like another program's.
+    /// The service owns one of the entries. If it were closed before the ports, the entries would look like another
+    /// program's.
     step_service: StepService,
     texts: TextPort,
 }
 
 impl Connection {
-    /// Connects to the instance's server and shakes hands; `client` names this program in its log.
+    /// Connects to the server of an instance and shakes hands. `client` names this program in the server's log.
     ///
     /// # Errors
-    /// If no server runs on the instance, it speaks another version, or it does not answer in time.
+    /// If no server runs on the instance, or it speaks another version, or it does not answer in time.
     pub fn open(
         instance: &Instance,
         client: &str,
@@ -68,9 +69,9 @@ impl Connection {
         })
     }
 
-    /// All ports but that for steps, whose size the server tells.
+    /// Opens all ports except the port for steps, whose size depends on the server's settings.
     fn open_ports(instance: &Instance, limit: Duration) -> Result<Opened<Ports>, ConnectionError> {
-        let _turn = Turn::take_within(limit)?; // declared first: what fails below is dropped within it
+        let _turn = Turn::take_within(limit)?; // Declared first, so that after an error the ports are dropped during it.
         check_descriptors("connect", CLIENT_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
@@ -91,15 +92,15 @@ impl Connection {
         Ok(Opened::new(entries, ports))
     }
 
-    /// What the server said of itself.
+    /// Returns the server's settings.
     pub fn info(&self) -> &ServerInfo {
         &self.info
     }
 
-    /// Asks on the control channel.
+    /// Sends a request on the control channel.
     ///
     /// # Errors
-    /// If the server refuses, has ended, or gives no good answer in time.
+    /// If the server refuses, has ended, or sends no valid answer in time.
     pub fn control(
         &mut self,
         request: &Request,
@@ -108,15 +109,15 @@ impl Connection {
         Backend::control(self, request, timeout)
     }
 
-    /// The server's process: readable when it has ended.
+    /// Returns a descriptor that is readable when the server's process has ended.
     pub fn server_process(&self) -> BorrowedFd<'_> {
         self.ports.texts.exchange.server_process.descriptor()
     }
 
-    /// Checks that the server's process runs, without asking it.
+    /// Checks that the server's process runs, without a request.
     ///
     /// # Errors
-    /// If it has ended.
+    /// If the server has ended.
     pub fn check_server(&self) -> Result<(), ConnectionError> {
         if self.ports.texts.exchange.server_process.has_ended() {
             Err(self.ports.texts.exchange.server_gone())
@@ -168,7 +169,7 @@ impl Backend for Connection {
 
 const WHAT: &str = "step";
 
-/// Refuses an answer to another question.
+/// Rejects an answer to another request.
 fn check_asked(
     info: &ServerInfo,
     request: &StepRequest,

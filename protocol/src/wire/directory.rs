@@ -1,4 +1,4 @@
-//! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
+//! The user's directory and prefix for channel files, and iceoryx2's configuration for them.
 
 use super::ipc::Ipc;
 use super::resources::{CLIENT_DESCRIPTORS, REMEDY, ipc_error, no_descriptors};
@@ -14,13 +14,13 @@ use std::time::{Duration, Instant};
 
 pub use super::resources::SHARED_MEMORY;
 
-/// How often to check that a program's files are still there.
+/// Interval between two checks that a program's files still exist.
 const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
-/// The directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
+/// Returns the directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
 ///
-/// Beside the shared memory, so that both are there or neither, and the same for every process of the user, of a
-/// session or not.
+/// It is next to the shared memory, so that both exist or neither does. It is the same for every process of the user,
+/// in any session.
 pub fn channel_directory() -> PathBuf {
     PathBuf::from(format!(
         "{SHARED_MEMORY}/emberwatch-{}/",
@@ -28,7 +28,8 @@ pub fn channel_directory() -> PathBuf {
     ))
 }
 
-/// The files by which others find a node, its services and ports: without one of them it is cut off.
+/// The files by which other processes find a node, its services and ports. Without one of them, the node cannot be
+/// found.
 #[derive(Debug)]
 pub struct Entries {
     paths: Vec<PathBuf>,
@@ -36,10 +37,10 @@ pub struct Entries {
 }
 
 impl Entries {
-    /// Those of a node, when its ports are made.
+    /// Lists the files of a node. Call it when the node's ports are made.
     ///
     /// # Errors
-    /// If they cannot be listed.
+    /// If the files cannot be listed.
     pub fn of(node: &Node<Ipc>) -> Result<Self, ChannelError> {
         let (directory, id) = (channel_directory(), node.id().value());
         let folder = directory.join(format!("nodes/{id}"));
@@ -61,10 +62,10 @@ impl Entries {
         })
     }
 
-    /// As [`Self::check`], unless the last time was a moment before `now`.
+    /// Checks like [`Self::check`], but does nothing if the last check was shortly before `now`.
     ///
     /// # Errors
-    /// As there.
+    /// If a file was removed.
     pub fn check_at(&self, now: Instant) -> Result<(), ChannelError> {
         if now.saturating_duration_since(self.checked.get()) < CHECK_INTERVAL {
             return Ok(());
@@ -74,10 +75,10 @@ impl Entries {
         Ok(())
     }
 
-    /// Checks that all are there.
+    /// Checks that all files still exist.
     ///
     /// # Errors
-    /// If one was removed.
+    /// If a file was removed.
     pub fn check(&self) -> Result<(), ChannelError> {
         let removed = self
             .paths
@@ -92,17 +93,17 @@ impl Entries {
     }
 }
 
-/// The channel directory, made if it is missing, and checked.
+/// Returns the channel directory. Creates it if it is missing, and checks it.
 pub(crate) fn own_channel_directory() -> Result<PathBuf, ChannelError> {
     let directory = channel_directory();
     own_directory(&directory)?;
     Ok(directory)
 }
 
-/// iceoryx2's configuration: its defaults, the user's own directory and prefix.
+/// Returns iceoryx2's configuration: its defaults, with the user's directory and prefix.
 ///
 /// # Errors
-/// If the directory cannot be made or belongs to another user.
+/// If the directory cannot be created, or belongs to another user.
 pub fn node_config() -> Result<Config, ChannelError> {
     let directory = own_channel_directory()?;
     let path = Path::new(directory.as_os_str().as_encoded_bytes())
@@ -111,19 +112,19 @@ pub fn node_config() -> Result<Config, ChannelError> {
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
-    // Cleaning up needs a turn (`turn.rs`), which iceoryx2 does not take.
+    // Cleaning up needs a turn (`turn.rs`), and iceoryx2 takes none.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
 }
 
-/// What names of this user's shared memory begin with.
+/// Returns the prefix of the names of this user's shared memory.
 pub(crate) fn prefix() -> String {
     format!("emberwatch-{}_", rustix::process::getuid().as_raw())
 }
 
-/// The error of a file or folder that the system does not let be used.
+/// Returns the error for a file or folder that the system does not allow using.
 pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
     if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) {
         return no_descriptors("use the channel directory", CLIENT_DESCRIPTORS);
@@ -132,7 +133,7 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
         path,
         match error.kind() {
             std::io::ErrorKind::ReadOnlyFilesystem => format!(
-                "{error}: channels need a {SHARED_MEMORY} that can be written to; as root, \
+                "{error}: channels need a writable {SHARED_MEMORY}; as root, \
                  `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
             ),
             std::io::ErrorKind::StorageFull => {
@@ -143,7 +144,7 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
     )
 }
 
-/// The error of a file or folder.
+/// Returns the error for a file or folder.
 pub(crate) fn directory_error(path: &std::path::Path, problem: String) -> ChannelError {
     ChannelError::Directory {
         path: path.display().to_string(),
@@ -151,7 +152,7 @@ pub(crate) fn directory_error(path: &std::path::Path, problem: String) -> Channe
     }
 }
 
-/// Makes the directory, for this user alone, or checks that it belongs to this user.
+/// Creates the directory for this user only, or checks that it belongs to this user.
 fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
     let wrong = |problem: String| directory_error(path, problem);
     match DirBuilder::new().mode(0o700).create(path) {
@@ -160,7 +161,7 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
         }
         _ => {}
     }
-    let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
+    let bare = path.components().as_path(); // Without the trailing slash, so that a link is detected.
     let found = std::fs::symlink_metadata(bare).map_err(|error| not_usable(path, error))?;
     let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
     if !mine || found.mode() & 0o022 != 0 {
@@ -168,7 +169,7 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
             "expected a directory that belongs to this user and that others cannot write to".into(),
         ));
     }
-    // Its mode depends on the umask it was made under.
+    // The directory's mode depends on the umask of its creator.
     match found.mode() & 0o777 {
         0o700 => Ok(()),
         _ => std::fs::set_permissions(path, Permissions::from_mode(0o700))

@@ -20,16 +20,16 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use std::time::{Duration, Instant};
 
-/// Longest sleep between two looks at the answer: bounds what a lost wake-up can cost.
+/// Maximum time between two checks for the answer, which limits the cost of a lost wake-up.
 const LONGEST_SLEEP: Duration = Duration::from_millis(50);
 
-/// How long the answering side may take to release a request that was given up.
+/// Maximum time in which the answering side must release a request that was given up.
 const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A port that sends requests.
 pub(super) type RequestClient<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// What a request and its answer need: both ends of waking, and the server's process.
+/// The resources of a request and its answer: the wake-ups in both directions, and the server's process.
 pub(super) struct Exchange {
     pub(super) instance: Instance,
     pub(super) server: Notifier<Ipc>,
@@ -56,7 +56,7 @@ impl Exchange {
         read: impl Fn(&R, &[u8]) -> T,
     ) -> Result<T, ConnectionError> {
         if self.server_process.has_ended() {
-            // A new server on the instance would take the request, but knows nothing of it.
+            // A new server on the instance would receive the request, but does not know the client.
             return Err(self.server_gone());
         }
         let pending = send(client, header, payload)?;
@@ -94,29 +94,29 @@ impl Exchange {
         })
     }
 
-    /// Sleeps until woken; returns whether it was woken, and whether the server has ended.
+    /// Sleeps until woken. Returns whether it was woken, and whether the server has ended.
     fn sleep(&self, timeout: Duration) -> Result<[bool; 2], ChannelError> {
         let descriptors = [descriptor(&self.listener), self.server_process.descriptor()];
         let readable = sleep_until_readable(&descriptors, timeout)
             .map_err(ipc_error("wait for the server"))?;
-        // Wake-ups that are left would end the next sleep at once.
+        // Remaining wake-ups would end the next sleep at once.
         drain(&self.listener)?;
         Ok([readable[0], readable[1]])
     }
 
-    /// The error of a server that has ended; removes the files it left.
+    /// Returns the error for a server that has ended, and removes the files of the dead server.
     pub(super) fn server_gone(&self) -> ConnectionError {
-        let _ = remove_leftovers(); // Else the next program removes them.
+        let _ = remove_leftovers(); // If this fails, the next program removes them.
         ConnectionError::ServerGone {
             instance: self.instance.name().into(),
         }
     }
 }
 
-/// A request that waits for its answer.
+/// A request that is waiting for its answer.
 type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// Sends a request, once the one before is released.
+/// Sends a request as soon as the previous one is released.
 fn send<Q: Header, R: Header>(
     client: &RequestClient<Q, R>,
     header: Q,
@@ -138,7 +138,7 @@ fn send<Q: Header, R: Header>(
     }
 }
 
-/// A copy of an answer's payload.
+/// Returns a copy of an answer's payload.
 pub(super) fn copied(what: &str, payload: &[u8]) -> Result<Vec<u8>, NoMemory> {
     let mut copy = with_capacity(format_args!("the answer to {what}"), payload.len())?;
     copy.extend_from_slice(payload);

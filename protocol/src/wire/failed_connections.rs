@@ -1,4 +1,4 @@
-//! Connections that could not be opened, for example as no file descriptors are left: their clients get no answer.
+//! Connections that could not be opened, for example because no file descriptors are free. Their clients get no answer.
 
 use super::resources::{SERVER_DESCRIPTORS, free_descriptors};
 use crate::throttle::Throttle;
@@ -9,8 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
-/// Counts them, and warns of those for which there were no file descriptors: limits may change, and the system has
-/// one too.
+/// Counts failed connections. Warns when file descriptors ran out, by the process's limit or by the system's.
 #[derive(Debug, Default)]
 pub struct FailedConnections {
     count: Arc<AtomicU64>,
@@ -18,7 +17,7 @@ pub struct FailedConnections {
 }
 
 impl FailedConnections {
-    /// A handler that counts, for a port.
+    /// Returns a handler for a port that counts its failed connections.
     pub fn counter(&self) -> impl DegradationFn + 'static {
         let count = self.count.clone();
         move |_: DegradationCause, _: &DegradationInfo| {
@@ -31,8 +30,8 @@ impl FailedConnections {
         self.count.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Warns, at most every ten seconds, if there were some since the last call, and descriptors are the reason;
-    /// another reason is the death of their clients.
+    /// Warns, at most every ten seconds, if connections failed since the last call and file descriptors are the reason.
+    /// The death of a client is another reason.
     pub fn warn(&self, now: Instant) {
         if self.count.swap(0, Ordering::Relaxed) == 0 {
             return;
@@ -45,7 +44,7 @@ impl FailedConnections {
             tracing::warn!(
                 limit,
                 n_unsaid,
-                "no file descriptors for a client or an observer, which gets no answer: {problem}"
+                "no file descriptors for a client or an observer, which will get no answer: {problem}"
             );
         }
     }

@@ -1,4 +1,4 @@
-//! Shows beliefs to observers, as often as a screen shows: the agent's side of the channel `agent`.
+//! Publishes beliefs to observers at the rate of a screen: the agent's side of the channel `agent`.
 
 use super::agent_belief::{BeliefPublisher, Intent};
 use super::channels::{AGENT_BUFFER, Instance};
@@ -7,14 +7,14 @@ use emberwatch_model::grid::Probabilities;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
+/// Time between two published beliefs of a world. No screen is faster, and each costs a copy.
 const INTERVAL: Duration = Duration::from_millis(20);
 
-/// How long readers may take to fetch what was shown last, unless they leave before: it goes with the process
-/// where a reader has not met it yet.
+/// Maximum time at the end for readers to receive the last belief. It is lost with the process if a reader has not
+/// connected to it yet.
 const FAREWELL: Duration = Duration::from_millis(500);
 
-/// What agents of one process show.
+/// The beliefs that the agents of one process publish.
 pub struct Feed {
     publisher: Option<BeliefPublisher>,
     turns: Turns,
@@ -28,26 +28,26 @@ struct Turns {
 
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
-    /// The world's number.
+    /// Number of the world.
     pub world: u32,
-    /// Numbers of the robots that are flown on it.
+    /// Numbers of the robots that the agent flies in it.
     pub robots: Range<u32>,
     /// The result of the step.
     pub result: &'a WorldResult,
-    /// Shape `[S, H, W]`.
+    /// The belief, shape `[S, H, W]`.
     pub belief: &'a Probabilities,
-    /// Who believes it, and what the path was for.
+    /// The policy and estimator, and the objective of the path.
     pub intent: Intent,
 }
 
 impl Feed {
-    /// Opens the channel for beliefs like this one. Without a channel, which is told once, nothing is shown:
-    /// acting does not depend on being seen.
+    /// Opens the channel for beliefs like this one. If it cannot be opened, it logs one warning and publishes nothing,
+    /// because acting does not depend on being observed.
     pub fn open(instance: &Instance, belief: &Probabilities) -> Self {
-        // The intent is some hundred bytes of text.
+        // The intent is a few hundred bytes of text.
         let n_bytes = belief.len() * size_of::<f32>() + 1024;
         let publisher = BeliefPublisher::open(instance, n_bytes)
-            .inspect_err(|error| tracing::warn!("beliefs are not shown: {error}"))
+            .inspect_err(|error| tracing::warn!("beliefs are not published: {error}"))
             .ok();
         Self {
             publisher,
@@ -55,12 +55,12 @@ impl Feed {
         }
     }
 
-    /// Whether it is time to show beliefs, and anybody looks.
+    /// Returns whether a belief is due, and there are readers.
     pub fn is_due(&self) -> bool {
         !self.due(1).is_empty()
     }
 
-    /// Which of several worlds are to be shown now, if anybody looks.
+    /// Returns the worlds whose beliefs are due, if there are readers.
     pub fn due(&self, n_worlds: usize) -> Vec<usize> {
         let due = self.turns.due(Instant::now(), n_worlds);
         if due.is_empty() || self.is_watched() {
@@ -70,14 +70,14 @@ impl Feed {
         }
     }
 
-    /// Whether there are readers.
+    /// Returns whether there are readers.
     pub fn is_watched(&self) -> bool {
         self.publisher
             .as_ref()
             .is_some_and(BeliefPublisher::is_watched)
     }
 
-    /// Ends, when readers have had time to fetch what was shown last.
+    /// Ends the feed, after readers have had time to receive the last belief.
     pub fn end(self) {
         let began = Instant::now();
         while self.turns.shown.is_some() && self.is_watched() && began.elapsed() < FAREWELL {
@@ -85,7 +85,7 @@ impl Feed {
         }
     }
 
-    /// Publishes a belief, unless the channel is not open.
+    /// Publishes a belief if the channel is open.
     pub fn show(&mut self, view: &View<'_>) {
         let Some(publisher) = &mut self.publisher else {
             return;
@@ -101,15 +101,15 @@ impl Feed {
             ..AgentHeader::default()
         };
         if let Err(error) = publisher.show(about, view.belief, &view.intent) {
-            tracing::warn!("beliefs are no longer shown: {error}");
+            tracing::warn!("beliefs are no longer published: {error}");
             self.publisher = None;
         }
     }
 }
 
 impl Turns {
-    /// Which of several worlds are due: one after the other, and no more at once than a reader keeps beside one that
-    /// is still to be read.
+    /// Returns the worlds that are due, in rotation. They are at most as many as a reader's buffer can hold next to an
+    /// unread one.
     fn due(&self, now: Instant, n_worlds: usize) -> Vec<usize> {
         let share = |shown: Instant| (now - shown).as_secs_f64() / INTERVAL.as_secs_f64();
         let n_due = self
@@ -119,7 +119,7 @@ impl Turns {
         turn.map(|number| number % n_worlds).collect()
     }
 
-    /// Takes note of a world that is shown.
+    /// Records that a world's belief was published.
     fn pass(&mut self, now: Instant) {
         self.shown = Some(now);
         self.n_shown += 1;

@@ -1,10 +1,10 @@
-//! iceoryx2's flavour, and headers in its shared memory.
+//! The variant of iceoryx2, and headers in its shared memory.
 
 use emberwatch_messages::message::Header;
 use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::service::ipc_threadsafe;
 
-/// iceoryx2's inter-process flavour whose ports may move between threads.
+/// iceoryx2's inter-process variant whose ports may move between threads.
 pub type Ipc = ipc_threadsafe::Service;
 
 /// A header in shared memory, for iceoryx2.

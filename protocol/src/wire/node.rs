@@ -14,11 +14,11 @@ use std::ops::{Deref, DerefMut};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::time::Instant;
 
-/// Makes this process known to iceoryx2, under the user's own directory and prefix, after removing what dead processes
-/// left there.
+/// Creates an iceoryx2 node for this process, in the user's directory and with the user's prefix. Removes the files of
+/// dead processes there first.
 ///
 /// # Errors
-/// If the directory, or shared memory of this prefix, belongs to another user, or iceoryx2 cannot create the node.
+/// If the directory, or shared memory with this prefix, belongs to another user, or iceoryx2 cannot create the node.
 pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
     let shared_memory = std::path::Path::new(SHARED_MEMORY);
@@ -32,12 +32,12 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
         .signal_handling_mode(SignalHandlingMode::Disabled);
     let node = node.create().map_err(ipc_error("create a node"))?;
     own_nodes::add(node.id().value());
-    // iceoryx2 makes the counter of nodes, which comes with the first node, writable for everybody.
+    // iceoryx2 creates the counter of nodes with the first node, and makes it writable for everybody.
     own_segments(shared_memory, &prefix())?;
     Ok(node)
 }
 
-/// Ports and their node, which are closed in a turn.
+/// Ports and their node, which are closed during a turn.
 #[derive(Debug)]
 pub(crate) struct Opened<T> {
     ports: Option<T>,
@@ -45,7 +45,7 @@ pub(crate) struct Opened<T> {
 }
 
 impl<T> Opened<T> {
-    /// Keeps the ports of a node with these entries.
+    /// Wraps the ports of a node with these entries.
     pub(crate) fn new(entries: Entries, ports: T) -> Self {
         Self {
             ports: Some(ports),
@@ -53,7 +53,7 @@ impl<T> Opened<T> {
         }
     }
 
-    /// Checks that others can still find them.
+    /// Checks that other processes can still find the ports.
     pub(crate) fn check(&self) -> Result<(), ChannelError> {
         self.entries.check_at(Instant::now())
     }
@@ -78,13 +78,13 @@ impl<T> Drop for Opened<T> {
         let _turn = Turn::take_to_end();
         let ports = self.ports.take();
         if self.entries.check().is_err() {
-            // Other programs may have made files of the same names by now.
+            // Other programs may have created files with the same names meanwhile.
             std::mem::forget(ports);
         }
     }
 }
 
-/// Checks that shared memory of this prefix belongs to this user, and closes it to all others.
+/// Checks that shared memory with this prefix belongs to this user, and removes the access of all others.
 fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelError> {
     let entries = std::fs::read_dir(folder).map_err(|error| not_usable(folder, error))?;
     for entry in entries.flatten() {
@@ -92,12 +92,12 @@ fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelErr
         if !name.as_encoded_bytes().starts_with(prefix.as_bytes()) {
             continue;
         }
-        // A file that is gone by now belonged to a process that ended.
+        // A file that is gone belonged to a process that has ended.
         let Ok(found) = entry.metadata() else {
             continue;
         };
         if !found.is_file() || found.uid() != rustix::process::getuid().as_raw() {
-            let problem = "expected shared memory of this user, got something of user";
+            let problem = "expected shared memory of this user, got a file of user";
             return Err(directory_error(
                 &entry.path(),
                 format!("{problem} {}", found.uid()),

@@ -1,4 +1,4 @@
-//! An observer's side of `frames`, `truth` and `agent`: it reads, never acts, and never slows the server.
+//! An observer's side of `frames`, `truth` and `agent`: it only reads, and never slows the server.
 
 use super::channels::{
     AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Publications,
@@ -17,27 +17,28 @@ use iceoryx2::prelude::PayloadHeader;
 use std::cell::Cell;
 use std::time::{Duration, Instant};
 
-/// How long an observer sleeps between two polls while it is busy: publishing wakes no observer, so that observers cost
-/// the server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
-/// this fills [`FRAME_BUFFER`].
+/// Time that an observer sleeps between two polls while it is busy. Publishing wakes no observer, so observers cost the
+/// server no system call. They do not spin either, which would take processor time from it. At 128,000 frames per
+/// second, [`FRAME_BUFFER`] fills up within this time.
 const BUSY_INTERVAL: Duration = Duration::from_micros(500);
 
-/// The same while it is not: each poll wakes a process, on a core that the server may need.
+/// Time that an observer sleeps between two polls while it is idle. Each poll wakes a process, on a core that the
+/// server may need.
 const IDLE_INTERVAL: Duration = Duration::from_millis(4);
 
-/// How long an observer stays busy after it began, and after it found a quarter of its buffer full.
+/// Time that an observer stays busy after it began, and after it found more than a quarter of its buffer full.
 const BUSY: Duration = Duration::from_secs(1);
 
 type Ports<H> = (Subscriber<Ipc, [u8], WireHeader<H>>, Node<Ipc>);
 
-/// Reads one channel of an instance, whether a server runs or not.
+/// A reader of one channel of an instance, whether a server runs or not.
 pub struct Observer<H: Header> {
     ports: Opened<Ports<H>>,
     publisher: Cell<Option<u32>>,
     polling: Polling,
 }
 
-/// How often to poll.
+/// Chooses the interval between polls.
 #[derive(Debug)]
 struct Polling {
     buffer: usize,
@@ -49,7 +50,7 @@ struct Polling {
 }
 
 impl Observer<FrameHeader> {
-    /// Reads the frames of an instance; the server publishes every world's current one at once.
+    /// Opens the frames of an instance. The server publishes every world's current frame at once.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many observers.
@@ -60,7 +61,7 @@ impl Observer<FrameHeader> {
 }
 
 impl Observer<TruthHeader> {
-    /// Reads the hidden states of an instance, if its server publishes them.
+    /// Opens the hidden states of an instance. They arrive only if its server publishes them.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many readers.
@@ -77,7 +78,7 @@ impl Observer<TruthHeader> {
 }
 
 impl Observer<AgentHeader> {
-    /// Reads what the agents of an instance believe; [`super::agent_belief::AgentBelief`] checks each sample.
+    /// Opens the beliefs of an instance's agents. [`super::agent_belief::AgentBelief`] checks each sample.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many readers.
@@ -122,16 +123,16 @@ impl<H: Header> Observer<H> {
         })
     }
 
-    /// Polls each 500 us at any time: for observers that must not miss the first samples after a pause, when the
-    /// server may publish more than a buffer holds within the 4 ms that others sleep then.
+    /// Makes the observer always poll every 500 us. This is for observers that must not miss the first samples after a
+    /// pause, when the server may publish more than a buffer within the usual 4 ms.
     #[must_use]
     pub fn eager(mut self) -> Self {
         self.polling.is_eager = true;
         self
     }
 
-    /// The next sample; `None` if none came in time. Gaps in the headers' sequence numbers are
-    /// samples that this observer lost, as it was too slow.
+    /// Waits for the next sample. Returns `None` if none came in time. Gaps in the headers' sequence numbers are
+    /// samples that this observer lost because it was too slow.
     ///
     /// # Errors
     /// If iceoryx2 cannot read the channel, or its files were removed.
@@ -148,7 +149,7 @@ impl<H: Header> Observer<H> {
         }
     }
 
-    /// The next sample, if there is one already.
+    /// Returns the next sample, if there already is one.
     ///
     /// # Errors
     /// If iceoryx2 cannot read the channel, or its files were removed.
@@ -172,14 +173,14 @@ impl<H: Header> Observer<H> {
         }))
     }
 
-    /// The process that published the sample received last: the server's, or an agent's.
+    /// Returns the process that published the last received sample: the server's, or an agent's.
     pub fn publisher(&self) -> Option<u32> {
         self.publisher.get()
     }
 }
 
 impl Polling {
-    /// How long to sleep, now that the buffer is empty.
+    /// Returns the time to sleep after the buffer was emptied.
     fn interval(&self, now: Instant) -> Duration {
         if self.n_found.replace(0) > self.buffer / 4 {
             self.busy.set(now);
@@ -192,7 +193,7 @@ impl Polling {
     }
 }
 
-/// Wakes a sleeping server, so that it notices the new observer now.
+/// Wakes a sleeping server, so that it notices the new observer at once.
 fn wake_server(services: &Services<'_>) -> Result<(), ChannelError> {
     let wake = services.wake(Channel::WakeServer)?;
     let notifier = wake.notifier_builder().create();

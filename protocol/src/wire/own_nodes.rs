@@ -1,4 +1,5 @@
-//! The nodes of this process, by their ids: a process of another PID namespace may have its number.
+//! The ids of this process's nodes. Process numbers are not enough, because a process in another PID namespace may have
+//! the same number.
 
 use std::collections::HashSet;
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};

@@ -5,8 +5,8 @@ use rustix::io::Errno;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-/// Sleeps until one of the descriptors is readable, a signal arrives or the timeout has passed;
-/// returns which of them are readable.
+/// Sleeps until one of the descriptors is readable, a signal arrives, or the timeout has passed. Returns for each
+/// descriptor whether it is readable.
 ///
 /// # Errors
 /// If the system cannot wait; never `EINTR`.
@@ -20,7 +20,7 @@ pub fn sleep_until_readable(
     }
 }
 
-/// Sleeps likewise; returns whether a descriptor is readable or a signal arrived.
+/// Sleeps like [`sleep_until_readable`]. Returns whether a descriptor is readable or a signal arrived.
 ///
 /// # Errors
 /// If the system cannot wait; never `EINTR`.
@@ -44,7 +44,7 @@ fn readable(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<Vec<boo
     Ok(polled.iter().map(|fd| !fd.revents().is_empty()).collect())
 }
 
-/// Whether a descriptor is readable now.
+/// Returns whether a descriptor is readable now.
 pub fn is_readable(descriptor: BorrowedFd<'_>) -> bool {
     sleep_until_readable(&[descriptor], Duration::ZERO).is_ok_and(|readable| readable[0])
 }

@@ -1,4 +1,4 @@
-//! Other processes: whether they run, and a descriptor that tells when they end.
+//! Other processes: checks whether they run, and watches for their end.
 
 use super::poll::is_readable;
 use super::resources::call_error;
@@ -12,21 +12,21 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 #[derive(Debug)]
 pub struct WatchedProcess(OwnedFd);
 
-/// The process to end with does not run, or cannot be watched.
+/// The error for a process of `--exit-with` that does not run or cannot be watched.
 #[derive(Debug, thiserror::Error)]
 pub enum NotWatched {
     /// There is no such process.
-    #[error("--exit-with {pid}: expected a running process, got none of this number")]
+    #[error("--exit-with {pid}: expected a running process, got none with this id")]
     NotRunning {
-        /// Its number.
+        /// The process id.
         pid: i32,
     },
     /// The system does not allow it.
     #[error("--exit-with {pid}: {problem}")]
     Refused {
-        /// Its number.
+        /// The process id.
         pid: i32,
-        /// The call, and what to do.
+        /// The failed call, and what to do.
         problem: ChannelError,
     },
 }
@@ -35,7 +35,7 @@ impl WatchedProcess {
     /// Watches a process.
     ///
     /// # Errors
-    /// `ESRCH` if there is no such process, or the system's error if it has no descriptor left.
+    /// `ESRCH` if there is no such process, or the system's error if no file descriptor is available.
     pub fn open(pid: i32) -> Result<Self, Errno> {
         let process = (pid > 0).then(|| Pid::from_raw(pid)).flatten();
         pidfd_open(process.ok_or(Errno::SRCH)?, PidfdFlags::empty()).map(Self)
@@ -44,7 +44,7 @@ impl WatchedProcess {
     /// Watches the process that `--exit-with` names.
     ///
     /// # Errors
-    /// If it does not run, or the system refuses to tell when it ends.
+    /// If the process does not run, or the system does not allow watching it.
     pub fn watch(pid: i32) -> Result<Self, NotWatched> {
         Self::open(pid).map_err(|errno| match errno {
             Errno::SRCH | Errno::INVAL => NotWatched::NotRunning { pid },
@@ -55,45 +55,46 @@ impl WatchedProcess {
         })
     }
 
-    /// Checks that this process may watch others: without that, nobody notices when one dies.
+    /// Checks that this process may watch others. Otherwise it could not notice their deaths.
     ///
     /// # Errors
-    /// If the system refuses it.
+    /// If the system does not allow it.
     pub fn check() -> Result<(), ChannelError> {
         Self::open(getpid().as_raw_nonzero().get())
             .map(drop)
             .map_err(watch_error)
     }
 
-    /// Readable when it has ended.
+    /// Returns a descriptor that is readable when the process has ended.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
 
-    /// Whether it has ended.
+    /// Returns whether the process has ended.
     pub fn has_ended(&self) -> bool {
         is_readable(self.descriptor())
     }
 }
 
-/// The error of a process that cannot be watched, though it may run.
+/// Returns the error for a process that cannot be watched, though it may run.
 pub(super) fn watch_error(errno: Errno) -> ChannelError {
     call_error("pidfd_open", errno)
 }
 
-/// The process that an iceoryx2 id of a node or a port names, by its number in that process's PID namespace.
+/// Returns the process of an iceoryx2 node or port from its id. The number is valid in that process's PID namespace.
 pub fn node_pid(id: u128) -> i32 {
     (id >> 64) as i32
 }
 
-/// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is no such process.
+/// Returns a process's state in `/proc`, such as `R` or `Z`, or `None` if there is no such process.
 pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
     let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;
-    // The state follows the name, which is in brackets and may hold brackets.
+    // The state follows the name, which is in brackets and may contain brackets.
     Ok(stat.and_then(|stat| stat.rsplit_once(") ")?.1.chars().next()))
 }
 
-/// What was read; `None` if it does not exist. Any other error says nothing about that.
+/// Returns what was read, or `None` if it does not exist. Other errors are returned, because they do not show that it
+/// is missing.
 pub(crate) fn if_there<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(found) => Ok(Some(found)),

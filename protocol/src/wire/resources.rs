@@ -1,5 +1,5 @@
-//! What ports take of the system: shared memory, files, descriptors. Who makes ports asks first, and if iceoryx2 fails
-//! all the same, the error names what is missing.
+//! The system resources of ports: shared memory, files and file descriptors. They are checked before ports are created.
+//! If iceoryx2 fails nevertheless, the error names the missing resource.
 
 use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::limits::memory::in_words;
@@ -11,44 +11,44 @@ use std::fmt::Debug;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixDatagram;
 
-/// Where iceoryx2 keeps shared memory: a folder that every user may write to.
+/// The folder of iceoryx2's shared memory, which every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
-/// What to do if it is full.
+/// Advice if the folder is full.
 pub(super) const REMEDY: &str = "free some, or give the container more (docker: --shm-size)";
 
-/// What the ports of a client or an observer take, beside its longest messages: 190 KiB (measured).
+/// Shared memory of the ports of a client or an observer in bytes, except its longest messages. Measured: 190 KiB.
 const PORT_BYTES: u64 = 512 << 10;
 
-/// The files of these: 25 (measured).
+/// Number of files of these ports. Measured: 25.
 const PORT_FILES: u64 = 48;
 
-/// File descriptors of a connection to a server, or to an agent: 31, and one for a moment (measured).
+/// Number of file descriptors of a connection to a server or an agent. Measured: 31, and one more for a moment.
 pub(super) const CLIENT_DESCRIPTORS: usize = 33;
 
-/// File descriptors of an observer: 9, and 3 for a moment (measured).
+/// Number of file descriptors of an observer. Measured: 9, and 3 more for a moment.
 pub(super) const OBSERVER_DESCRIPTORS: usize = 12;
 
-/// File descriptors that a server takes for one more client.
+/// Number of file descriptors that a server needs for one more client.
 pub(super) const SERVER_DESCRIPTORS: usize = 10;
 
-/// With fewer free descriptors, their lack is the likely reason why iceoryx2 fails.
+/// If fewer descriptors than this are free, their lack is the likely reason for an error of iceoryx2.
 const FEW_DESCRIPTORS: usize = 10;
 
-/// Checks that there is room for the ports of a connection, and for a message of them.
+/// Checks that there is enough shared memory for the ports of a connection, and for a message on them.
 ///
 /// # Errors
-/// If not.
+/// If there is too little.
 pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelError> {
     let n_bytes = PORT_BYTES + message_bytes as u64;
     check_room(n_bytes, n_bytes)
 }
 
-/// Checks that so many bytes of shared memory are free, as many files as the ports of a connection are, and that a file
-/// may be as long as the longest of them.
+/// Checks that `n_bytes` bytes of shared memory and enough files for the ports of a connection are free, and that a
+/// file may have `longest_file` bytes.
 ///
 /// # Errors
-/// If not.
+/// If there is too little.
 pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit < longest_file {
@@ -58,22 +58,22 @@ pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
         ));
     }
     check_free(n_bytes)?;
-    // A file system without a limit says 0 of 0.
+    // A file system without a limit on files reports 0 of 0.
     let found = statvfs(SHARED_MEMORY).ok();
     let found = found.filter(|found| found.f_files > 0 && found.f_favail < PORT_FILES);
     found.map_or(Ok(()), |found| {
         let free = found.f_favail;
         no_room(format!(
-            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
+            "expected {PORT_FILES} free files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
              nr_inodes)"
         ))
     })
 }
 
-/// Checks that so many bytes of shared memory are free.
+/// Checks that `n_bytes` bytes of shared memory are free.
 ///
 /// # Errors
-/// If not.
+/// If there is too little.
 pub(super) fn check_free(n_bytes: u64) -> Result<(), ChannelError> {
     let Ok(found) = statvfs(SHARED_MEMORY) else {
         return Ok(());
@@ -92,12 +92,12 @@ pub(super) fn no_room<T>(problem: String) -> Result<T, ChannelError> {
     Err(ChannelError::NoRoom { problem })
 }
 
-/// Adds context to an error of iceoryx2, whose cause is asked of the system where iceoryx2 does not tell it.
+/// Adds context to an error of iceoryx2. If iceoryx2 does not report the cause, finds it in the system's limits.
 pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
     limited_error(what, "64 processes")
 }
 
-/// As [`ipc_error`], for what there may be so many of.
+/// Adds context like [`ipc_error`], for resources with a limited count. `most` is the limit, such as `16 clients`.
 pub fn limited_error<E: Debug>(
     what: &'static str,
     most: &'static str,
@@ -116,20 +116,20 @@ pub fn limited_error<E: Debug>(
     }
 }
 
-/// Checks that the system gives sockets, which wake other processes.
+/// Checks that the system allows sockets, which wake other processes.
 fn check_sockets() -> Result<(), ChannelError> {
     let socket = UnixDatagram::unbound();
     let errno = socket.err().and_then(|error| Errno::from_io_error(&error));
     errno.map_or(Ok(()), |errno| Err(call_error("socket (AF_UNIX)", errno)))
 }
 
-/// Checks that so many descriptors are free, before any of them is used: what iceoryx2 began and could not finish may stay
-/// open.
+/// Checks that `needed` descriptors are free before any is used: descriptors of an unfinished operation of iceoryx2 may
+/// stay open.
 pub(super) fn check_descriptors(what: &'static str, needed: usize) -> Result<(), ChannelError> {
     free_descriptors(needed).map_err(|_| no_descriptors(what, needed))
 }
 
-/// The error of a system call that does not depend on a file.
+/// Returns the error of a system call that does not depend on a file.
 pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     match errno {
         Errno::MFILE | Errno::NFILE => no_descriptors(call, CLIENT_DESCRIPTORS),
@@ -140,7 +140,7 @@ pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     }
 }
 
-/// The error of a process that may open no more files.
+/// Returns the error of a process that cannot open more files.
 pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError {
     let limit = getrlimit(Resource::Nofile).current;
     ChannelError::NoDescriptors {
@@ -150,15 +150,15 @@ pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError 
     }
 }
 
-/// Opens so many descriptors and closes them again.
+/// Checks that `n` descriptors are free, by opening and closing them.
 ///
 /// # Errors
-/// The system's, if there are not as many.
+/// The system's error, if fewer are free.
 pub(super) fn free_descriptors(n: usize) -> Result<(), Errno> {
     let opened = (0..n).map(|_| eventfd(0, EventfdFlags::CLOEXEC));
     match opened.collect::<Result<Vec<OwnedFd>, Errno>>() {
         Err(errno @ (Errno::MFILE | Errno::NFILE)) => Err(errno),
-        // Where the call is refused, nothing is known.
+        // If the system refuses the call, the number is unknown.
         _ => Ok(()),
     }
 }

@@ -1,4 +1,4 @@
-//! The answering side of a request channel: take a request, send its answer, wake its client.
+//! The answering side of a request channel: receives a request, sends its answer, and wakes its client.
 //!
 //! The server uses [`Answers`] on each of its channels.
 
@@ -20,26 +20,26 @@ use serde::Serialize;
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// Length that answers in JSON may have before their segment grows, bytes.
+/// Maximum size of a JSON answer in bytes before its segment grows.
 pub const JSON_SLICE: usize = 16_384;
 
-/// Listeners remembered before the table is emptied.
+/// Maximum number of known listeners, after which the table is emptied.
 const MAX_KNOWN_LISTENERS: usize = 1024;
 
-/// How long clients may take to read an answer before its sender ends.
+/// Maximum time in which clients must read an answer before its sender ends.
 const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// A request that waits for its answer.
+/// A request that is waiting for its answer.
 pub type Active<Q, R> = ActiveRequest<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// A request in JSON that waits for its answer.
+/// A JSON request that is waiting for its answer.
 pub type ActiveControl = Active<ControlRequest, ControlReply>;
 
 /// The answering port of a service of JSON messages.
 pub type ControlServer =
     Server<Ipc, [u8], WireHeader<ControlRequest>, [u8], WireHeader<ControlReply>>;
 
-/// Sends answers and wakes the clients that wait for them.
+/// The sender of answers, which wakes the clients that wait for them.
 #[derive(Debug)]
 pub struct Answers {
     notifier: Notifier<Ipc>,
@@ -47,7 +47,7 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Sends answers to clients of an instance.
+    /// Opens the wake service of an instance, to send answers to its clients.
     ///
     /// # Errors
     /// If the wake service cannot be opened.
@@ -60,8 +60,7 @@ impl Answers {
         })
     }
 
-    /// Sends an answer and wakes its client. A client that has ended, or that does not read its answers, loses
-    /// this one.
+    /// Sends an answer and wakes its client. The answer is lost if the client has ended, or does not read its answers.
     pub fn send<Q: Header, R: Header>(
         &mut self,
         request: &Active<Q, R>,
@@ -81,11 +80,12 @@ impl Answers {
             });
         match sent {
             Ok(()) => self.wake(listener),
-            Err(problem) => tracing::debug!(problem, "an answer was not taken"),
+            Err(problem) => tracing::debug!(problem, "an answer could not be sent"),
         }
     }
 
-    /// Sends an answer in JSON and wakes its client; a refusal if there is too little memory for a long answer.
+    /// Sends a JSON answer and wakes its client. If there is too little memory for a long answer, sends a refusal
+    /// instead.
     pub fn send_json(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
         let mut status = status;
         let mut text = serde_json::to_vec(reply).expect("invariant: replies serialise");
@@ -130,8 +130,8 @@ impl Answers {
     }
 }
 
-/// The request that was received, if any. A failure is due to the client, such as one whose memory is gone: it must not
-/// end the server.
+/// Returns the received request, if any. Only a client can cause a failure, for example if its memory is gone, so a
+/// failure must not end the server.
 pub fn received<T>(
     result: Result<Option<T>, ReceiveError>,
     failed_connections: &FailedConnections,
@@ -145,10 +145,10 @@ pub fn received<T>(
     })
 }
 
-/// The answering port of a service of JSON messages, for answers of any length.
+/// Makes the answering port of a service of JSON messages. Answers may have any length.
 ///
 /// # Errors
-/// If iceoryx2 cannot make it; [`port_owner`] tells whether another process has the port.
+/// If iceoryx2 cannot make it. [`port_owner`] finds out whether another process has the port.
 pub fn control_server(
     service: &ControlService,
     failed_connections: &FailedConnections,
@@ -161,7 +161,7 @@ pub fn control_server(
         .create()
 }
 
-/// The node that has a service's one answering port, if this is why another could not be created.
+/// Returns the node that owns a service's only answering port, if that is why another could not be created.
 pub fn port_owner<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
     error: &ServerCreateError,
@@ -171,12 +171,12 @@ pub fn port_owner<Q: Header, R: Header>(
         .flatten()
 }
 
-/// A listener's id from the two halves in a request's header.
+/// Returns a listener's id from the two halves in a request's header.
 pub fn listener_id(low: u64, high: u64) -> u128 {
     u128::from(low) | u128::from(high) << 64
 }
 
-/// Waits, for half a second at most, until clients have read their answers and dropped their requests.
+/// Waits until clients have read their answers and dropped their requests, for at most half a second.
 pub fn wait_until_taken<Q: Header, R: Header>(requests: &[Active<Q, R>]) {
     let deadline = Instant::now() + LAST_ANSWER_TIMEOUT;
     while requests.iter().any(Active::is_connected) && Instant::now() < deadline {

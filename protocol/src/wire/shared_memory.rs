@@ -1,5 +1,5 @@
-//! Memory for ports. Files in shared memory are sparse, and a write to a page for which there is no memory ends the
-//! process with SIGBUS. So programs give memory to what they may write to, before they do.
+//! Allocates memory for ports. Files in shared memory are sparse, and a write to a page for which there is no memory
+//! ends the process with SIGBUS. So programs allocate the pages that they may write to before they write.
 
 use super::channel_files::ChannelFiles;
 use super::directory::{directory_error, not_usable};
@@ -15,8 +15,8 @@ use std::collections::HashSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-/// The memory of one port's messages. They lie one after the other at its end, and the first free one is taken, so
-/// memory for the first ones is enough while no more are in use.
+/// The memory of one port's messages. The messages are stored consecutively at its end, and a new message takes the
+/// first free place. So memory for the first ones is enough as long as no more are in use.
 #[derive(Debug)]
 pub struct MessageMemory {
     path: PathBuf,
@@ -27,10 +27,11 @@ pub struct MessageMemory {
     n_ready: Cell<u64>,
 }
 
-/// Gives memory to what a node's ports and services write to, but not to messages of the server's.
+/// Allocates memory for everything that a node's ports and services write to; for a server without the memory of
+/// messages.
 ///
 /// # Errors
-/// If there is not enough.
+/// If there is not enough memory.
 pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelError> {
     let files = ChannelFiles::of_user();
     let wrong = |error: std::io::Error| not_usable(&files.root, error);
@@ -52,14 +53,14 @@ pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelEr
 }
 
 impl MessageMemory {
-    /// That of a port which has at least `n_messages` of at least `message_bytes`.
+    /// Finds the memory of a port that holds at least `n_messages` messages of at least `message_bytes` bytes.
     ///
     /// # Errors
-    /// If its file is not there.
+    /// If the port has no such file.
     pub fn of(port: u128, n_messages: usize, message_bytes: usize) -> Result<Self, ChannelError> {
         let files = ChannelFiles::of_user();
         let wrong = |error: std::io::Error| not_usable(SHARED_MEMORY.as_ref(), error);
-        // iceoryx2 numbers the files of memory that may grow.
+        // iceoryx2 numbers the files of memory that can grow.
         let ends = [format!("_{port}.data"), format!("_{port}__0.data")];
         let is_of_port = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -84,7 +85,7 @@ impl MessageMemory {
         })
     }
 
-    /// Makes so many messages ready to be written.
+    /// Allocates memory for the first `n_messages` messages.
     ///
     /// # Errors
     /// If there is not enough memory for them.
@@ -115,7 +116,7 @@ fn open(path: &Path) -> Result<File, ChannelError> {
     opened.map_err(|error| not_usable(path, error))
 }
 
-/// Gives memory to the first bytes of a file; what is in them stays.
+/// Allocates memory for the first bytes of a file, and keeps their content.
 fn fill(path: &Path, file: &File, n_bytes: u64) -> Result<(), ChannelError> {
     loop {
         match fallocate(file, FallocateFlags::empty(), 0, n_bytes.max(1)) {

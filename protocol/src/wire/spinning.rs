@@ -1,44 +1,45 @@
-//! Whether a wait spins or blocks at once, from what came of it before. It knows no clock.
+//! Decides whether a wait spins or blocks at once, from the success of earlier waits. It reads no clock; time is an
+//! argument.
 //!
-//! Where both processes have a core, spinning answers in about 1 us and blocking in about 50 us, most of it the
-//! wake-up of an idle core. Where others keep the cores busy it is the other way round: who spins uses up its time
-//! slice; who blocks is woken ahead of the busy ones. No wait yields: beside a busy process each `sched_yield`
-//! costs a time slice, milliseconds.
+//! If each process has a core, spinning takes about 1 us and blocking about 50 us, mostly to wake an idle core. If
+//! other processes keep the cores busy, blocking is faster: a spinning process uses up its time slice, while a blocked
+//! one is scheduled ahead of busy ones. No wait yields, because with busy processes each `sched_yield` costs a time
+//! slice, which is milliseconds.
 
 use std::time::{Duration, Instant};
 
-/// How long to poll before blocking: longer than the wake-up of a process that answers at once, so that two that
-/// block find out that spinning pays.
+/// Time to poll before blocking. It is longer than the wake-up of a process that answers at once, so that two processes
+/// that block find out that spinning pays.
 const SPIN: Duration = Duration::from_micros(100);
 
-/// A look that comes so long after the one before it: a busy process had the core meanwhile. Less than a time slice;
-/// more than short pieces of work need, such as a snapshot's way to its file.
+/// If the time between two polls exceeds this, a busy process had the core meanwhile. It is less than a time slice, and
+/// more than short work takes, such as handing a snapshot to a writer.
 const LOST_CORE: Duration = Duration::from_millis(1);
 
-/// After so many waits in a row that were longer than the spin, spinning does not pay.
+/// Number of consecutive waits longer than [`SPIN`] after which spinning does not pay.
 const VAIN_SPINS: u32 = 3;
 
-/// How long to block at once then, before one wait tries again.
+/// Time for which waits then block at once, before one wait tries spinning again.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Decides when to spin, from what came of it before. It knows no clock.
+/// The record of earlier waits, from which the next ones decide whether to spin.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Spinning {
-    /// When this wait began, and its last look; `None` where it does not spin, or no more.
+    /// When this wait began, and its last poll; `None` if it does not spin, or has stopped spinning.
     wait: Option<(Instant, Instant)>,
     n_vain: u32,
     not_before: Option<Instant>,
 }
 
 impl Spinning {
-    /// A wait begins.
+    /// Begins a wait.
     pub fn begin(&mut self, now: Instant) {
         let may_spin = self.not_before.is_none_or(|end| now >= end);
         self.wait = may_spin.then_some((now, now));
     }
 
-    /// Nothing has arrived yet: whether to look again at once. If not, block.
-    pub fn goes_on(&mut self, now: Instant) -> bool {
+    /// Returns whether to poll again at once, if nothing has arrived yet. If not, block.
+    pub fn keeps_spinning(&mut self, now: Instant) -> bool {
         let Some((start, last)) = self.wait else {
             return false;
         };
@@ -56,7 +57,7 @@ impl Spinning {
         false
     }
 
-    /// The wait is over: something has arrived.
+    /// Ends the wait, because something has arrived.
     pub fn arrived(&mut self) {
         if self.wait.is_some() {
             self.n_vain = 0;
@@ -68,8 +69,8 @@ impl Spinning {
 mod tests {
     use super::*;
 
-    /// Waits: when each begins in microseconds, when it looks in vain from then on, at which look it blocks, and whether
-    /// something arrives then.
+    /// For each wait: its start in microseconds; the times of its polls without success after the start; the poll at
+    /// which it blocks; and whether something arrives then.
     type Waits<'a> = &'a [(u64, &'a [u64], Option<u64>, bool)];
 
     fn check(waits: Waits<'_>) {
@@ -78,9 +79,9 @@ mod tests {
         for &(start, looks, blocked, arrives) in waits {
             spinning.begin(micros(start));
             let mut looks = looks.iter().copied();
-            let found = looks.find(|at| !spinning.goes_on(micros(start + at)));
+            let found = looks.find(|at| !spinning.keeps_spinning(micros(start + at)));
             assert_eq!(found, blocked, "from {start} on");
-            let after = looks.find(|at| spinning.goes_on(micros(start + at)));
+            let after = looks.find(|at| spinning.keeps_spinning(micros(start + at)));
             assert_eq!(after, None, "it has blocked");
             if arrives {
                 spinning.arrived();
@@ -100,10 +101,10 @@ mod tests {
             (100_100, &[0, 100], Some(100), false),
             (100_200, &[0], Some(0), false),
         ]);
-        // One lost core is enough.
+        // One lost core is enough to stop spinning.
         let at_once = (4_001, &[0][..], Some(0), false);
         check(&[(0, &[0, 5, 4_000], Some(4_000), false), at_once]);
-        // A look soon after a long block tells nothing.
+        // A poll soon after a long block does not count as a lost core.
         let next = (9_000, &[0, 99][..], None, false);
         check(&[(0, &[0, 100, 9_000], Some(100), false), next]);
     }

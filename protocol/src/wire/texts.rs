@@ -1,4 +1,4 @@
-//! A client's side of `control`, the channel of JSON text.
+//! The client's side of `control`, the channel of JSON text.
 
 use super::channel_files::lives_elsewhere;
 use super::channels::{
@@ -19,19 +19,19 @@ use rustix::io::Errno;
 use serde::Deserialize;
 use std::time::Duration;
 
-/// Length that requests may have before their segment grows, bytes.
+/// Maximum size of a request in bytes before its segment grows.
 const SLICE: usize = 4096;
 
 const WHAT: &str = "a control request";
 
-/// The port for texts, and what all requests of its connection need.
+/// The port for JSON requests, and the resources that all requests of its connection share.
 pub(super) struct TextPort {
     client: RequestClient<ControlRequest, ControlReply>,
     sequence: u64,
     pub(super) exchange: Exchange,
 }
 
-/// What every refusal says, and every hello.
+/// The fields of refusals and of `hello` that are read here.
 #[derive(Deserialize, Default)]
 struct Common {
     #[serde(default)]
@@ -41,7 +41,7 @@ struct Common {
 }
 
 impl TextPort {
-    /// Makes the port of the service; it keeps the node, which dies with it.
+    /// Makes the port of the service. The port owns the node, which ends with it.
     pub(super) fn create(
         node: Node<Ipc>,
         instance: &Instance,
@@ -77,7 +77,7 @@ impl TextPort {
         })
     }
 
-    /// Shakes hands; returns what the other side says of itself. `client` names this program in its log.
+    /// Shakes hands, and returns the server's reply to `hello`. `client` names this program in the server's log.
     pub(super) fn shake_hands(
         &mut self,
         client: &str,
@@ -89,7 +89,7 @@ impl TextPort {
         };
         let hello = serde_json::to_vec(&hello).expect("invariant: requests serialise");
         let answer = self.ask(&hello, timeout)?;
-        // In another PID namespace, the server's process id names another process or none.
+        // In another PID namespace, the server's process id refers to another process or to none.
         let said: Common = serde_json::from_slice(&answer).map_err(|it| garbled("hello", it))?;
         if said
             .pid_namespace
@@ -100,14 +100,14 @@ impl TextPort {
         Ok(answer)
     }
 
-    /// Sends a text and returns the text of its answer.
+    /// Sends a JSON request and returns its reply.
     pub(super) fn ask(
         &mut self,
         text: &[u8],
         timeout: Duration,
     ) -> Result<Vec<u8>, ConnectionError> {
         if text.len() > SLICE {
-            check_room_for_ports(text.len())?; // It will be in a new file.
+            check_room_for_ports(text.len())?; // The request needs a new file.
         }
         self.sequence += 1;
         let (listener_low, listener_high) = self.exchange.listener_id();
@@ -131,7 +131,7 @@ impl TextPort {
     }
 }
 
-/// The process of a service's server.
+/// Returns the process of a service's server.
 fn server_process(
     service: &ControlService,
     instance: &Instance,

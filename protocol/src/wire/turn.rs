@@ -1,7 +1,8 @@
-//! A lock between processes: one that makes or removes nodes, services or ports takes a turn (PROTOCOL.md section 1).
+//! A lock between processes. A *turn* is the time in which one process holds it; every process takes a turn before it
+//! creates or removes nodes, services or ports (PROTOCOL.md section 1).
 //!
-//! During its turn no other process makes anything: what is unfinished was left by a dead one. The lock is a `flock`,
-//! which ends with its process.
+//! During a turn no other process creates anything, so unfinished files were left by dead processes. The lock is a
+//! `flock`, which ends with its process.
 
 use super::directory::{not_usable, own_channel_directory};
 use super::process::process_state;
@@ -16,49 +17,49 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long to wait for others, each of which takes milliseconds.
+/// Maximum wait for other processes, each of which takes milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
 
-/// The same for what can also be done without a turn, or by the next program: closing and cleaning up.
+/// Maximum wait before closing and cleaning up, which can also be done without a turn, or by the next program.
 const SHORT_WAIT: Duration = Duration::from_secs(1);
 
-/// How long to wait before asking which process has the turn, and whether it is stopped.
+/// Time after which a waiting process checks which process has the turn, and whether it is stopped.
 const STOPPED_WAIT: Duration = Duration::from_millis(50);
 
-/// A process that has had the turn for so long does not run: it may be frozen, which it does not show.
+/// Time after which a process that has the turn counts as frozen. The system does not report frozen processes.
 const FROZEN_WAIT: Duration = Duration::from_secs(2);
 
-/// How often to try.
+/// Interval between two attempts.
 const INTERVAL: Duration = Duration::from_micros(500);
 
-/// The file in the channel directory that is locked.
+/// The lock file in the channel directory.
 const LOCK: &str = "lock";
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Held {
     No,
-    /// By this thread; no other process makes or removes anything.
+    /// This thread has the lock: no other process creates or removes anything.
     Alone,
-    /// By a stopped process, which is not waited for.
+    /// A stopped process has the lock, and this thread continues without it.
     Unlocked,
 }
 
-/// Whether a thread of this process has its turn, or forks: the child of a fork within a turn would inherit locks that
-/// nobody unlocks there. Of an atom and sleep, which survive a fork themselves.
+/// Whether a thread of this process has its turn, or forks. The child of a fork during a turn would inherit a lock that
+/// nobody in it unlocks. The flag is an atomic that is polled, because these survive a fork.
 static BUSY: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
     static HELD: Cell<Held> = const { Cell::new(Held::No) };
 }
 
-/// A turn; it ends when it is dropped. One within another of the same thread is part of that.
+/// A turn, which ends when it is dropped. A turn within another turn of the same thread is part of it.
 #[derive(Debug)]
 pub struct Turn {
     is_outermost: bool,
     lock: Option<OwnedFd>,
 }
 
-/// Waits for the turns of other threads, and keeps them waiting; call it before a fork.
+/// Waits until no other thread has a turn, and blocks new turns. Call it before a fork.
 pub fn before_fork() {
     if HELD.get() == Held::No {
         while BUSY.swap(true, Ordering::Acquire) {
@@ -67,7 +68,7 @@ pub fn before_fork() {
     }
 }
 
-/// Lets them go on; call it after the fork, in the parent and in the child.
+/// Allows turns again. Call it after the fork, in the parent and in the child.
 pub fn after_fork() {
     if HELD.get() == Held::No {
         BUSY.store(false, Ordering::Release);
@@ -75,20 +76,20 @@ pub fn after_fork() {
 }
 
 impl Turn {
-    /// Waits for a turn. A process that has it and is stopped or frozen is not waited for.
+    /// Waits for a turn, but not for a stopped or frozen process that has it.
     ///
     /// # Errors
-    /// If others hold it for too long, or the directory cannot be written to.
+    /// If other processes hold the lock for too long, or the directory is not writable.
     pub fn take() -> Result<Self, ChannelError> {
         Self::take_within(LONGEST_WAIT)
     }
 
-    /// As [`Self::take`], but waits no longer than a limit.
+    /// Waits like [`Self::take`], with a maximum wait.
     pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
         Self::take_unless(limit, check_interrupt)
     }
 
-    /// As [`Self::take`], but for a short time and uninterrupted: to close what is open, and to clean up.
+    /// Waits like [`Self::take`], with a short maximum wait and without interrupts: to close ports and to clean up.
     pub(crate) fn take_to_end() -> Result<Self, ChannelError> {
         Self::take_unless(SHORT_WAIT, || Ok(()))
     }
@@ -115,7 +116,7 @@ impl Turn {
         Ok(Self { is_outermost, lock })
     }
 
-    /// Whether no other process has it.
+    /// Returns whether this thread has the lock, so that no other process is active.
     pub fn is_alone(&self) -> bool {
         HELD.get() == Held::Alone
     }
@@ -124,7 +125,7 @@ impl Turn {
 impl Drop for Turn {
     fn drop(&mut self) {
         if let Some(lock) = &self.lock {
-            // Not by closing alone: a child of a fork may have a copy.
+            // Closing alone is not enough, because the child of a fork may have a copy.
             let _ = flock(lock, FlockOperation::Unlock);
         }
         if self.is_outermost {
@@ -134,7 +135,7 @@ impl Drop for Turn {
     }
 }
 
-/// The lock; `None` if a stopped or frozen process has it.
+/// Waits for the lock. Returns `None` if a stopped or frozen process has it.
 fn wait(
     path: &Path,
     limit: Duration,
@@ -148,7 +149,7 @@ fn wait(
         let file = open(path, flags, Mode::RUSR | Mode::WUSR).map_err(wrong)?;
         match flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) if is_file(&file, path) => return Ok(Some(file)),
-            Ok(()) => continue, // It was removed meanwhile: others lock another file now.
+            Ok(()) => continue, // The file was removed meanwhile, and others lock a new file.
             Err(Errno::WOULDBLOCK | Errno::INTR) => {}
             Err(errno @ (Errno::PERM | Errno::ACCESS | Errno::NOSYS)) => {
                 return Err(call_error("flock", errno));
@@ -187,7 +188,7 @@ fn is_file(file: &OwnedFd, path: &Path) -> bool {
     }
 }
 
-/// The process that has the lock, by `/proc/locks`.
+/// Returns the process that has the lock, from `/proc/locks`.
 fn holder(file: &OwnedFd) -> Option<i32> {
     let found = fstat(file).ok()?;
     let (major, minor) = (major(found.st_dev), minor(found.st_dev));

@@ -1,4 +1,4 @@
-//! The bounded wait that both sides use: spin while that pays, then block, never past a deadline.
+//! The bounded wait of both sides: spin while that pays, then block, never longer than a deadline.
 
 use super::ipc::Ipc;
 use super::resources::ipc_error;
@@ -12,17 +12,17 @@ use std::time::{Duration, Instant};
 
 pub use super::poll::{is_readable, sleep_until_event, sleep_until_readable};
 
-/// Waits, and remembers whether spinning pays.
+/// A waiter that learns whether spinning pays.
 #[derive(Debug, Default)]
 pub struct Waiter {
     spinning: Cell<Spinning>,
 }
 
 impl Waiter {
-    /// Polls until something arrives or the timeout has passed, then returns `None`.
+    /// Polls until something arrives. Returns `None` if the timeout passes before that.
     ///
-    /// `block` may sleep for at most the duration it is given; it is called again and again until the
-    /// timeout, so it may return early for any reason.
+    /// `block` may sleep for at most the duration that it is given. It is called repeatedly until the timeout, so it
+    /// may return early for any reason.
     ///
     /// # Errors
     /// The first error of `poll` or `block`.
@@ -43,7 +43,7 @@ impl Waiter {
             }
             let now = Instant::now();
             let waited = now - start;
-            if spinning.goes_on(now) {
+            if spinning.keeps_spinning(now) {
                 std::hint::spin_loop();
             } else if waited < timeout {
                 block(timeout - waited)?;
@@ -56,14 +56,14 @@ impl Waiter {
     }
 }
 
-/// The descriptor that is readable while a listener has notifications to drain.
+/// Returns the descriptor that is readable while a listener has notifications to drain.
 #[expect(unsafe_code, reason = "iceoryx2 hands out the raw descriptor only")]
 pub fn descriptor(listener: &Listener<Ipc>) -> BorrowedFd<'_> {
     // SAFETY: the descriptor stays open as long as its listener, which the result borrows.
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
 
-/// Drops a listener's wake-ups; returns whether there were any.
+/// Drops a listener's wake-ups, and returns whether there were any.
 ///
 /// # Errors
 /// If iceoryx2 cannot read them.

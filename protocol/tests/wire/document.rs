@@ -22,14 +22,14 @@ pub struct Field {
     pub of: String,
 }
 
-/// The cells of each row of the one table whose header line begins like this.
+/// Returns the cells of each row of the one table whose header line begins like this.
 pub fn rows_under(header: &str) -> Vec<Vec<String>> {
     let (_, rest) = PROTOCOL.split_once(&format!("\n{header}")).expect(header);
     assert!(!rest.contains(&format!("\n{header}")), "two {header}");
     rows(rest)
 }
 
-/// The byte table of a struct, and its `struct` format.
+/// Returns the byte table of a struct, and its `struct` format.
 pub fn documented_struct(name: &'static str) -> (Layout, String) {
     let start = format!("\n### {name}: `");
     let (_, rest) = PROTOCOL.split_once(&start).expect(name);
@@ -50,7 +50,7 @@ pub fn documented_struct(name: &'static str) -> (Layout, String) {
     (layout, parts[2].into())
 }
 
-/// The fields in the one byte table whose header line begins like this.
+/// Returns the fields in the one byte table whose header line begins like this.
 pub fn fields_under(header: &str) -> Vec<Field> {
     rows_under(header).into_iter().map(field).collect()
 }
@@ -64,7 +64,7 @@ fn field(row: Vec<String>) -> Field {
     }
 }
 
-/// The fenced blocks of a language: what follows the language on the fence's line, and the text.
+/// Returns the fenced blocks of a language, with the title after the language and the text.
 pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
     let blocks = PROTOCOL.split("\n```").skip(1).step_by(2);
     blocks
@@ -72,7 +72,7 @@ pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
         .collect()
 }
 
-/// The byte sizes that a Python `struct` format with `=` names.
+/// Returns the byte sizes in a Python `struct` format with `=`.
 pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
     let codes = format.strip_prefix('=').expect("standard sizes");
     let mut count = None;
@@ -92,7 +92,7 @@ pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
     sizes
 }
 
-/// The sizes of a struct's numbers, nested structs laid out flat.
+/// Returns the sizes of a struct's numbers, with nested structs flattened.
 pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     let of_field = |field: &Field| match field.of.as_str() {
         "u16" => vec![2],
@@ -104,7 +104,7 @@ pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     layout.fields.iter().flat_map(of_field).collect()
 }
 
-/// The bytes of a worked example. Compares each number's bytes with the value written next to them.
+/// Returns the bytes of a worked example. Compares each number's bytes with the value written next to them.
 pub fn worked_example(name: &str) -> Vec<u8> {
     let mut blocks = fences("hex").into_iter();
     let (_, text) = blocks.find(|(title, _)| title.trim() == name).expect(name);
@@ -136,7 +136,7 @@ fn bytes_of_hex(text: &str) -> Vec<u8> {
     text.split(' ').map(byte).collect()
 }
 
-/// The rows of a table whose header line has begun before `rest`.
+/// Returns the rows of a table whose header line begins before `rest`.
 fn rows(rest: &str) -> Vec<Vec<String>> {
     let lines = rest.lines().skip(2);
     let cells = |line: &str| {

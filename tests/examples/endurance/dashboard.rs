@@ -1,4 +1,4 @@
-//! What a dashboard costs the simulator, with and without a browser that draws, and what it uses itself.
+//! Measures what a dashboard costs the simulator, with and without a browser, and what it uses itself.
 
 use crate::observers::table;
 use std::time::Instant;
@@ -7,7 +7,7 @@ use tests::harness::{Program, Server};
 use tests::meter::{Use, processor_seconds};
 use tests::report::say;
 
-/// A dashboard on a server, perhaps with a browser; says on drop what the dashboard used.
+/// A dashboard on a server, optionally with a browser. Prints on drop what the dashboard used.
 struct Audience {
     dashboard: Program,
     browser: Option<Program>,
@@ -15,7 +15,7 @@ struct Audience {
     _profile: TempDir,
 }
 
-/// Compares a step's time without, with a dashboard, and with one that Chromium draws, on a grid of some side.
+/// Compares the time of a step without a dashboard, with a dashboard, and with one shown in Chromium, on a square grid.
 pub fn compare(n_rounds: usize, side: usize) {
     let audience = |with_dashboard: bool, with_browser: bool| {
         move |server: &Server| with_dashboard.then(|| Audience::attend(server, with_browser))
@@ -43,7 +43,7 @@ impl Audience {
                 "--no-sandbox",
                 "--disable-gpu",
                 "--window-size=1280,720",
-                // Without a port to debug it, it would end at once.
+                // Without a debugging port, Chromium would end immediately.
                 "--remote-debugging-port=0",
                 &format!("--user-data-dir={}", profile.path().display()),
                 url.trim(),

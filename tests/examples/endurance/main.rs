@@ -1,4 +1,4 @@
-//! What observers and snapshots cost a server, and what hours of coming and going do to it.
+//! Measures what observers, dashboards and snapshots cost a server, and what hours of changing clients do.
 //!
 //! `cargo run --release -p tests --example endurance -- observers 5 | dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 

@@ -1,4 +1,4 @@
-//! What observers cost: a step's time with 0, 1, 4 and 16 of them, one of them stopped.
+//! Measures the time of a step with 0, 1, 4 and 16 observers, one of which is stopped.
 
 use emberwatch_protocol::Probabilities;
 use emberwatch_protocol::agent_belief::{BeliefPublisher, Intent};
@@ -15,7 +15,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 20_000;
 
-/// Prints the server's own time and the round trip for each number of observers, some rounds over.
+/// Prints the server's own time and the round trip for each number of observers, over `n_rounds` rounds.
 pub fn compare(n_rounds: usize) {
     let audiences = [0, 1, 4, 16].map(|n_observers| {
         let attend = move |server: &Server| -> Vec<Program> {
@@ -26,8 +26,8 @@ pub fn compare(n_rounds: usize) {
     table(n_rounds, "--burn-in 1000", &audiences);
 }
 
-/// Prints median and 99th percentile of the server's own time and of the round trip beside each audience: the
-/// median over rounds, and the least and the greatest.
+/// Prints, for each audience, the median and 99th percentile of the server's own time and of the round trip: their
+/// median, minimum and maximum over the rounds.
 pub fn table<A, T>(n_rounds: usize, flags: &str, audiences: &[(String, A)])
 where
     A: Fn(&Server) -> T,
@@ -49,7 +49,7 @@ where
     }
 }
 
-/// Median and 99th percentile of the server's time for a step, then of the round trip, us.
+/// Returns the median and 99th percentile of the server's time for a step, then of the round trip, in microseconds.
 fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let server = Server::start(flags);
     let _audience = attend(&server);
@@ -63,7 +63,7 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let mut last = Instant::now();
     for n in 0..N_STEPS {
         let path = path_to_bytes(&paths.next(info.n_moves));
-        // As an agent that plans for a while: 2,000 steps a second, not as many as there can be.
+        // Limits the rate to 2,000 steps per second, like an agent that plans for some time.
         while last.elapsed() < Duration::from_micros(500) {
             std::hint::spin_loop();
         }
@@ -73,7 +73,7 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
             work.push(reply.simulation_nanos as f64 / 1e3);
             trips.push(last.elapsed().as_secs_f64() * 1e6);
         }
-        // As an agent shows its beliefs: at most each 20 ms.
+        // Publishes a belief at most every 20 ms, like an agent.
         if n % 40 == 0 && showcase.is_watched() {
             let parts = split_step_payload(&reply, &payload).expect("a good answer");
             let world = &parts.worlds[0];
@@ -104,7 +104,7 @@ fn start(server: &Server, is_stopped: bool) -> Program {
     observer
 }
 
-/// Reads frames without end.
+/// Reads frames until the process is killed.
 pub fn observe(instance: &str) {
     let instance = Instance::new(instance).expect("a plain name");
     let observer = Observer::frames(&instance).expect("observe");

@@ -1,4 +1,4 @@
-//! What `--snapshot-every 1000` costs a client that steps as fast as it can, with a folder where temporary files are.
+//! Measures what `--snapshot-every 1000`, with a temporary folder, costs a client that steps as fast as it can.
 
 use emberwatch_protocol::path::path_to_bytes;
 use std::time::Instant;
@@ -9,7 +9,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 100_000;
 
-/// Prints the time of a step without and with snapshots, run in turns, and their ratio.
+/// Prints the time of a step without and with snapshots, measured alternately, and their ratio.
 pub fn compare(n_rounds: usize) {
     let (mut without, mut with, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..n_rounds {
@@ -38,7 +38,7 @@ pub fn compare(n_rounds: usize) {
     ));
 }
 
-/// Microseconds of a step.
+/// Returns the time of a step in microseconds.
 fn measure(flags: &str) -> f64 {
     let server = Server::start(&format!("--burn-in 1000 {flags}"));
     let mut stepper = Stepper::new(server.connect(), 0..1);

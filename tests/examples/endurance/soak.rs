@@ -1,5 +1,5 @@
-//! Hours of agents and observers that come, go, are killed, stopped and taken over, snapshots among them;
-//! what the server uses, second by second, as CSV and as a figure.
+//! Runs for hours agents and observers that come, go, are killed, stopped and taken over, together with snapshots.
+//! Writes what the server uses, second by second, as a CSV file and as a figure.
 
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;
@@ -16,7 +16,7 @@ use tests::report::say;
 const FLAGS: &str =
     "--height 64 --width 64 --worlds 4 --burn-in 1000 --lease-millis 1000 --publish-truth";
 
-/// Does all that for some seconds; writes `soak.csv` and `soak.svg`.
+/// Runs the test for this many seconds and writes `soak.csv` and `soak.svg`.
 pub fn soak(seconds: u64, folder: &Path) {
     std::fs::create_dir_all(folder).expect("the folder");
     let snapshots = folder.join("snapshots");
@@ -60,7 +60,7 @@ pub fn soak(seconds: u64, folder: &Path) {
     write(folder, &rows);
 }
 
-/// Those who come and go.
+/// The agents and observers that come and go.
 struct Guests<'a> {
     server: &'a Server,
     rng: ChaCha8Rng,

@@ -1,7 +1,7 @@
-//! A simulator under attack: the victim in it, who acts on a world of its own, and shares another with an attacker.
+//! A simulator under attack, with a victim that acts on its own world and shares another world with an attacker.
 //!
-//! It is kept from one input to the next, so that leases, resets and episodes come to every
-//! state, and begins again after some inputs, so that few of them cause a failure.
+//! The simulator is kept between inputs, so that leases, resets and episodes reach every state. It is replaced after
+//! some inputs, so that a failure can be reproduced from few inputs.
 
 use crate::mirror::step_again;
 use crate::wire::{step_body, step_header};
@@ -25,49 +25,49 @@ use std::time::{Duration, Instant};
 
 pub const N_MOVES: usize = 4;
 pub const N_ROBOTS: usize = 2;
-/// The attackers' two, the shared one, the victim's.
+/// Two worlds of the attackers, the shared world and the victim's world.
 pub const N_WORLDS: u32 = 4;
-/// The shared world: its first robot is the attacker's, its second the victim's.
+/// The shared world, whose first robot the attacker holds and whose second robot the victim holds.
 pub const SHARED: usize = 2;
 /// The victim's world.
 const HOME: usize = 3;
-/// Robots that are the attackers', from 0 on.
+/// Number of robots that the attackers hold, from robot 0 on.
 pub const N_THEIRS: u32 = (SHARED * N_ROBOTS + 1) as u32;
 
-/// How long the shared world waits for a path.
+/// Deadline of the shared world.
 const DEADLINE: Duration = Duration::from_millis(50);
 
-/// Inputs that one simulator gets.
+/// Number of inputs for one simulator.
 const N_INPUTS: usize = 256;
 
-/// Of so many inputs, the victim steps after one.
+/// The victim steps once per this many inputs.
 const VICTIM_STEPS: usize = 8;
 
-/// Who must not notice anything: the victim in its own world, and as a second client in the shared one.
+/// The two undisturbed clients: the victim in its own world, and its second client in the shared world.
 const VICTIM: ClientId = ClientId { node: 1, pid: 1 };
 const SHARER: ClientId = ClientId { node: 4, pid: 4 };
 
-/// The others. The first holds the attackers' robots.
+/// The attacking clients. The first one holds the attackers' robots.
 pub const ATTACKERS: [ClientId; 2] = [ClientId { node: 2, pid: 2 }, ClientId { node: 3, pid: 3 }];
 
-/// A simulator, its clock, and what waits.
+/// A simulator with its simulated clock and its waiting requests.
 pub struct Siege {
     pub simulator: Simulator,
     pub now: Instant,
     pub jobs: Vec<ResetJob>,
     pub pending: Vec<(ClientId, PendingReply)>,
-    /// The victim's lease, then the attackers' last, then the victim's in the shared world.
+    /// The victim's lease, then the attackers' latest leases, then the victim's lease in the shared world.
     pub leases: [u64; 4],
-    /// The attacker's step that waits, and since when.
+    /// The attacker's waiting step, and since when it waits.
     pub attackers_step: Option<(Ticket, Instant)>,
-    /// The victim's step that waits in the shared world, and its path.
+    /// The victim's waiting step in the shared world, and its path.
     shared_step: Option<(Ticket, Vec<u8>)>,
-    /// The shared world as it must be.
+    /// The expected shared world.
     mirror: Episode,
     n_inputs: usize,
 }
 
-/// A world, and each of its robots with its frame.
+/// The result of a world, and the result and frame of each of its robots.
 pub type WorldSeen = (WorldResult, Vec<(RobotResult, Vec<u8>)>);
 
 pub fn on_siege(input: impl FnOnce(&mut Siege) -> bool) -> bool {
@@ -86,7 +86,7 @@ pub fn on_siege(input: impl FnOnce(&mut Siege) -> bool) -> bool {
 }
 
 impl Siege {
-    /// The victim and the first attacker hold their worlds.
+    /// Creates the simulator, in which the victim and the first attacker hold their robots.
     fn begin() -> Self {
         let config = ServerConfig {
             worlds: N_WORLDS,
@@ -139,7 +139,7 @@ impl Siege {
             .control(self.now, client, version, text, &ServerStats::default())
     }
 
-    /// Runs the resets, and answers the clients that waited for them.
+    /// Runs the pending resets and answers the clients that waited for them.
     pub fn finish_resets(&mut self) {
         for job in std::mem::take(&mut self.jobs) {
             let (world, episode) = job.run(&self.simulator.spec().rules);
@@ -157,14 +157,14 @@ impl Siege {
         }
     }
 
-    /// Results and frames of the worlds, but of those in their burn-in.
+    /// Returns the results and frames of all worlds, or `None` for a world in its burn-in.
     pub fn worlds(&self) -> Vec<Option<WorldSeen>> {
         let worlds = self.simulator.worlds();
         let episodes = worlds.map(|world| self.simulator.episode(world));
         episodes.map(|episode| episode.map(seen)).collect()
     }
 
-    /// What everybody may know of the worlds.
+    /// Returns the public status of the worlds.
     pub fn status(&mut self) -> Vec<WorldStatus> {
         match self.ask(VICTIM, VERSION, br#"{"op":"status"}"#) {
             Outcome::Answer(Reply::Status(status)) => status.worlds,
@@ -172,7 +172,7 @@ impl Siege {
         }
     }
 
-    /// Steps the victim's world, which must go as if nobody else were there; and its robot in the shared one.
+    /// Steps the victim's world, which must evolve as if alone, and sends or cancels a step in the shared world.
     fn victim_steps(&mut self) {
         static QUIET: OnceLock<Vec<(StepReply, Vec<u8>)>> = OnceLock::new();
         let steps = QUIET.get_or_init(|| {
@@ -187,7 +187,7 @@ impl Siege {
             "the victim's step {number} differs"
         );
         match self.shared_step.take_if(|_| number % 2 == 1) {
-            // What is given up is never flown.
+            // A cancelled path must never be flown.
             Some((ticket, _)) => self.simulator.cancel_step(self.now, ticket),
             None => self.fly_shared(),
         }
@@ -207,7 +207,7 @@ impl Siege {
         (reply, payload)
     }
 
-    /// Sends a path for the victim's robot of the shared world, unless one waits.
+    /// Sends a path for the victim's robot in the shared world, unless one is waiting.
     pub fn fly_shared(&mut self) {
         if self.shared_step.is_some() || self.mirror.is_over() {
             return;
@@ -229,7 +229,7 @@ impl Siege {
         self.check_shared();
     }
 
-    /// Takes the answers to steps that waited, and checks that the shared world is as its own paths make it.
+    /// Collects the answers to waiting steps, and checks that the shared world agrees with its paths.
     pub fn check_shared(&mut self) {
         let (mut payload, mut waited) = (Vec::new(), Duration::ZERO);
         let before = self.mirror.outcome().step;
@@ -253,7 +253,7 @@ impl Siege {
         assert!(is_due, "the victim was not waited for");
     }
 
-    /// Takes the step in the mirror that the shared world has taken, if any: with this path of the victim's, or none.
+    /// If the shared world has stepped, repeats the step in the mirror, with the given path of the victim or none.
     fn check_shared_step(&mut self, path: Option<&[u8]>) {
         let episode = self.simulator.episode(SHARED);
         let episode = episode.expect("nobody but who holds both robots resets it");
@@ -286,7 +286,7 @@ fn seen(episode: &Episode) -> WorldSeen {
     (world_result(episode.outcome()), robots.collect())
 }
 
-/// Checks that an answer is whole, and a refusal empty.
+/// Checks that an answer is complete and that a refusal is empty.
 pub fn check_answer(reply: &StepReply, payload: &[u8]) -> Status {
     assert_eq!(reply.version, VERSION);
     let parts = split_step_payload(reply, payload).expect("as long as its header says");

@@ -1,4 +1,4 @@
-//! What the programs read from files: models, checkpoints.
+//! Fuzz targets for models and checkpoints.
 
 use super::messages::Seed;
 use emberwatch_belief::estimation::belief::Belief;
@@ -22,10 +22,10 @@ use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape, Transit
 use ndarray::{Array3, Axis};
 use std::collections::BTreeMap;
 
-/// Steps that a model is simulated for.
+/// Number of simulated steps of a model.
 const N_STEPS: u64 = 8;
 
-/// A model file: refused, or it can be written, read, simulated and filtered.
+/// Checks that a model file is refused, or can be written, read again, simulated and filtered.
 pub fn model(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return false;
@@ -50,7 +50,7 @@ pub fn model(bytes: &[u8]) -> bool {
     true
 }
 
-/// Certain beliefs and the one that knows nothing.
+/// Checks that predictions from certain beliefs and from the uniform belief are valid beliefs.
 fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<f32>) {
     let dim = (model.n_states(), shape.height(), shape.width());
     let mut next = Array3::zeros(dim);
@@ -67,7 +67,7 @@ fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<
     }
 }
 
-/// From every cell where a robot may be.
+/// Checks that moves from every free cell end in free cells.
 fn robots_stay_free(airspace: &Airspace) {
     let shape = airspace.shape();
     let cells = (0..shape.n_cells()).map(|index| shape.cell(index));
@@ -85,7 +85,7 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     for step in 0..N_STEPS {
         dynamics.step(1, step, &mut states);
     }
-    // Panics where there is no such state.
+    // The index panics if a state does not exist.
     let rewards = states
         .iter()
         .map(|state| model.reward()[usize::from(*state)]);
@@ -93,8 +93,8 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     assert!(reward.is_finite(), "the reward sums to {reward}");
 }
 
-/// A checkpoint: refused, or what it holds is finite, and a learner goes on from it or refuses it. Its digest is
-/// mended, which keeps damage out but nobody who means harm.
+/// Checks that a checkpoint is refused, or that its numbers are finite and a learner resumes from it or refuses it. The
+/// digest is corrected first, because it protects against damage, not against attackers.
 pub fn checkpoint(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     let mut learned = learners::from_bytes(&bytes);
@@ -115,7 +115,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let n_matrices = filter.tables.dimensions.n_matrices as f64;
         let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
-        // That of decisions is no learner's.
+        // Checkpoints of decisions also hold a filter, but a filter learner resumes only from its own checkpoints.
         if learners::filter::FILTER.checkpoints.contains(&&*kind) {
             learn(&contents, filter.tables.dimensions.sees_own_state);
         }
@@ -131,13 +131,13 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     true
 }
 
-/// Goes on from a filter's checkpoint, if a learner can.
+/// Resumes from a filter's checkpoint, if a learner accepts it.
 fn learn(contents: &Contents, sees_own_state: bool) {
     let learner = FilterLearner::resume(contents, dimensions(sees_own_state), worlds(), &config());
     if let Ok(mut learner) = learner {
         let again = learner.contents().expect("no device");
         let saved: SavedFilter = again.state().expect("its state");
-        // More takes its time. Numbers that are finite may be too large to work with.
+        // More updates would take too long. Learning may fail, because finite numbers can be too large to compute with.
         let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
     }
 }
@@ -152,7 +152,7 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
     }
 }
 
-/// Worlds of three cells.
+/// Returns worlds of three cells.
 fn worlds() -> Worlds {
     Worlds {
         airspace: Airspace::open(Shape::new(1, 3).expect("a grid")),
@@ -167,12 +167,12 @@ fn config() -> AgentConfig {
     config.learning.window = 2;
     config.learning.block_windows = 1;
     config.learning.streams = 2;
-    // Few enough numbers for a corpus.
+    // Small networks keep the files of the corpus small.
     config.decisions.learning.width = 1;
     config
 }
 
-/// Decisions before their first step, on a filter before its first.
+/// Returns the checkpoint of untrained decisions on an untrained filter.
 fn decisions() -> Contents {
     let learner = DecisionsLearner::new(base_of_filter(), None, worlds(), &config());
     let mut contents = learner.and_then(|learner| learner.contents());
@@ -198,7 +198,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         n_matrices: 2,
         ..dimensions(false)
     };
-    // The large autoencoder asked for 30 GiB once.
+    // The large autoencoder guards against a claimed size of 30 GiB.
     [
         ("filter", "learned_filter", filter(dimensions(false))),
         ("own_filter", "learned_own_filter", filter(dimensions(true))),
@@ -211,7 +211,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     .into()
 }
 
-/// A learner that has seen some frames.
+/// Returns the checkpoint of a filter learner after some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape(), config());
     let mut fit = FilterFit::new(dimensions, shape, &config);
@@ -232,7 +232,7 @@ fn filter(dimensions: Dimensions) -> Contents {
     Contents::new(tensors, &state)
 }
 
-/// As far as the sizes that it asks for.
+/// Returns the checkpoint of an autoencoder of this size, without its weights.
 fn autoencoder(side: usize, length: usize) -> Contents {
     let cell = Shape::new(1, 1).expect("a grid");
     let state = SavedNetwork {

@@ -1,4 +1,4 @@
-//! What a client, an observer or a learner reads: answers, frames, replies.
+//! Fuzz targets for the messages that clients and observers read: answers, frames, replies.
 
 use bytemuck::{Pod, bytes_of};
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
@@ -16,19 +16,19 @@ use serde::de::DeserializeOwned;
 use std::collections::HashSet;
 use std::fmt::Debug;
 
-/// A file of a corpus: name and bytes.
+/// A file of a corpus: its name and bytes.
 pub type Seed = (&'static str, Vec<u8>);
 
-/// Observations of the model that frames are of.
+/// Number of observations of the model.
 const N_OBSERVATIONS: usize = 3;
 
-/// A header from the first bytes, and the rest; `None` if there are too few.
+/// Splits bytes into a header and the rest. Returns `None` if there are too few bytes.
 pub fn split_header<H: Pod>(bytes: &[u8]) -> Option<(H, &[u8])> {
     let (header, payload) = bytes.split_at_checked(size_of::<H>())?;
     Some((bytemuck::pod_read_unaligned(header), payload))
 }
 
-/// A step's answer: what splits is every byte of it, and frames hold what was observed or nothing.
+/// Checks that an answer to a step splits completely into its parts, and that its frames hold valid observations.
 pub fn step_answer(bytes: &[u8]) -> bool {
     let Some((reply, payload)) = split_header::<StepReply>(bytes) else {
         return false;
@@ -59,7 +59,7 @@ pub fn step_answer(bytes: &[u8]) -> bool {
     !parts.worlds.is_empty() && frames.map(|frame| is_frame(shape, frame)).min() == Some(true)
 }
 
-/// A sample of `frames`: of each robot a frame, and a path that stays on the grid.
+/// Checks that each robot in a sample of `frames` has a valid frame and a path that stays on the grid.
 pub fn frame(bytes: &[u8]) -> bool {
     let Some((header, payload)) = split_header::<FrameHeader>(bytes) else {
         return false;
@@ -100,7 +100,7 @@ fn is_path(shape: Shape, start: Cell, bytes: &[u8]) -> bool {
     true
 }
 
-/// A sample of `agent`: a belief of as many numbers as its header says, and what the agent wants.
+/// Checks that the belief and the plan in a sample of `agent` have the lengths that the header states.
 pub fn outlook(bytes: &[u8]) -> bool {
     let Some((header, payload)) = split_header::<AgentHeader>(bytes) else {
         return false;
@@ -116,7 +116,7 @@ pub fn outlook(bytes: &[u8]) -> bool {
     true
 }
 
-/// A reply on `control`.
+/// Checks a reply on `control`.
 pub fn control_reply(bytes: &[u8]) -> bool {
     let reply = survives::<Reply>(bytes);
     if let Some(Reply::Hello(info)) = &reply
@@ -129,7 +129,7 @@ pub fn control_reply(bytes: &[u8]) -> bool {
     reply.is_some_and(|reply| reply.status() == Status::Ok)
 }
 
-/// What is parsed is written, and is the same when it is parsed again.
+/// Parses a value, writes it and checks that it is unchanged when parsed again.
 pub fn survives<T: Serialize + DeserializeOwned + PartialEq + Debug>(bytes: &[u8]) -> Option<T> {
     let value = parse::<T>(bytes).ok()?;
     let text = serde_json::to_vec(&value).expect("what was parsed is written");
@@ -160,7 +160,7 @@ pub fn step_answer_seeds() -> Vec<Seed> {
     ]
 }
 
-/// What a robot was given that flew so many moves.
+/// Returns the result of a robot that flew `n_moves` moves.
 fn flew(n_moves: u32) -> RobotResult {
     RobotResult {
         reward: 2.0,

@@ -1,4 +1,4 @@
-//! What the server reads: requests of attackers.
+//! Fuzz targets for the requests that the server reads.
 
 use super::besieged::{
     ATTACKERS, N_MOVES, N_ROBOTS, N_THEIRS, N_WORLDS, SHARED, Siege, WorldSeen, check_answer,
@@ -14,15 +14,15 @@ use emberwatch_protocol::message::{
 use emberwatch_sim::simulator::{Outcome, PendingReply, Stepped};
 use std::time::Duration;
 
-/// What stands for the attacker's lease in a control request.
+/// The placeholder for the attacker's lease in a control request.
 const LEASE: &str = "LEASE";
 
-/// A step request, 56 bytes, and its payload; steps k count from the present ones of their worlds.
+/// Handles a step request: a header of 56 bytes, and a payload whose steps k are relative to the current ones.
 pub fn step(bytes: &[u8]) -> bool {
     split_header(bytes).is_some_and(|(request, body)| on_siege(|siege| siege.step(&request, body)))
 }
 
-/// A byte that says who asks and what happened before, and a control request.
+/// Handles a byte that selects the client and the events before, and then a control request.
 pub fn control(bytes: &[u8]) -> bool {
     bytes
         .split_first()
@@ -31,7 +31,7 @@ pub fn control(bytes: &[u8]) -> bool {
 
 impl Siege {
     fn step(&mut self, request: &StepRequest, body: &[u8]) -> bool {
-        // One request at a time: with the next one it gives up what waits.
+        // The attacker has one request at a time, so a new one cancels its waiting request.
         if let Some((given_up, _)) = self.attackers_step.take() {
             self.simulator.cancel_step(self.now, given_up);
         }
@@ -78,7 +78,7 @@ impl Siege {
         true
     }
 
-    /// Adds the present steps of the worlds of a step to those in its payload.
+    /// Adds the current steps of the worlds to the steps in a payload.
     fn body_from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
         let mut body = body.to_vec();
         let end = u64::from(request.first_robot) + u64::from(request.n_robots);
@@ -130,7 +130,7 @@ impl Siege {
         }) = request
             && first_robot.saturating_add(n_robots) > N_THEIRS
         {
-            return false; // Everybody may take any robot over, also the victim's.
+            return false; // A takeover of the victim's robots is legal, so it is not tested here.
         }
         if let Ok(request) = &request {
             assert_eq!(survives::<Request>(&text).as_ref(), Some(request));
@@ -157,7 +157,7 @@ impl Siege {
                 assert_eq!(reply.status(), Status::Ok);
                 true
             }
-            // No file is written or read: as if the disk had failed.
+            // Simulates a disk failure, so that no file is written or read.
             Outcome::File(_, pending) => {
                 self.simulator.cancel_file(self.now, &pending);
                 true
@@ -169,7 +169,7 @@ impl Siege {
         }
     }
 
-    /// Keeps what a client waits for in place of what it waited for before: one request at a time.
+    /// Stores the pending request of a client, which replaces its previous one: a client has one at a time.
     fn wait_for(&mut self, who: usize, pending: PendingReply) {
         let client = ATTACKERS[who];
         let mut waiting = self.pending.iter();
@@ -181,7 +181,7 @@ impl Siege {
     }
 }
 
-/// A text with the lease in its place.
+/// Replaces the placeholder in a text by the lease.
 fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
     let mut words = text.windows(LEASE.len());
     let Some(at) = words.position(|word| word == LEASE.as_bytes()) else {
@@ -191,7 +191,7 @@ fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
 }
 
 pub fn step_seeds() -> Vec<Seed> {
-    // The attacker's lease is the third that is given.
+    // The attacker's lease is the third one granted.
     let one = step_request(13, 0..2);
     let both = step_request(13, 0..4);
     let full = StepRequest {

@@ -1,4 +1,4 @@
-//! Files of worlds: snapshots, recordings and recorded states.
+//! Fuzz targets for files of worlds: snapshots, recordings and recorded states.
 
 use super::messages::Seed;
 use crate::harness::recorded_info;
@@ -17,10 +17,10 @@ use std::sync::OnceLock;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// Bytes in front of a snapshot's body.
+/// Length of a snapshot's header in bytes.
 const HEADER_BYTES: usize = 24;
 
-/// Bytes in front of a recording's records, and of each record's body.
+/// Lengths of the headers of a recording and of each record, in bytes.
 const RECORDING_HEADER: usize = 16;
 const RECORD_HEADER: usize = 24;
 
@@ -41,8 +41,8 @@ fn spec() -> &'static WorldSpec {
     })
 }
 
-/// A snapshot: refused, or its worlds can be flown in and reset. Its checksum is mended, which keeps damage
-/// out but nobody who means harm.
+/// Checks that a snapshot is refused, or that its worlds can step and be reset. The checksum is corrected first,
+/// because it protects against damage, not against attackers.
 pub fn snapshot(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     if bytes.len() >= HEADER_BYTES {
@@ -68,7 +68,7 @@ pub fn snapshot(bytes: &[u8]) -> bool {
     true
 }
 
-/// A step of two robots: those that fly, and those that observe every cell.
+/// Returns the paths of two robots, with masks of the robots that fly and of those that observe every cell.
 fn flown(ready: u64, full: u64) -> Flown<'static> {
     Flown {
         moves: &[Move::Right, Move::Down, Move::Left, Move::Down],
@@ -79,7 +79,7 @@ fn flown(ready: u64, full: u64) -> Flown<'static> {
     }
 }
 
-/// A recording: refused, or read to its end. Its checksums are mended, too.
+/// Checks that a recording is refused or read to its end, after correcting its checksums.
 pub fn recording(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     mend(&mut bytes);
@@ -96,7 +96,7 @@ pub fn recording(bytes: &[u8]) -> bool {
     is_whole
 }
 
-/// Writes the checksum of each record that is whole.
+/// Corrects the checksum of each complete record.
 fn mend(bytes: &mut [u8]) {
     let mut rest = bytes.get_mut(RECORDING_HEADER..).unwrap_or_default();
     while let Some((header, behind)) = rest.split_first_chunk_mut::<RECORD_HEADER>() {
@@ -174,7 +174,7 @@ pub fn recording_seeds() -> Vec<Seed> {
     vec![("frame", bytes), ("cut", cut)]
 }
 
-/// Recorded states of three kinds, an archive or one array: refused, or all sequences have one shape.
+/// Checks that an archive or array of three recorded states is refused, or that all its sequences have the same shape.
 pub fn states(bytes: &[u8]) -> bool {
     let mut sequences = Sequences::new(3);
     let added = if bytes.starts_with(b"\x93NUMPY") {

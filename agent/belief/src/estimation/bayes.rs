@@ -1,4 +1,4 @@
-//! Bayes' rule on the cells that a frame shows (paper eqs. 5 and 10).
+//! Bayes' rule at the cells that a frame shows (paper eqs. 5 and 10).
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::grid::Probabilities;
@@ -6,7 +6,7 @@ use emberwatch_model::{Cell, Frame};
 use ndarray::{Array2, NdFloat};
 use thiserror::Error;
 
-/// A frame that the belief holds impossible.
+/// An observation that is impossible under the belief.
 #[derive(Debug, Error, PartialEq)]
 #[error(
     "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
@@ -18,7 +18,7 @@ pub struct ZeroEvidence {
     pub belief: Vec<f32>,
 }
 
-/// The same of a cell by its index, among cells of any number type.
+/// Like [`ZeroEvidence`], with the cell's index and probabilities of any number type.
 #[derive(Debug, PartialEq)]
 pub struct Impossible<T> {
     pub index: usize,
@@ -27,30 +27,31 @@ pub struct Impossible<T> {
     pub belief: Vec<T>,
 }
 
-/// The distribution of what each cell shows, `[O, H, W]`, under a belief: `B' u`. `likelihood` is `P(y | x)`, `[S, O]`.
+/// Computes the distribution of each cell's observation under a belief, `B' u`, shape `[O, H, W]`. `likelihood` is
+/// `P(y | x)`, shape `[S, O]`.
 ///
 /// # Panics
-/// If the likelihood is of another number of states.
+/// If the belief and the likelihood have different numbers of states.
 pub fn observations(belief: &Belief, likelihood: &Array2<f64>) -> Probabilities {
     let (height, width) = belief.shape().dim();
     let (n_states, n_observations) = likelihood.dim();
     let states = belief.view();
     let states = states.to_shape((n_states, height * width));
-    let states = states.expect("likelihood: expected the belief's states");
+    let states = states.expect("likelihood: expected the belief's number of states");
     let observations = likelihood.t().mapv(|p| p as f32).dot(&states);
     let dim = (n_observations, height, width);
     let observations = observations.into_shape_with_order(dim);
     observations.expect("invariant: one number per observation and cell")
 }
 
-/// Bayes' rule on the cells that a frame shows, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.
+/// Applies Bayes' rule to the cells that a frame shows: `p = B(y) u / (b(y)' u)` (eq. 5). Other cells keep `p = u`.
 /// `likelihood` is `P(y | x)`, shape `[S, O]`.
 ///
 /// # Errors
-/// [`ZeroEvidence`] where `b(y)' u = 0`; the belief is then as it was.
+/// [`ZeroEvidence`] if `b(y)' u = 0` for some cell. The belief is then unchanged.
 ///
 /// # Panics
-/// If the frame is of another grid or was decoded for more observations.
+/// If the frame has another grid, or an observation that the likelihood lacks.
 pub fn correct(
     belief: &mut Belief,
     likelihood: &Array2<f64>,
@@ -67,10 +68,11 @@ pub fn correct(
     })
 }
 
-/// [`correct`] for cells of any grids: `probabilities` state by state, and of the observed cells index and value.
+/// Like [`correct`], for any list of cells. `probabilities` holds one block of cells per state. `observed` lists the
+/// index and the value of each observed cell.
 ///
 /// # Errors
-/// The first cell where `b(y)' u` is 0 or no number; the probabilities are then as they were.
+/// [`Impossible`] for the first cell where `b(y)' u` is 0 or not finite. The probabilities are then unchanged.
 ///
 /// # Panics
 /// If a cell or a value is out of range.
@@ -81,12 +83,12 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
 ) -> Result<(), Impossible<T>> {
     let n_states = likelihood.nrows();
     let n_cells = probabilities.len() / n_states;
-    // Kept apart until the whole frame is known to be possible.
+    // Written back only after the whole frame has proved possible.
     let mut posteriors: Vec<T> = Vec::new();
     for (index, observed) in observed() {
         let prior = probabilities[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
-        // In f64, where the product of two f32 cannot underflow to zero.
+        // Computed in f64, where the product of two f32 cannot underflow to zero.
         let joint = || {
             let pairs = prior.clone().zip(&likelihood);
             pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)

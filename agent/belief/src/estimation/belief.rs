@@ -1,4 +1,4 @@
-//! A [`Belief`]: one probability distribution over states per cell, on the simplex by construction.
+//! A [`Belief`] is one probability distribution over states per cell. Its constructors check or ensure this.
 //!
 //! Estimators compute beliefs (the `u` and `p` of paper eqs. 5 and 6), and objectives read them. An exploring robot is
 //! attracted by their entropy (eq. 14).
@@ -9,8 +9,8 @@ use ndarray::{ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum distance from 1 of the sum over a cell's probabilities. It is about 400 rounding errors of an `f32`: a
-/// softmax or normalisation leaves less, and a mistake leaves more.
+/// Maximum distance from 1 of the sum over a cell's probabilities. It is about 400 rounding errors of an `f32`: the
+/// error of a softmax or normalisation is smaller, and the error of a bug is larger.
 const SUM_TOLERANCE: f32 = 5e-5;
 
 /// One distribution over states per cell, shape `[S, H, W]`; each cell sums to one.
@@ -51,18 +51,18 @@ pub enum BeliefError {
 }
 
 impl Belief {
-    /// Gives all states the same probability in every cell.
+    /// Creates a belief with the same probability for all states in every cell.
     pub fn uniform(n_states: usize, shape: Shape) -> Self {
         Self::everywhere(&vec![1.0 / n_states as f32; n_states], shape)
     }
 
-    /// Gives every cell the model's distribution at the start of burn-in.
+    /// Creates a belief with the model's initial distribution, at the start of burn-in, in every cell.
     pub fn from_initial(model: &Model, shape: Shape) -> Self {
         let initial: Vec<f32> = model.initial().iter().map(|&p| p as f32).collect();
         Self::everywhere(&initial, shape)
     }
 
-    /// Gives each cell's state, shape `[H, W]`, the probability 1. This is the belief of an oracle.
+    /// Creates a belief with probability 1 for each cell's given state, shape `[H, W]`: the belief of an oracle.
     ///
     /// # Errors
     /// If a state is not below `n_states`.
@@ -89,7 +89,7 @@ impl Belief {
         })
     }
 
-    /// Checks probabilities of shape `[S, H, W]`, such as the output of a network.
+    /// Creates a belief from probabilities of shape `[S, H, W]`, such as the output of a network, and checks them.
     ///
     /// # Errors
     /// If a cell's probabilities are not a distribution. The error names the first such cell.
@@ -134,7 +134,8 @@ impl Belief {
 
     /// Reads the bytes of [`Self::to_bytes`].
     ///
-    /// Returns `None` if they are not a belief of the shape `dim`, `[S, H, W]`: see [`Self::from_probabilities`].
+    /// Returns `None` if they do not encode a valid belief of shape `dim`, `[S, H, W]`. [`Self::from_probabilities`]
+    /// checks it.
     pub fn from_bytes(bytes: &[u8], dim: (usize, usize, usize)) -> Option<Self> {
         let (numbers, []) = bytes.as_chunks::<4>() else {
             return None;
@@ -187,7 +188,7 @@ impl Belief {
         Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
     }
 
-    /// Returns the probabilities, state by state and row-major.
+    /// Returns the probabilities, shape `[S, H, W]`, row-major.
     pub fn as_slice(&self) -> &[f32] {
         let slice = self.probabilities.as_slice();
         slice.expect("invariant: beliefs are row-major")
@@ -204,7 +205,7 @@ impl Belief {
         &mut self.probabilities
     }
 
-    /// Gives every cell the same distribution.
+    /// Creates a belief with the same distribution in every cell.
     pub(crate) fn everywhere(distribution: &[f32], shape: Shape) -> Self {
         let (height, width) = shape.dim();
         let dim = (distribution.len(), height, width);
@@ -232,9 +233,9 @@ impl From<Belief> for Probabilities {
 
 /// Computes the natural logarithm of a probability, with an error of a few units in the last place.
 ///
-/// At 0 it is a finite number, so that `p * ln(p)` is 0. There are no branches or calls, so that the loop over cells
-/// is vectorised. The polynomial in `m - 1` is from `logf` of the Cephes library (S. Moshier), where `p = m 2^e` with
-/// `m` in `sqrt(1/2)..sqrt(2)`.
+/// The result at 0 is finite, so that `p * ln(p)` is 0 there. The code has no branches or calls, so that the compiler
+/// vectorises the loop over cells. The polynomial in `m - 1` is from `logf` of the Cephes library (S. Moshier), where
+/// `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`.
 #[inline]
 fn ln(p: f32) -> f32 {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
@@ -293,7 +294,7 @@ mod tests {
     #[test]
     fn numbers_off_the_simplex_are_rejected_by_cell() {
         let third = 1.0 / 3.0;
-        // The last has the sum 1, but is no distribution.
+        // The last two sum to 1, but contain negative numbers.
         for states in [
             [third, third, 0.5],
             [third, third, 0.3],

@@ -1,8 +1,9 @@
-//! How much the paying state of a cell says of that of another one nearby: correlations, learned from what is seen.
+//! Correlations between the paying states of nearby cells, learned from frames.
 //!
-//! One number per pair of ages (steps since a cell was last seen, in `N_AGES` ranges) and per class of offsets, as
-//! directions are not told apart. No hidden states are used: where a frame shows two cells near each other,
-//! the product of their innovations is an estimate of their covariance.
+//! There is one correlation for each pair of age ranges and each class of offsets. A cell's age is the number of steps
+//! since it was last seen, in `N_AGES` ranges. A class contains the offsets that differ only in direction. Learning
+//! needs no hidden states: if a frame shows two nearby cells, the product of their innovations estimates their
+//! covariance.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::innovation::Innovation;
@@ -10,17 +11,19 @@ use emberwatch_model::{Cell, Frame};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 
-/// Cells further off than this, in rows or columns, are not corrected.
+/// Maximum distance, in rows and in columns, at which a seen cell corrects another cell.
 pub const RADIUS: usize = 4;
 
-/// Rows and columns of a neighbourhood.
+/// Number of rows and of columns of a neighbourhood.
 pub const SIDE: usize = 2 * RADIUS + 1;
 
+/// Number of age ranges.
 pub(super) const N_AGES: usize = 8;
 
-/// The last age of each range but the last one, steps.
+/// The upper end of each age range in steps. The last range has no upper end.
 const LAST_AGES: [u8; N_AGES - 1] = [1, 2, 4, 7, 12, 25, 60];
 
+/// The range of each age.
 pub const AGE_RANGES: [usize; 256] = {
     let mut ranges = [0; 256];
     let mut age = 1;
@@ -33,82 +36,86 @@ pub const AGE_RANGES: [usize; 256] = {
     ranges
 };
 
-/// Classes of offsets: `(a, b)` with `a <= b <= RADIUS`, the cell itself the first.
+/// Number of classes of offsets: one for each `(a, b)` with `a <= b <= RADIUS`. Class 0 is the cell itself.
 const N_CLASSES: usize = (RADIUS + 1) * (RADIUS + 2) / 2;
 
-/// Weight of the mean over older cells, in pairs of cells of variance one: ranges that are seldom seen together follow it.
+/// Weight of the mean over all older age ranges, in pairs of cells with variance 1. Pairs of ranges with little data
+/// follow the mean.
 const SHRINKAGE: f64 = 60.0;
 
-/// No two cells are taken to be more alike than this.
+/// Maximum correlation between two cells.
 const LARGEST: f64 = 0.9;
 
-/// No sum of so many pairs can be seen.
+/// Upper bound of the sums in a valid file. No run observes that many pairs.
 const MOST: f64 = 1e15;
 
-/// Sums over pairs of cells seen in the same frames, and the correlations they give.
+/// Correlations, and the sums over pairs of cells from which they are estimated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Sums", into = "Sums")]
 pub struct Correlations {
     sums: Sums,
-    /// By age range of the one and of the other cell, and class of offset.
+    /// The correlation by the age ranges of the two cells and the class of their offset.
     table: [[[f32; N_CLASSES]; N_AGES]; N_AGES],
 }
 
-/// One estimate of a correlation: products of innovations, and what they would sum to were it 1.
+/// The numerator and denominator of a correlation: the sum of products of innovations, and its value for correlation 1.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 struct Sum {
     products: f64,
     largest: f64,
 }
 
-/// By age range of the younger and of the older cell, and class of offset.
+/// The sums by the age ranges of the younger and the older cell and the class of their offset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Sums([[[Sum; N_CLASSES]; N_AGES]; N_AGES]);
 
-/// Steps since each cell of a grid was seen.
+/// The number of steps since each cell of a grid was last seen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ages(Vec<u8>);
 
-/// What a frame says of one cell's paying state.
+/// The evidence of a frame about one cell's paying state.
 #[derive(Debug, Clone)]
 pub struct Evidence {
     cell: Cell,
-    /// The range of its age before the frame.
+    /// The range of the cell's age before the frame.
     age: usize,
     /// Posterior minus prior probability.
     innovation: f64,
-    /// Two such innovations multiply to the product of their scales, on average, if both cells always agree.
+    /// Scale of the innovation. If two cells always agree, the mean product of their innovations is the product of
+    /// their scales.
     scale: f64,
 }
 
 impl Ages {
-    /// No cell of a grid was seen.
+    /// Creates the ages of a grid whose cells were never seen.
     pub fn new(n_cells: usize) -> Self {
         Self(vec![u8::MAX; n_cells])
     }
 
-    /// Steps, row-major; 255 for so many or more.
+    /// Returns the steps since each cell was seen, row-major, saturating at 255.
     pub fn as_slice(&self) -> &[u8] {
         &self.0
     }
 
+    /// Adds one step to all ages.
     pub fn grow(&mut self) {
         for age in &mut self.0 {
             *age = age.saturating_add(1);
         }
     }
 
+    /// Sets the age of a seen cell to 0.
     pub fn see(&mut self, index: usize) {
         self.0[index] = 0;
     }
 }
 
 impl Evidence {
-    /// What a frame says of `state` at each of its cells, with the belief before it, in which cells had some ages.
-    /// `likelihood` is `P(y | x)`, shape `[S, O]`.
+    /// Computes the evidence of a frame about `state` at each of its cells. `belief` and `ages` are from before the
+    /// frame, and `likelihood` is `P(y | x)`, shape `[S, O]`. Omits observations that are impossible under the belief.
     ///
     /// # Panics
-    /// If the frame or the ages are of another grid.
+    /// If the frame or the ages have another grid.
     pub fn of(
         frame: &Frame,
         belief: &Belief,
@@ -131,6 +138,7 @@ impl Evidence {
 }
 
 impl Sums {
+    /// Adds the products of a pair of seen cells, if the pair is within [`RADIUS`] columns.
     fn add(&mut self, one: &Evidence, other: &Evidence) {
         let down = one.cell.row.abs_diff(other.cell.row);
         let across = one.cell.col.abs_diff(other.cell.col);
@@ -144,7 +152,7 @@ impl Sums {
 }
 
 impl Default for Correlations {
-    /// Before anything is seen: cells are independent.
+    /// Returns the correlations before the first frame, with which cells are independent.
     fn default() -> Self {
         let mut correlations = Self {
             sums: Sums([[[Sum::default(); N_CLASSES]; N_AGES]; N_AGES]),
@@ -162,7 +170,9 @@ impl TryFrom<Sums> for Correlations {
         let is_possible =
             |sum: &Sum| sum.products.abs() < MOST && (0.0..MOST).contains(&sum.largest);
         if !sums.0.as_flattened().as_flattened().iter().all(is_possible) {
-            return Err("sums of correlations: expected finite ones, got others");
+            return Err(
+                "sums of correlations: expected magnitudes below 1e15 and no negative scales",
+            );
         }
         let mut correlations = Self {
             sums,
@@ -180,12 +190,13 @@ impl From<Correlations> for Sums {
 }
 
 impl Correlations {
-    /// The correlations of a cell of an age range with its neighbours: by their age range, and [`class`] of offset.
+    /// Returns the correlations of a cell in an age range, by the neighbour's age range and the [`class`] of the
+    /// offset.
     pub fn of(&self, age: usize) -> &[[f32; N_CLASSES]; N_AGES] {
         &self.table[age]
     }
 
-    /// As in a table by age ranges and offsets, of shape `[N_AGES, N_AGES, SIDE, SIDE]`.
+    /// Creates correlations from a table by age ranges and offsets, shape `[N_AGES, N_AGES, SIDE, SIDE]`.
     #[cfg(test)]
     pub fn of_table(table: &ndarray::Array4<f32>) -> Self {
         let mut correlations = Self::default();
@@ -196,7 +207,7 @@ impl Correlations {
         correlations
     }
 
-    /// Learns from what one frame said, in row-major order.
+    /// Learns from the evidence of one frame, whose cells are in row-major order.
     pub fn learn(&mut self, seen: &[Evidence]) {
         for (index, one) in seen.iter().enumerate() {
             let below = seen[index + 1..].iter();
@@ -208,7 +219,7 @@ impl Correlations {
         self.update();
     }
 
-    /// Weighs what was learned so far less, by a factor below 1.
+    /// Multiplies the weight of past evidence by a factor below 1.
     pub fn fade(&mut self, factor: f64) {
         for sum in self.sums.0.as_flattened_mut().as_flattened_mut() {
             sum.products *= factor;
@@ -216,7 +227,7 @@ impl Correlations {
         }
     }
 
-    /// The table of the sums.
+    /// Computes the table from the sums.
     fn update(&mut self) {
         for younger in 0..N_AGES {
             for class in 1..N_CLASSES {
@@ -243,7 +254,7 @@ impl Correlations {
     }
 }
 
-/// The class of an offset by its distances in rows and columns, [`RADIUS`] at most, in any order.
+/// Returns the class of an offset from its distances in rows and columns, in any order, each at most [`RADIUS`].
 pub const fn class(one: usize, other: usize) -> usize {
     let (less, more) = if one < other {
         (one, other)

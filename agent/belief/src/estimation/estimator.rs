@@ -1,4 +1,4 @@
-//! What an estimator is: frames in, a belief about every cell out (paper sections III.A to III.C).
+//! The interface of estimators, which turn frames into a belief about every cell (paper sections III.A to III.C).
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
@@ -10,14 +10,15 @@ use std::borrow::Cow;
 use std::error::Error as StdError;
 use thiserror::Error;
 
-/// Keeps a belief about one world: [`Self::correct`] with each frame, then [`Self::predict`].
+/// A belief about one world. In each step, [`Self::correct`] applies the frame, then [`Self::predict`] moves one step
+/// ahead.
 ///
-/// That is all that an estimator must do. What only some have, they offer beside it.
+/// Every estimator implements these two methods and [`Self::belief`]. The others are optional and have defaults.
 pub trait Estimator: Send + Any {
-    /// Takes in a frame of X_k (eq. 5).
+    /// Corrects the belief with the frame of X_k (eq. 5).
     ///
     /// # Errors
-    /// If the frame is impossible under the belief, which is then as it was.
+    /// If the frame is impossible under the belief. The belief is then unchanged.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError>;
 
     /// Moves the belief from X_k to X_{k+1} (eq. 6).
@@ -29,76 +30,77 @@ pub trait Estimator: Send + Any {
         None
     }
 
-    /// The belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
+    /// Returns the belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
     fn belief(&self) -> &Belief;
 
-    /// Returns about how many bytes of memory the estimator takes: by default four times its belief, for the belief, its
-    /// predictor and work space.
+    /// Returns the approximate memory use of the estimator in bytes. The default is four times the size of its belief:
+    /// the belief, its predictor and work space.
     fn memory_bytes(&self) -> usize {
         4 * size_of_val(self.belief().as_slice())
     }
 
-    /// `P(y | x)`, shape `[S, O]`, of an estimator whose belief predicts frames.
+    /// Returns `P(y | x)`, shape `[S, O]`, if the belief predicts observations.
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         None
     }
 
-    /// Of one that corrects a filter: what that filter predicts the next frame to show in each cell, `[O, H, W]`.
+    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by the filter that
+    /// this estimator corrects. Most estimators correct no filter.
     fn base(&self) -> Option<&Probabilities> {
         None
     }
 
-    /// The hidden vector `h_k` behind the belief, for a DQN that decides on it (paper section III.E).
+    /// Returns the hidden vector `h_k` behind the belief, which is the input of a DQN (paper section III.E).
     fn hidden(&self) -> Option<&[f32]> {
         None
     }
 
-    /// An estimator from whose bytes another of its kind can go on.
+    /// Returns the interface that saves the estimator's state, if another estimator can resume from it.
     fn handover(&self) -> Option<&dyn Handover> {
         None
     }
 
-    /// As [`Self::handover`], to go on from bytes.
+    /// Like [`Self::handover`], to restore a saved state.
     fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         None
     }
 
-    /// An oracle, which must be told the hidden states.
+    /// Returns the interface that receives the hidden states, if the estimator is an oracle.
     fn told(&mut self) -> Option<&mut dyn Told> {
         None
     }
 }
 
-/// All that an estimator knows of its world before X_{k+1}, as bytes.
+/// An estimator whose state before X_{k+1} can be saved as bytes and restored by another of the same kind.
 pub trait Handover {
-    /// Names what the bytes mean: only estimators of the same kind can read them.
+    /// Returns a description of the byte format. Only estimators with the same description can read the bytes.
     fn kind(&self) -> String;
 
-    /// The belief, `[S, H, W]` as `f32`, then what its kind adds.
+    /// Returns the belief, `[S, H, W]` as `f32`, followed by any data that is specific to the kind.
     fn to_bytes(&self) -> Vec<u8>;
 
-    /// Goes on from the bytes of an estimator of the same kind. Returns false, and changes nothing, if they do not
-    /// fit.
+    /// Restores the state from the bytes of an estimator of the same kind. Returns false and changes nothing if the
+    /// bytes do not fit.
     fn restore(&mut self, bytes: &[u8]) -> bool;
 }
 
-/// An estimator that is told the hidden states.
+/// An oracle: an estimator that receives the hidden states.
 pub trait Told {
-    /// Takes in hidden states, shape `[H, W]`: X_k after a frame; X_{k+1} before a path, where they are known.
+    /// Receives hidden states, shape `[H, W]`: X_k after a frame, or X_{k+1} before a path if they are known.
     ///
     /// # Errors
-    /// If they are not states of the belief's model and grid.
+    /// If the states do not fit the belief.
     fn tell(&mut self, states: &Grid<u8>) -> Result<(), BeliefError>;
 }
 
-/// Why an estimator did not take in what was seen.
+/// The reason why an estimator rejected a frame.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum EstimatorError {
-    /// A frame that the belief rules out.
+    /// The frame is impossible under the belief.
     #[error(transparent)]
     ZeroEvidence(#[from] ZeroEvidence),
-    /// A network whose numbers are too large to compute with, or whose device fails.
+    /// The estimator's network overflowed, or its device failed.
     #[error("checkpoint: {0}")]
     Network(Box<dyn StdError + Send + Sync>),
 }

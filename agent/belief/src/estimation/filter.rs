@@ -25,9 +25,9 @@ pub struct BayesFilter {
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Buffer for the next predictor. With cavities, the belief before the next correction.
+    /// Buffer for the next predictor. With cavities, it also holds the belief before the next correction.
     predictor: Probabilities,
-    /// Checksum of the parameters. Beliefs of filters with other parameters have another meaning.
+    /// Checksum of the parameters. A saved belief fits only a filter with the same parameters.
     checksum: u32,
 }
 
@@ -41,7 +41,11 @@ impl BayesFilter {
     /// If the prior and the model have different numbers of states.
     pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {
         let expected = model.n_states();
-        assert_eq!(prior.n_states(), expected, "prior: expected other states");
+        assert_eq!(
+            prior.n_states(),
+            expected,
+            "prior: expected the model's number of states"
+        );
         let transition = Transition::new(model, prior.shape())?;
         let checksum = known_checksum(model);
         let likelihood = model.likelihood().clone();
@@ -57,7 +61,7 @@ impl BayesFilter {
         Self::new(transition, likelihood, prior, checksum)
     }
 
-    /// Sets the kind of prediction of a filter with learned parameters. `tables` are these parameters.
+    /// Sets the kind of prediction of a filter with learned parameters. `tables` must be the filter's parameters.
     pub fn predicting_learned(self, tables: &Tables, kind: PredictionKind) -> Self {
         let weights = Weights {
             kernels: &tables.kernels(),
@@ -79,7 +83,7 @@ impl BayesFilter {
         }
     }
 
-    /// Sets the kind of prediction of a known model's filter. `model` is this model.
+    /// Sets the kind of prediction of a known model's filter. `model` must be the filter's model.
     pub fn predicting_known(self, model: &Model, kind: PredictionKind) -> Self {
         self.predicting(model.into(), kind)
     }
@@ -103,7 +107,7 @@ impl BayesFilter {
         }
     }
 
-    /// Returns [`Handover::kind`] for filters of a known model.
+    /// Returns the [`Handover::kind`] of filters of a known model.
     pub fn handover_of_known(model: &Model, kind: PredictionKind) -> String {
         handover_of(known_checksum(model), kind)
     }
@@ -138,7 +142,7 @@ impl Estimator for BayesFilter {
             let predictor = self.predictor.as_slice_mut();
             let predictor = predictor.expect("invariant: row-major");
             prediction.predict(self.belief.as_slice(), predictor);
-            // Both hold the predictor: the next correction of the cavities compares the belief with it.
+            // Both buffers hold the predictor, because the next correction of the cavities compares the belief with it.
             self.belief.as_mut_slice().copy_from_slice(predictor);
             return;
         }
@@ -224,7 +228,11 @@ fn known_checksum(model: &Model) -> u32 {
 fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32) {
     let dimensions = tables.dimensions;
     let n_states = dimensions.n_states;
-    assert_eq!(belief.n_states(), n_states, "belief: expected other states");
+    assert_eq!(
+        belief.n_states(),
+        n_states,
+        "belief: expected the parameters' number of states"
+    );
     let kernels = tables.kernels();
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
@@ -284,7 +292,7 @@ mod tests {
             .expect("possible");
         let fire = filter.belief().probability(2);
         assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
-        // .98 / (.01 + .05 + .98), the column of O for an observed fire.
+        // The column of O for an observed fire is (.01, .05, .98), and the prior is uniform.
         assert!((fire[[0, 1]] - 0.98 / 1.04).abs() < 1e-6);
     }
 

@@ -1,26 +1,26 @@
-//! Bayes' rule at one cell, and what it does to the probability of one state.
+//! Bayes' rule at one cell, and its effect on the probability of one state.
 
 use ndarray::Array2;
 
-/// A variance that is divided by is at least this.
+/// Lower bound of variances that serve as a denominator.
 const LEAST_VARIANCE: f64 = 1e-9;
 
-/// What an observation does to a cell's paying state.
+/// The effect of an observation on the probability of one state of the observed cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Innovation {
-    /// The probability of the observation, more than 0.
+    /// The probability of the observation, above 0.
     pub evidence: f64,
     /// Posterior minus prior probability of the state.
     pub value: f64,
-    /// What seeing the cell takes off the variance, on average over observations.
+    /// The expected reduction of the state's variance by an observation of the cell.
     pub reduction: f64,
-    /// The prior's variance.
+    /// The variance `p (1 - p)` of the state under the prior, at least [`LEAST_VARIANCE`].
     pub variance: f64,
 }
 
 impl Innovation {
-    /// Bayes' rule (eq. 5) for `state` at a cell of some probabilities, with `P(y | x)` of shape `[S, O]`; `None` if the
-    /// observation is impossible.
+    /// Computes the effect of an observation on `state` by Bayes' rule (eq. 5). `prior` has the cell's probabilities,
+    /// and `likelihood` is `P(y | x)`, shape `[S, O]`. Returns `None` if the observation is impossible.
     pub fn of(prior: &[f64], likelihood: &Array2<f64>, state: usize, observed: u8) -> Option<Self> {
         let (n_observations, before) = (likelihood.ncols(), prior[state]);
         let likelihood = likelihood.as_slice();
@@ -34,7 +34,7 @@ impl Innovation {
             _ => 0.0,
         };
         let seen = usize::from(observed);
-        // Of a sensor with several matrices side by side, the one by which the cell was seen.
+        // A sensor with several matrices has them side by side. Average over the one that made this observation.
         let n_matrices = own[..n_observations].iter().sum::<f64>().round().max(1.0) as usize;
         let of_matrix = n_observations / n_matrices;
         let matrix = seen / of_matrix * of_matrix..(seen / of_matrix + 1) * of_matrix;

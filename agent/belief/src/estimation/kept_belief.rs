@@ -1,5 +1,5 @@
-//! Simulated first beliefs of earlier runs, kept in the user's cache folder: a file each, of the key, the probabilities
-//! and a checksum. Where anything is wrong with a file or the folder, the belief is simulated again.
+//! A cache of simulated priors in the user's cache folder. Each file holds a key, the probabilities and a checksum. If
+//! a file or the folder is unusable, the caller simulates the prior again.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
@@ -12,29 +12,29 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// Most files that are kept.
+/// Maximum number of cached files.
 const MAX_FILES: usize = 32;
 
-/// Most bytes of a belief: one about 512 x 512 cells in four states.
+/// Maximum size of a cached belief in bytes: 512 x 512 cells with four states.
 const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
 
-/// Where a prior is kept.
+/// The cache file of one prior.
 #[derive(Debug)]
 pub struct KeptBelief {
     path: PathBuf,
-    /// All that the belief depends on, as text.
+    /// Everything that the belief depends on, as text.
     key: String,
-    /// S, H and W.
+    /// The belief's shape `[S, H, W]`.
     dim: (usize, usize, usize),
 }
 
 impl KeptBelief {
-    /// `None` if there is no cache folder, or the belief is too large for it.
+    /// Returns the cache file of a prior, or `None` if there is no cache folder or the belief exceeds the maximum size.
     pub fn new(prior: Prior, model: &Model, shape: Shape, seed: u64) -> Option<Self> {
         let version = env!("CARGO_PKG_VERSION");
-        // What robots see changes no world.
+        // Sensors and no-fly zones do not influence the hidden states.
         let file = ModelFile {
             sensor: None,
             no_fly: None,
@@ -48,10 +48,10 @@ impl KeptBelief {
         (n_value_bytes(dim) <= MAX_BYTES).then_some(Self { path, key, dim })
     }
 
-    /// The belief, if it was kept.
+    /// Returns the cached belief, if there is a valid file.
     pub fn read(&self) -> Option<Belief> {
         let found = self.path.metadata().ok()?;
-        // Nothing is read of a file of another length, or of what is no file.
+        // Check the type and the length first, so that neither a device nor a huge file is read.
         if !found.is_file() || found.len() != self.n_bytes() as u64 {
             return None;
         }
@@ -66,10 +66,10 @@ impl KeptBelief {
         Belief::from_probabilities(values).ok()
     }
 
-    /// Keeps the belief for later runs; the oldest go where there are too many.
+    /// Writes the belief for later runs, and removes the oldest files beyond the maximum number.
     ///
     /// # Errors
-    /// If the system does not let it write there.
+    /// If the folder or the file cannot be written.
     pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
         let mut bytes = self.key.clone().into_bytes();
         let values = belief.probabilities().iter();
@@ -91,7 +91,7 @@ fn n_value_bytes((n_states, height, width): (usize, usize, usize)) -> usize {
     n_states * height * width * size_of::<f32>()
 }
 
-/// `XDG_CACHE_HOME`, or `.cache` in the home folder; relative paths do not count.
+/// Returns `XDG_CACHE_HOME`, or `.cache` in the home folder. Relative paths are ignored.
 fn cache_folder() -> Option<PathBuf> {
     let folder = |name| std::env::var_os(name).map(PathBuf::from);
     let is_absolute = |path: &PathBuf| path.is_absolute();
@@ -101,27 +101,27 @@ fn cache_folder() -> Option<PathBuf> {
         .or_else(|| of_home().filter(is_absolute))
 }
 
-/// Writes a file of the user alone beside the path and renames it; a checksum in it finds what a crash leaves.
+/// Writes a user-only temporary file next to the path and renames it. Its checksum reveals files cut short by a crash.
 fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let beside = path.with_extension(std::process::id().to_string());
-    // What an earlier process of this number left may have other readers.
-    let _ = std::fs::remove_file(&beside);
+    let temporary = path.with_extension(std::process::id().to_string());
+    // A file left by an earlier process with the same id may have other permissions.
+    let _ = std::fs::remove_file(&temporary);
     let mut options = OpenOptions::new();
     options.write(true).create_new(true);
     #[cfg(unix)]
     options.mode(0o600);
-    let opened = options.open(&beside);
+    let opened = options.open(&temporary);
     let written = opened
         .and_then(|mut file| file.write_all(bytes))
-        .and_then(|()| std::fs::rename(&beside, path));
+        .and_then(|()| std::fs::rename(&temporary, path));
     if written.is_err() {
-        // The first error is the one to tell.
-        let _ = std::fs::remove_file(&beside);
+        // Report the first error, not an error of the cleanup.
+        let _ = std::fs::remove_file(&temporary);
     }
     written
 }
 
-fn remove_oldest(folder: &Path, most: usize) {
+fn remove_oldest(folder: &Path, max_files: usize) {
     let Ok(entries) = std::fs::read_dir(folder) else {
         return;
     };
@@ -132,9 +132,9 @@ fn remove_oldest(folder: &Path, most: usize) {
     };
     let mut files: Vec<_> = entries.filter_map(age).collect();
     files.sort();
-    let n_too_many = files.len().saturating_sub(most);
+    let n_too_many = files.len().saturating_sub(max_files);
     for (_, path) in &files[..n_too_many] {
-        // Another agent may have removed it.
+        // Another agent may have removed the file already.
         let _ = std::fs::remove_file(path);
     }
 }
@@ -145,13 +145,13 @@ mod tests {
 
     #[test]
     fn a_belief_of_the_most_bytes_is_kept_and_none_above() {
-        // It has four states.
+        // This model has four states.
         let model = Model::built_in("road-ice").expect("built in");
         let is_kept = |width| {
             let shape = Shape::new(512, width).expect("test shape");
             KeptBelief::new(Prior::Initial, &model, shape, 0).is_some()
         };
-        assert!(cache_folder().is_some(), "expected HOME");
+        assert!(cache_folder().is_some(), "HOME must be set");
         assert_eq!([512, 513].map(is_kept), [true, false]);
     }
 
@@ -188,7 +188,7 @@ mod tests {
         assert_eq!(kept("key").read(), None, "not there");
         kept("key").write(&belief).expect("written");
         assert_eq!(kept("key").read(), Some(belief.clone()));
-        assert_eq!(kept("kez").read(), None, "another key");
+        assert_eq!(kept("kez").read(), None, "a different key");
         let path = kept("key").path;
         let whole = std::fs::read(&path).expect("the file");
         let mut flipped = whole.clone();

@@ -15,18 +15,18 @@ use thiserror::Error;
 /// Maximum size of an unconstrained number. Weights are at least 1e-7, probabilities at least 1e-14.
 pub const BOUND: f32 = 16.0;
 
-/// First weight of the cell itself for staying in its state. The first weights suit states that last and spread.
+/// Initial weight of a cell's own state for keeping it. The initial weights suit states that persist and spread.
 const OWN_WEIGHT: f64 = 1.0;
-/// First weight of a neighbour for the cell taking the neighbour's state.
+/// Initial weight of a neighbour's state for spreading to the cell.
 const NEIGHBOUR_WEIGHT: f64 = 0.1;
-/// Share of either weight for each other next state.
+/// Initial weight of each other next state, as a share of the two weights above.
 const OTHER_STATE: f64 = 0.005;
 
-/// First logit for observing a state as itself. Among three observations, the probability is 0.86.
+/// Initial logit of observing a state as itself. With three observations, its probability is 0.86.
 const OWN_OBSERVATION: f32 = 2.5;
 
-/// Noise on the first logits, and relative noise on the first weights. Without it, states that share an observation
-/// would learn the same parameters.
+/// Amplitude of the noise on the initial logits, and of the relative noise on the initial weights. Without noise,
+/// states that share an observation would learn the same parameters.
 const NOISE: f32 = 0.1;
 
 /// The dimensions of a learned filter.
@@ -87,10 +87,10 @@ pub enum DimensionsError {
 }
 
 impl Dimensions {
-    /// Checks the dimensions against the limits of a model.
+    /// Checks the dimensions against the limits of a model, and returns them.
     ///
     /// # Errors
-    /// If one is out of range. The error names the first.
+    /// If a dimension is out of range. The error names the first such dimension.
     pub fn check(self) -> Result<Self, DimensionsError> {
         let counts = [
             ("states", 2, self.n_states),
@@ -151,10 +151,10 @@ impl Parameters {
     /// Names of the tensors in files and messages.
     pub const NAMES: [&'static str; 3] = ["kernel", "likelihood", "initial"];
 
-    /// Returns the parameters with which learning starts.
+    /// Returns the initial parameters for learning.
     ///
-    /// States last, spread to neighbours, and are mostly observed as the observation with their own number, if there is
-    /// one. All own-state kernels start alike, up to noise.
+    /// With them, states persist, spread to neighbours, and mostly show the observation with their own number, if it
+    /// exists. All own-state kernels start equal, up to noise.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
         // Uniform in -1..1.
@@ -210,7 +210,7 @@ impl Parameters {
         rows.flat_map(softmax).collect()
     }
 
-    /// Applies the chain rule: from gradients with respect to [`Tables`] to gradients with respect to the parameters.
+    /// Converts gradients with respect to [`Tables`] into gradients with respect to the parameters, by the chain rule.
     pub fn chain(&self, by_tables: &[Vec<f64>; 3]) -> Self {
         let [kernel, likelihood, initial] = &self.tensors;
         let [by_kernel, by_likelihood, by_initial] = by_tables;
@@ -251,15 +251,19 @@ impl Tables {
         Belief::everywhere(&self.initial, shape)
     }
 
-    /// Returns the parameters of a model, the solution that learning looks for.
+    /// Returns the tables of a known model, which are the goal of learning.
     ///
-    /// The bias is left out. Beliefs sum to one, so away from the edges a bias equals weights that are the same for all
-    /// states.
+    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias equals weights that are the same for
+    /// all states.
     ///
     /// # Panics
     /// If the model has several zones.
     pub fn of_model(model: &Model) -> Self {
-        assert_eq!(model.n_zones(), 1, "zones: expected one kernel for all");
+        assert_eq!(
+            model.n_zones(),
+            1,
+            "zones: expected a model with a single zone"
+        );
         let cast = |value: &f64| *value as f32;
         let (_, _, height, width) = model.kernel().dim();
         Self {
@@ -366,10 +370,10 @@ mod tests {
         }
     }
 
-    /// Gradients agree with differences.
+    /// Checks gradients against finite differences.
     fn check_chain_rule(dimensions: Dimensions) {
         let parameters = Parameters::first(dimensions, 3);
-        // Any smooth function of the tables: a sum with arbitrary factors.
+        // The function to differentiate: a linear function of the tables with arbitrary factors.
         let factors: [Vec<f64>; 3] = dimensions.lengths().map(|length| {
             let factor = |index| (index as f64 * 0.7).sin();
             (0..length).map(factor).collect()

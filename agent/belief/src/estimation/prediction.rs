@@ -57,10 +57,10 @@ pub enum PredictionKind {
     Cavities,
 }
 
-/// Largest error of a distribution's sum that is left to rounding.
+/// Maximum rounding error of a distribution's sum that is left uncorrected.
 const MAX_DRIFT: f32 = 1e-5;
 
-/// Divides distributions by their sums where rounding errors have added up, as in a cell that is never seen.
+/// Normalises distributions whose rounding errors have added up, as happens in a cell that is never seen.
 ///
 /// There is one plane per state, `plane_length` apart, and one distribution per lane.
 #[inline(always)]
@@ -83,18 +83,18 @@ pub struct Prediction {
     layout: Layout,
     /// Index of the susceptible state's kernel, if there are cavities.
     susceptible: Option<usize>,
-    /// For each neighbour, its distance from a cell in a plane.
+    /// For each neighbour, the offset of its index in a plane from the cell's index.
     offsets: Vec<isize>,
     beliefs: PaddedBeliefs,
     /// Buffer for the cavities after the next prediction.
     next: PaddedBeliefs,
-    /// For each neighbour, the index of its belief for the chunk and kernel being predicted.
+    /// For each neighbour, the index of its belief, for the current chunk and kernel.
     places: Vec<usize>,
     predictor: ChunkPredictor,
 }
 
 impl Prediction {
-    /// Arranges weights for predictions of a grid. All cavities start as the given belief.
+    /// Prepares predictions on the belief's grid. All cavities start as the given belief.
     ///
     /// Without own-state kernels, [`PredictionKind::Cavities`] has no cavities and computes the second order.
     ///
@@ -102,7 +102,11 @@ impl Prediction {
     /// If the belief and the weights have different numbers of states.
     pub fn new(weights: Weights<'_>, kind: PredictionKind, belief: &Belief) -> Self {
         let (n_states, _, height, width) = weights.kernels[0].dim();
-        assert_eq!(belief.n_states(), n_states, "belief: expected other states");
+        assert_eq!(
+            belief.n_states(),
+            n_states,
+            "belief: expected the weights' number of states"
+        );
         let layout = Layout::new(weights);
         let wants_cavities = kind == PredictionKind::Cavities;
         let susceptible = wants_cavities.then(|| layout.most_influenced()).flatten();
@@ -124,20 +128,21 @@ impl Prediction {
         }
     }
 
-    /// Returns the kind that the prediction was made with.
+    /// Returns the method of prediction.
     pub fn kind(&self) -> PredictionKind {
         self.kind
     }
 
-    /// Returns about how many bytes of memory it takes.
+    /// Returns the approximate memory use in bytes.
     pub fn memory_bytes(&self) -> usize {
-        // Weights, and as much work space.
+        // The factor 2 counts a second set of beliefs and work space of the size of the weights.
         let n_weights = self.n_states * self.n_states * (1 + self.offsets.len());
         let beliefs = size_of_val(&*self.beliefs.probabilities);
         2 * (beliefs + n_weights * size_of::<Lanes>()) + self.layout.slots.memory_bytes()
     }
 
-    /// Whether there are cavities, which [`Self::correct`] must update after each correction of the belief.
+    /// Returns whether there are cavities. If so, [`Self::correct`] must update them after each correction of the
+    /// belief.
     pub fn has_cavities(&self) -> bool {
         self.susceptible.is_some()
     }
@@ -166,10 +171,10 @@ impl Prediction {
         }
     }
 
-    /// Writes the predictor of a posterior, both `[S, H, W]`, and predicts the cavities.
+    /// Computes the predictor of a posterior, both `[S, H, W]`, and predicts the cavities.
     ///
     /// # Panics
-    /// If one of them has another length.
+    /// If either slice has another length.
     pub fn predict(&mut self, posterior: &[f32], predictor: &mut [f32]) {
         let expected = self.n_states * self.shape.n_cells();
         assert_eq!(posterior.len(), expected, "posterior: expected [S, H, W]");
@@ -191,7 +196,7 @@ impl Prediction {
     }
 
     /// Predicts the cells of a chunk that starts at `[row, col]`, and their cavities.
-    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
+    #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     fn predict_chunk(&mut self, [row, col]: [usize; 2], chunk: usize, predictor: &mut [f32]) {
         let place = self.beliefs.planes.place([row, col]);
         self.predict_kernels(place, chunk);
@@ -234,7 +239,8 @@ impl Prediction {
             let has_cavities = self.susceptible == Some(index);
             let neighbours = self.places.iter_mut().zip(&self.offsets).enumerate();
             for (neighbour, (to, offset)) in neighbours {
-                // Seen from the neighbour, this cell lies opposite.
+                // Use the cavity without this cell's influence. From the neighbour, this cell is in the opposite
+                // direction.
                 let opposite = n - 1 - neighbour;
                 let belief = if has_cavities {
                     opposite
@@ -255,9 +261,8 @@ impl Prediction {
         }
     }
 
-    /// Returns the probability of a next state: the mean over the own states, whose beliefs start at `at`.
-    ///
-    /// Computes it for the belief itself or for a cavity.
+    /// Returns the probability of a next state, as the mean over own states. The belief about the own states starts at
+    /// `at`. Without a `cavity`, it is the probability of the belief itself.
     #[inline(always)]
     fn next_probability(
         &self,

@@ -1,4 +1,4 @@
-//! What a filter believes before its first frame: the predictor `u_0` of paper section III.A.
+//! The belief before the first frame: the predictor `u_0` of paper section III.A.
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::dynamics::Dynamics;
@@ -10,17 +10,18 @@ use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// How much the average over the grid weighs in a cell's prior, in worlds: a choice that hardly
-/// matters, as the first frames soon outweigh it.
+/// Weight of the grid-wide average in a cell's prior, in worlds. The choice hardly matters, because the first frames
+/// soon outweigh it.
 const POOLED_WORLDS: f64 = 16.0;
 
+/// A choice of the belief before the first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Prior {
-    /// How often each cell of simulated worlds is in each state after burn-in: the best that can be
-    /// known before the first frame.
+    /// The frequency of each state in each cell of simulated worlds after burn-in. Nothing better can be known before
+    /// the first frame.
     Simulated {
         n_worlds: usize,
-        /// Steps from the initial distribution.
+        /// Number of steps from the initial distribution.
         burn_in: u64,
     },
     /// The model's initial distribution, which is right for a world without burn-in.
@@ -33,13 +34,16 @@ impl Prior {
     /// The default number of simulated worlds: 64.
     pub const N_WORLDS: usize = 64;
 
-    /// The belief before the first frame; `seed` only matters to [`Prior::Simulated`].
+    /// Returns the belief before the first frame. Only [`Prior::Simulated`] uses `seed`.
+    ///
+    /// # Errors
+    /// If the model cannot be simulated on the grid.
     pub fn belief(self, model: &Model, shape: Shape, seed: u64) -> Result<Belief, ModelError> {
         let belief = self.belief_unless(&AtomicBool::new(false), model, shape, seed)?;
         Ok(belief.expect("invariant: nothing cancels it"))
     }
 
-    /// The same, or `None` soon after it is cancelled: a simulation may take minutes.
+    /// Like [`Self::belief`], but returns `None` soon after `cancelled` is set. A simulation may take minutes.
     pub fn belief_unless(
         self,
         cancelled: &AtomicBool,
@@ -66,21 +70,21 @@ impl Prior {
     }
 }
 
-/// Worlds simulated side by side.
+/// A simulation of several worlds in parallel.
 struct Simulation<'a> {
     dynamics: Dynamics,
     /// S, H and W.
     dim: (usize, usize, usize),
     seed: u64,
-    /// Steps from the initial distribution.
+    /// Number of steps from the initial distribution.
     burn_in: u64,
     cancelled: &'a AtomicBool,
 }
 
 impl Simulation<'_> {
-    /// Counts of each state in each cell, shape `[S, H, W]`; of fewer steps once it is cancelled.
+    /// Counts the worlds in which each cell is in each state, shape `[S, H, W]`. Once cancelled, worlds stop early.
     ///
-    /// Counts are integers, so their sum does not depend on the order in which threads add them.
+    /// Counts are integers, so the order in which threads add them does not matter.
     fn counts(&self, n_worlds: usize) -> Array3<u32> {
         let none = || Array3::zeros(self.dim);
         let count = |mut counts: Array3<u32>, world: usize| {
@@ -93,7 +97,7 @@ impl Simulation<'_> {
         counts.reduce(none, |a, b| a + b)
     }
 
-    /// The states of one world after burn-in.
+    /// Simulates one world and returns its states after burn-in.
     fn world(&self, world: usize) -> Grid<u8> {
         let world_seed = stream(self.seed, Purpose::Prior, world as u64).next_u64();
         let mut dynamics = self.dynamics.clone();
@@ -108,16 +112,17 @@ impl Simulation<'_> {
     }
 }
 
-/// Relative frequencies, drawn towards those of the whole grid, as if [`POOLED_WORLDS`] more worlds
-/// had been seen that are alike everywhere: a few worlds say little about one cell, and a state not
-/// seen in a cell is still possible there.
+/// Computes relative frequencies per cell, shrunk towards the frequencies of the whole grid.
+///
+/// The grid-wide frequencies count like [`POOLED_WORLDS`] more worlds: a few worlds say little about one cell, and a
+/// state that none of them shows in a cell is still possible there.
 fn average(counts: &Array3<u32>, n_states: usize, shape: Shape) -> Belief {
     let in_all = |state: usize| -> u32 { counts.index_axis(Axis(0), state).sum() };
     let totals: Vec<f64> = (0..n_states)
         .map(|state| f64::from(in_all(state)))
         .collect();
     let total: f64 = totals.iter().sum();
-    // One more count of each state: nothing is impossible because it was not seen.
+    // Add-one smoothing, so that a state that was never simulated keeps a positive probability.
     let pooled = |state: usize| (totals[state] + 1.0) / (total + n_states as f64);
     let n_worlds = total / shape.n_cells() as f64;
     let probability = |(state, row, col): (usize, usize, usize)| {
@@ -170,7 +175,7 @@ mod tests {
             .belief(&Model::wildfire(), shape, 0)
             .expect("valid model");
         let mean = prior.probability(1).mean().expect("not empty");
-        // 25,600 cells latent with .01: four standard errors are .0025.
+        // Each of 25,600 cells is latent with probability .01: four standard errors are .0025.
         assert!((mean - 0.01).abs() < 0.0025, "{mean}");
         assert!(prior.view().iter().all(|&p| p > 0.0));
     }

@@ -1,10 +1,11 @@
-//! How well a belief predicted a frame: the log-likelihood of what was seen.
+//! The log-likelihood of a frame under a predicted belief.
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::ops::AddAssign;
 
+/// The log-likelihood of observations, summed over cells and frames.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Score {
     /// Sum of `ln P(y)`.
@@ -13,7 +14,7 @@ pub struct Score {
 }
 
 impl Score {
-    /// Per seen cell; NaN if none was seen.
+    /// Returns the mean log-likelihood per seen cell, or NaN if no cell was seen.
     pub fn mean(&self) -> f64 {
         self.log_likelihood / self.n_seen as f64
     }
@@ -26,8 +27,8 @@ impl AddAssign for Score {
     }
 }
 
-/// Scores a prediction `u` of a frame: `ln sum_x P(y | x) u(x)` over its cells, as if they were
-/// independent. `likelihood` is `P(y | x)`, shape `[S, O]`.
+/// Scores a frame under the predictor `u`: the sum over its observed cells of `ln sum_x P(y | x) u(x)`, as if cells
+/// were independent. `likelihood` is `P(y | x)`, shape `[S, O]`.
 pub fn score(predictor: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Score {
     let n_cells = predictor.shape().n_cells();
     let numbers = predictor.as_slice();

@@ -17,7 +17,7 @@ use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::borrow::Cow;
 
-/// Encoding of ages and correlations. The limit exceeds the size on the largest grid.
+/// Encoding of ages and correlations. The limit exceeds the encoded size for the largest grid.
 const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
     .with_fixed_int_encoding()
     .with_limit();
@@ -45,15 +45,15 @@ pub fn correcting(
 }
 
 impl SpatialFilter {
-    /// Returns [`Handover::kind`] for spatial filters. `filter` is the kind of the wrapped filter, and `state` the
+    /// Returns the [`Handover::kind`] of spatial filters. `filter` is the kind of the wrapped filter, and `state` the
     /// state whose probability is spread.
     pub fn handover_of(filter: &str, state: usize) -> String {
         format!("spatial {filter}, ages and sums of state {state} as bincode")
     }
 
-    /// Wraps a filter. Corrections spread the probability of `state`, the state with the highest reward.
+    /// Wraps a filter. Corrections spread the probability of `state`, the *paying state* with the highest reward.
     ///
-    /// `correlations` are learned further from each frame. The default starts without any.
+    /// Each frame updates `correlations`. The default has none yet.
     ///
     /// # Panics
     /// If the filter has no such state.
@@ -79,7 +79,8 @@ impl SpatialFilter {
         self.correlations = correlations;
     }
 
-    /// Corrects the belief with observations of distinct cells, one after the other: row-major index and observation.
+    /// Corrects the belief with observations of distinct cells, one after the other. Each item of `seen` is a cell's
+    /// row-major index and its observation.
     ///
     /// # Errors
     /// If an observation is impossible under the belief. The belief is then unchanged.

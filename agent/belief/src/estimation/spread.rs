@@ -1,4 +1,4 @@
-//! How what is seen at one cell changes what is believed of the cells around it: the arithmetic of one correction.
+//! The arithmetic of one correction: how the observation of a cell changes the beliefs about its neighbours.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{AGE_RANGES, Ages, Correlations, RADIUS, SIDE, class};
@@ -6,14 +6,14 @@ use crate::estimation::innovation::Innovation;
 use emberwatch_model::vectors::vectorised;
 use emberwatch_model::{Cell, Shape};
 
-/// Nothing that neighbours say is certain: after that, the paying state of a cell has at least this probability, and at
-/// most one minus it.
+/// Bound on spread probabilities. An observation of a neighbour is never conclusive, so it leaves the paying state with
+/// a probability from `LEAST` to `1 - LEAST`.
 const LEAST: f32 = 1e-5;
 
-/// Where a patch has the seen cell itself.
+/// Index of the seen cell in its own patch.
 const CENTRE: usize = RADIUS * WIDTH + 2 * RADIUS;
 
-/// The class of each offset, from the upper left one.
+/// The [`class`] of each offset in a neighbourhood, by row and column.
 const CLASSES: [[usize; SIDE]; SIDE] = {
     let mut classes = [[0; SIDE]; SIDE];
     let mut at = 0;
@@ -25,23 +25,24 @@ const CLASSES: [[usize; SIDE]; SIDE] = {
     classes
 };
 
-/// Cells of a row of a [`Patch`]: a neighbourhood's, between margins.
+/// Length of a row of a [`Patch`]: the side of a neighbourhood, and a margin at either end.
 const WIDTH: usize = SIDE + 2 * RADIUS;
 
-/// Covariances of one seen cell with those around it, row by row. Thanks to the margins, two of them that lie some rows
-/// and columns apart are laid over each other by a single offset.
+/// Covariances of a seen cell with each cell of its neighbourhood, row-major. Margins make it possible to align the
+/// patches of two nearby cells by a single offset.
 type Patch = [f32; WIDTH * SIDE];
 
-/// The paying state of all cells during a correction, with a margin of [`RADIUS`] cells that vary with no others.
+/// Work space of a correction. Per-cell buffers are row-major, with a margin of [`RADIUS`] cells around the grid whose
+/// covariance with any cell is 0.
 #[derive(Debug, Clone)]
 pub struct Spread {
     shape: Shape,
     /// The state whose probability is spread.
     state: usize,
-    /// Cells of a row with its margins.
+    /// Length of a row with its margins.
     stride: usize,
     probability: Vec<f32>,
-    /// Of the paying state, before the frame.
+    /// Standard deviation of the paying state before the frame.
     deviation: Vec<f32>,
     ages: Vec<u8>,
     seen: Vec<SeenCell>,
@@ -56,7 +57,7 @@ struct SeenCell {
 }
 
 impl Spread {
-    /// No cell has been seen.
+    /// Allocates the work space for a grid.
     pub fn new(shape: Shape, state: usize) -> Self {
         let stride = shape.width() + 2 * RADIUS;
         let n_cells = stride * (shape.height() + 2 * RADIUS);
@@ -72,7 +73,7 @@ impl Spread {
         }
     }
 
-    /// Begins a correction of a belief with what is seen at some cells, by index.
+    /// Starts a correction of a belief. `seen` lists the row-major index and the observation of each seen cell.
     pub fn begin(
         &mut self,
         belief: &Belief,
@@ -108,7 +109,7 @@ impl Spread {
         self.patches = patches.collect();
     }
 
-    /// The covariances of a cell before the frame.
+    /// Computes the covariances of a cell with its neighbourhood before the frame.
     fn patch(&self, cell: Cell, correlations: &Correlations) -> Patch {
         let own = self.deviation[self.place(cell)];
         let age = self.ages[self.place(cell)];
@@ -136,13 +137,13 @@ impl Spread {
         self.seen.len()
     }
 
-    /// A seen cell, what is seen there, and what is believed of it by now.
+    /// Returns a seen cell, its observation, and the belief about it after the corrections so far.
     pub fn prior(&self, index: usize, belief: &Belief) -> (Cell, u8, Vec<f64>) {
         let SeenCell { cell, observed, .. } = self.seen[index];
         let now = f64::from(self.probability[self.place(cell)]);
         let mut states = belief.states(self.shape.index(cell));
         let rest: f64 = states.iter().sum::<f64>() - states[self.state];
-        // What no neighbour changed stays as it is: the rest of one may be less than 32 bits tell.
+        // If no neighbour changed the probability, keep all states: `1 - now` may lose a tiny rest to rounding.
         if rest > 0.0 && now != states[self.state] {
             states.iter_mut().for_each(|p| *p *= (1.0 - now) / rest);
             states[self.state] = now;
@@ -150,7 +151,7 @@ impl Spread {
         (cell, observed, states)
     }
 
-    /// Corrects a seen cell and those around it, and the covariances of those that are still to come.
+    /// Corrects a seen cell, its neighbours, and the covariances of the seen cells after it.
     pub fn spread(&mut self, index: usize, innovation: &Innovation, posterior: Vec<f64>) {
         let own = posterior[self.state] as f32;
         vectorised(
@@ -160,8 +161,8 @@ impl Spread {
         self.seen[index].posterior = posterior;
     }
 
-    /// [`Self::spread`], given the probability of the paying state after it.
-    #[inline(always)] // As is its part, to be compiled for the vectors of this processor.
+    /// Implements [`Self::spread`], given the posterior probability of the paying state.
+    #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     fn correct(&mut self, index: usize, innovation: &Innovation, posterior: f32) {
         let cell = self.seen[index].cell;
         let (corner, place) = (self.corner(cell), self.place(cell));
@@ -171,18 +172,18 @@ impl Spread {
         let gain = (innovation.value / innovation.variance) as f32;
         let own_variance = patch[CENTRE];
         for (offset, row) in patch.chunks_exact_mut(WIDTH).enumerate() {
-            // What others left there is of no cell.
+            // The margins hold stale values and match no cell.
             row[..RADIUS].fill(0.0);
             row[RADIUS + SIDE..].fill(0.0);
             let start = corner + offset * self.stride;
             let others = &mut self.probability[start..start + SIDE];
             for (covariance, p) in row[RADIUS..].iter_mut().zip(others) {
-                // Both paying is at most as likely as either, and at least what their sum exceeds one by.
+                // The joint probability of two events is at most min(p, q) and at least max(0, p + q - 1).
                 let both = *p * own;
                 let least = (*p + own - 1.0).max(0.0) - both;
                 *covariance = covariance.max(least).min(p.min(own) - both);
                 let moved = (*p + *covariance * gain).clamp(LEAST, 1.0 - LEAST);
-                // Without correlations this is the plain filter.
+                // With a covariance of 0, keep the exact probability of the plain filter.
                 *p = if *covariance == 0.0 { *p } else { moved };
             }
         }
@@ -198,7 +199,7 @@ impl Spread {
         }
     }
 
-    /// Ends a correction: writes it into the belief and the ages that it began with.
+    /// Ends a correction: writes the result to the belief, and sets the ages of the seen cells to 0.
     pub fn end(&self, belief: &mut Belief, ages: &mut Ages) {
         let n_cells = self.shape.n_cells();
         let numbers = belief.as_mut_slice();
@@ -228,14 +229,16 @@ impl Spread {
         (cell.row + RADIUS) * self.stride + cell.col + RADIUS
     }
 
-    /// Where the neighbourhood of a cell begins.
+    /// Returns the index of the upper left cell of a neighbourhood.
     fn corner(&self, cell: Cell) -> usize {
         cell.row * self.stride + cell.col
     }
 }
 
-/// Gives one state of some cells, the first of each state's `n_cells`, the probabilities `now`; the others keep their
-/// proportions. Where they have none, nothing changes.
+/// Sets the probability of one state to `now`, and rescales the other states in proportion.
+///
+/// The cells are the first `now.len()` of each state's `n_cells`. A cell whose other states all have probability 0 is
+/// left unchanged.
 #[inline(always)]
 fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {
     let own = state * n_cells;
@@ -262,7 +265,8 @@ fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {
     }
 }
 
-/// Takes off a patch what was learned of its cells from another one, which lies `down` and `across` before it.
+/// Updates the covariances of a patch after another cell was seen. The patch lies `down` rows and `across` columns from
+/// the patch of the seen cell.
 #[inline(always)]
 fn reduce(patch: &mut Patch, seen: &Patch, share: f64, (down, across): (isize, isize)) {
     let offset = down * WIDTH as isize + across;

@@ -1,24 +1,26 @@
-//! Beliefs that frames do not change: of those who are told the hidden states, and of one who learns nothing.
+//! Estimators that ignore frames: oracles, which receive the hidden states, and a constant belief.
 
 use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::estimator::{Estimator, EstimatorError, Told};
 use emberwatch_model::ModelError;
 use emberwatch_model::{Frame, Grid, Model, Probabilities, Transition};
 
-/// Told X_k: certain of it, and one prediction ahead of it for the next path.
+/// An oracle that receives X_k, the states that the frame observed.
+///
+/// Its belief is certain of these states, until [`Estimator::predict`] moves it one step ahead for the next path.
 pub struct Oracle {
     belief: Belief,
     transition: Transition,
 }
 
-/// Told X_{k+1}, the state that the next path will meet.
+/// An oracle that receives X_{k+1}, the states that the next path will meet.
 pub struct Clairvoyant(pub Belief);
 
-/// Believes the same for ever, as if nothing were seen.
+/// A constant belief, as if nothing were ever observed.
 pub struct Unchanging(pub Belief);
 
 impl Oracle {
-    /// Before it is told anything.
+    /// Creates an oracle that holds `prior` until it receives hidden states.
     ///
     /// # Errors
     /// If the model cannot be simulated on the prior's grid.

@@ -1,23 +1,26 @@
-//! Beam search over several paths, of which the first is flown: it sets out for what one path cannot reach, and beyond
-//! that for the nearest cells that are worth something.
+//! Beam search over several consecutive paths. The robot flies only the first. It heads for cells that a single path
+//! cannot reach. If the other paths find nothing either, it heads for the nearest valuable cells.
 
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_model::{Cell, Grid};
 
-/// Paths that are planned at once: of T = 12 moves, they reach most of a grid of 64 x 64 cells.
+/// Number of paths per plan. With T = 12 moves each, they reach most cells of a 64 x 64 grid.
 const N_PATHS: usize = 6;
 
-/// Worth of a path's cells beside those of the path before it: what a later path finds may have burnt out by then.
+/// Discount from each path to the next, because cells may have burnt out when a later path arrives.
 const DISCOUNT: f32 = 0.8;
 
-/// Plans six paths and gives the first.
+/// A planner that plans six consecutive paths and returns the first.
 #[derive(Debug)]
 pub struct Ahead(BeamSearch);
 
 impl Ahead {
-    /// A search that keeps `width` states, at least one.
+    /// Creates a planner with a beam of `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
         Self(BeamSearch::new(width))
     }
@@ -42,13 +45,13 @@ impl Planner for Ahead {
     }
 }
 
-/// The best of all cells from each cell, where every move of the way there leaves a share; shape `[H, W]`. A search
-/// over equal cells has no direction without it.
+/// Computes the maximum discounted value of all cells as seen from each cell, shape `[H, W]`. Each move on the way to a
+/// cell multiplies its value by `kept_per_move`. This gives the search a direction where the values are flat.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
     let mut promise = values.worth().mapv(|value| value.max(0.0));
     let airspace = values.airspace();
     let is_free = |(row, col): (usize, usize)| airspace.is_free(Cell { row, col });
-    // Nothing draws a robot to where it may not be, and no way leads through there.
+    // No-fly cells have no value, and no way leads through them.
     let all = promise.indexed_iter_mut();
     all.filter(|(at, _)| !is_free(*at))
         .for_each(|(_, promise)| *promise = 0.0);
@@ -60,7 +63,7 @@ fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
             promise[[row, col]] = promise[[row, col]].max(passed_on);
         }
     };
-    // Once down and to the right, once back: the way to any cell is such a pair.
+    // One pass down and to the right, then one pass back. On an open grid, this covers all ways.
     for (row, col) in cells.clone() {
         spread(
             (row, col),

@@ -1,54 +1,55 @@
-//! Beam search over paths: keeps the best B sets of visited cells at each move.
+//! Beam search over paths. It keeps the best B partial paths at each move.
 //!
-//! The planner of paper section III.D draws paths at random; the objective of eq. 15 over distinct
-//! cells is an orienteering problem, where extending only good beginnings finds far better paths in
-//! less time. A state of the search is a cell and the set of cells visited so far, whatever their order:
-//! of beginnings that agree in both only the best goes on.
+//! The planner of paper section III.D draws paths at random. But the objective of eq. 15 over distinct cells is an
+//! orienteering problem, for which extending only good partial paths finds far better paths in less time. A state of
+//! the search is a cell and the set of cells visited so far, in any order. Of the partial paths with the same state,
+//! the search keeps the best.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use crate::planning::reach::Reach;
 use emberwatch_model::path::Move;
 use emberwatch_model::randomness::split_mix;
 
-/// Key of the hash values that stand for cells, unless told otherwise: the word `beam` in ASCII.
+/// Default key of the cells' hash values: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
-/// The default width. With the known-model filter a width of 100 earned 37.2 +- 2.2 per step on 40
-/// training worlds of 300 steps; widths 50 and 200 earned .5 +- .9 and .5 +- .8 less (paired), at 0.4
-/// and 2 times the time. A greedy walk earned 8.1 +- .8 less (16 worlds).
+/// The default width.
+///
+/// With the known-model filter, width 100 earned 37.2 +- 2.2 per step on 40 training worlds of 300 steps. Widths 50 and
+/// 200 earned .5 +- .9 and .5 +- .8 less (paired), in 0.4 and 2 times the time. A greedy walk earned 8.1 +- .8 less (16
+/// worlds).
 pub const DEFAULT_WIDTH: usize = 50;
 
-/// Beam search of a given width. Ties are broken by a hash of the visited cells, which prefers no
-/// direction.
+/// Beam search of a given width. A hash of the visited cells breaks ties, so that no direction is preferred.
 #[derive(Debug)]
 pub struct BeamSearch {
     width: usize,
     hash_key: u64,
-    /// Worth of a move's cell beside that of the move before it.
+    /// Discount from each move to the next.
     discount: f32,
-    /// Worth of the next move's cell: a power of the discount.
+    /// Weight of the next move's cell: a power of the discount.
     weight: f32,
     reach: Reach,
-    /// A random number for each cell of the reach (Zobrist, 1970): a set's hash is their exclusive
-    /// or, so that it does not depend on the order of the visits.
+    /// A random number for each cell of the reach (Zobrist, 1970). The hash of a set is their exclusive or, which does
+    /// not depend on the order of the visits.
     cell_hashes: Vec<u64>,
     beam: Vec<State>,
     next_beam: Vec<State>,
-    /// For each state of the beam, one bit per cell of the reach.
+    /// For each state of the beam, one bit per cell of the reach: whether the path has visited it.
     visited: Vec<u64>,
     next_visited: Vec<u64>,
-    /// The same for the cells in sight, where sight counts.
+    /// The same for the cells seen by the path, if cells in sight count.
     seen_cells: Vec<u64>,
     next_seen_cells: Vec<u64>,
     candidates: Vec<Candidate>,
-    /// Rank of each candidate and its index.
+    /// The rank and the index of each candidate.
     ranking: Vec<(u64, u32)>,
     seen: SeenStates,
-    /// For each move and each state of the beam after it, where it came from.
+    /// For each move, the origin of each state of the beam after it.
     history: Vec<Origin>,
 }
 
-/// A beginning of a path that the search goes on from.
+/// A partial path that the search may extend.
 #[derive(Debug, Clone, Copy)]
 struct State {
     row: u32,
@@ -58,14 +59,14 @@ struct State {
     hash: u64,
 }
 
-/// A state one move further on.
+/// A successor of a state in the beam.
 #[derive(Debug, Clone, Copy)]
 struct Candidate {
     state: State,
     origin: Origin,
 }
 
-/// The index of the state before, and the move.
+/// The index of the previous state, and the move from it.
 #[derive(Debug, Clone, Copy)]
 struct Origin {
     state: u32,
@@ -79,9 +80,15 @@ impl Default for BeamSearch {
 }
 
 impl BeamSearch {
-    /// A search that keeps `width` states, at least one.
+    /// Creates a search that keeps `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
-        assert!(width > 0, "beam search: expected a width of at least one");
+        assert!(
+            width > 0,
+            "beam search: expected a width of at least 1, got 0"
+        );
         Self {
             width,
             hash_key: HASH_KEY,
@@ -102,32 +109,33 @@ impl BeamSearch {
         }
     }
 
-    /// Breaks ties in another way for each key.
+    /// Sets the hash key. Different keys break ties differently.
     pub fn set_key(&mut self, key: u64) {
         self.hash_key = key;
         self.cell_hashes.clear();
     }
 
-    /// Makes each move's cell worth `discount` times as much as that of the move before it; 1 at first.
+    /// Sets the discount: a cell counts `discount` times as much as at the previous move. The default is 1.
     pub fn set_discount(&mut self, discount: f32) {
         self.discount = discount;
     }
 
-    /// [`Planner::plan`], or `None` once `stops`, which is asked before each move: a wide beam may take minutes.
+    /// Like [`Planner::plan`], but returns `None` as soon as `stops` returns true. It is called before each move,
+    /// because the search with a wide beam may take minutes.
     pub fn plan_unless(
         &mut self,
         problem: &PlanningProblem<'_>,
         mut stops: impl FnMut() -> bool,
     ) -> Option<Plan> {
         self.look_at(problem);
-        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
+        // A beam of width 1 is a greedy walk. Taking the better plan ensures that a wider beam is never worse.
         let greedy = self.search(1, problem.n_moves, &mut stops)?;
         let plan = self.search(self.width, problem.n_moves, &mut stops)?;
         let is_greedy = greedy.score > plan.score;
         Some(if is_greedy { greedy } else { plan })
     }
 
-    /// The best path that a beam of the given width finds in the reach; `None` once `stops`.
+    /// Returns the best path that a beam of the given width finds in the reach, or `None` if `stops` returns true.
     fn search(
         &mut self,
         width: usize,
@@ -139,7 +147,7 @@ impl BeamSearch {
             if stops() {
                 return None;
             }
-            // Of the start nothing is seen.
+            // At the start, no cells are seen yet.
             self.expand(index > 0);
             self.select(width, index > 0);
             self.weight *= self.discount;
@@ -194,7 +202,7 @@ impl BeamSearch {
         sight.map_or(0, |sight| sight.n_cells().div_ceil(64))
     }
 
-    /// Lists the states one move on from the beam, each once with its best score.
+    /// Lists the successors of the beam's states, each distinct state once with its best score.
     fn expand(&mut self, was_seen: bool) {
         self.candidates.clear();
         self.seen.clear();
@@ -219,13 +227,13 @@ impl BeamSearch {
         }
     }
 
-    /// The state after a move from a state of the beam, and its hash: that of cell and visited set.
+    /// Returns the successor of a state of the beam by a move, and the hash of its cell and visited set.
     #[inline]
     fn successor(&self, index: usize, step: Move) -> (Candidate, u64) {
         let before = self.beam[index];
         let (row, col) = self.reach.after(step, before.row, before.col);
         let cell = self.reach.index(row, col);
-        // 1 or 0, used as index and mask: what is random must not become a branch.
+        // 1 or 0, used as index and mask, because a branch on this random bit would be slow.
         let again = self.visited[index * self.words_per_state() + cell / 64] >> (cell % 64) & 1;
         let cell_hash = self.cell_hashes[cell];
         let state = State {
@@ -242,6 +250,7 @@ impl BeamSearch {
         (Candidate { state, origin }, key)
     }
 
+    /// Ranks the candidates and keeps the best `width`.
     fn rank(&mut self, width: usize) {
         let rank = |(index, candidate): (usize, &Candidate)| {
             let State { score, hash, .. } = candidate.state;
@@ -258,7 +267,7 @@ impl BeamSearch {
         }
     }
 
-    /// Makes the best candidates the beam.
+    /// Replaces the beam with the best candidates.
     fn select(&mut self, width: usize, was_seen: bool) {
         self.rank(width);
         let (n_words, n_seen) = (self.words_per_state(), self.seen_words_per_state());
@@ -280,7 +289,7 @@ impl BeamSearch {
             self.next_beam.push(state);
             self.history.push(origin);
         }
-        // Every move's origins start at a multiple of the width.
+        // Pad, so that every move's origins start at a multiple of the width.
         let n_missing = width - self.next_beam.len();
         let nowhere = Origin {
             state: 0,
@@ -293,7 +302,7 @@ impl BeamSearch {
         std::mem::swap(&mut self.seen_cells, &mut self.next_seen_cells);
     }
 
-    /// The moves that led to a state of the last beam.
+    /// Returns the moves that led to a state of the last beam.
     fn moves_to(&self, state: usize, width: usize, n_moves: usize) -> Vec<Move> {
         let mut moves = vec![Move::Up; n_moves];
         let mut state = state;
@@ -313,24 +322,24 @@ impl Planner for BeamSearch {
     }
 }
 
-/// Bits that order as the numbers do.
+/// Returns bits whose unsigned order is the order of the numbers.
 fn ordered_bits(score: f32) -> u32 {
     let bits = score.to_bits();
-    // Negative numbers order backwards by their bits, and lie below the others.
+    // As bits, negative numbers are in reverse order, and above the positive ones.
     bits ^ if bits >> 31 == 1 { u32::MAX } else { 1 << 31 }
 }
 
-/// Which states are among the candidates of one move: a hash table whose keys are hashes already,
-/// cleared without touching it.
+/// The states among the candidates of one move: a hash table whose keys are hashes already. A round counter clears it
+/// without a write to each slot.
 #[derive(Debug)]
 struct SeenStates {
-    /// Key, round in which it was put there, and index of its candidate.
+    /// The key, the round of its insertion, and the index of its candidate.
     slots: Vec<(u64, u32, u32)>,
     round: u32,
 }
 
 impl SeenStates {
-    /// Room for `n` states at most half full, so that probes stay short.
+    /// Creates a table for `n` states, which is then at most half full, so that probes are short.
     fn new(n: usize) -> Self {
         let slots = vec![(0, 0, 0); (2 * n).next_power_of_two()];
         Self { slots, round: 0 }
@@ -344,7 +353,7 @@ impl SeenStates {
         }
     }
 
-    /// The candidate of a key; where there is none, the key gets `candidate`.
+    /// Returns the candidate of a key. If the key is new, inserts it with `candidate` and returns `None`.
     #[inline]
     fn find_or_insert(&mut self, key: u64, candidate: usize) -> Option<usize> {
         let mask = self.slots.len() - 1;

@@ -1,34 +1,35 @@
-//! What a robot remembers beside its belief: how long ago it saw each cell, and what its paths brought.
+//! A robot's memory in addition to its belief: the age of each cell's last observation, and the rewards of its paths.
 
 use emberwatch_model::{Frame, Grid, Shape};
 use serde::{Deserialize, Serialize};
 
-/// Steps in which what is known of a cell fades to `1/e`.
+/// Number of steps in which the freshness of a cell decays to `1/e`.
 const FADING_STEPS: f32 = 300.0;
 
-/// Share of the latest reward in the running mean.
+/// Weight of the latest reward in the running mean.
 const LATEST_SHARE: f32 = 0.2;
 
+/// The freshness of each cell, and recent rewards.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
-    /// `exp(-age / 300)` of each cell, by the steps since it was seen; 0 before.
+    /// `exp(-age / 300)` of each cell, where `age` is the number of steps since it was seen. 0 if it was never seen.
     freshness: Grid<f32>,
     pub recent: Recent,
 }
 
-/// What a robot's paths brought.
+/// The rewards of a robot's recent paths.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Recent {
     /// Reward per move of the last path.
     pub last_reward: f32,
-    /// Its running mean.
+    /// Exponential running mean of the reward per move.
     pub mean_reward: f32,
-    /// Paths flown.
+    /// Number of paths flown.
     pub n_paths: u64,
 }
 
 impl Memory {
-    /// Before the first frame.
+    /// Creates the memory before the first frame.
     pub fn new(shape: Shape) -> Self {
         Self {
             freshness: Grid::zeros(shape.dim()),
@@ -36,7 +37,7 @@ impl Memory {
         }
     }
 
-    /// Takes in the frame of the next step.
+    /// Ages all cells by one step, then records the cells of the step's frame as fresh.
     pub fn see(&mut self, frame: &Frame) {
         let fading = (-1.0 / FADING_STEPS).exp();
         self.freshness.mapv_inplace(|fresh| fresh * fading);
@@ -47,7 +48,7 @@ impl Memory {
         }
     }
 
-    /// Takes in the reward of a path.
+    /// Records the reward of a path.
     pub fn earn(&mut self, reward: f64, n_moves: usize) {
         let recent = &mut self.recent;
         recent.last_reward = reward as f32 / n_moves as f32;
@@ -55,18 +56,18 @@ impl Memory {
         recent.n_paths += 1;
     }
 
-    /// How new each cell would be, shape `[H, W]`: 0 if it was just seen, 1 if never.
+    /// Returns the novelty of each cell, shape `[H, W]`: 0 if the cell was just seen, 1 if it was never seen.
     pub fn novelty(&self) -> Grid<f32> {
         self.freshness.mapv(|fresh| 1.0 - fresh)
     }
 
-    /// Bytes of [`Self::to_bytes`] on a grid.
+    /// Returns the number of bytes of [`Self::to_bytes`] on a grid.
     pub fn n_bytes(shape: Shape) -> usize {
         4 * shape.n_cells() + 16
     }
 
-    /// Little-endian: how fresh each cell is, `[H, W]` as `f32`; the last and the mean reward as `f32`; the number of
-    /// paths as `u64`.
+    /// Encodes the memory as little-endian numbers: the freshness `[H, W]`, the last and the mean reward as `f32`, then
+    /// the number of paths as `u64`.
     pub fn to_bytes(&self) -> Vec<u8> {
         let Recent {
             last_reward,
@@ -78,7 +79,7 @@ impl Memory {
         bytes.chain(n_paths.to_le_bytes()).collect()
     }
 
-    /// From the bytes of another on the same grid; `None` if they are not.
+    /// Decodes the bytes of [`Self::to_bytes`], or returns `None` if they are not a valid memory of the grid.
     pub fn from_bytes(bytes: &[u8], shape: Shape) -> Option<Self> {
         if bytes.len() != Self::n_bytes(shape) {
             return None;
@@ -98,7 +99,7 @@ impl Memory {
         memory.is_of(shape).then_some(memory)
     }
 
-    /// Whether all of it is possible on a grid.
+    /// Checks that the shape and all numbers are valid for a grid.
     pub fn is_of(&self, shape: Shape) -> bool {
         let rewards = [self.recent.last_reward, self.recent.mean_reward];
         self.freshness.dim() == shape.dim()

@@ -1,5 +1,5 @@
-//! An [`Objective`] says what a path is for; on a belief it becomes [`CellValues`], which planners
-//! maximise (the costs `c_1` and `c_2` of paper eqs. 13 and 14, with the sign turned).
+//! The goal of a path. An [`Objective`] and a belief determine [`CellValues`], which planners maximise. They are the
+//! costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use emberwatch_model::grid::{Cell, Grid, Shape};
@@ -8,34 +8,36 @@ use emberwatch_model::{Airspace, Pays};
 use ndarray::ArrayView2;
 use serde::{Deserialize, Serialize};
 
-/// Worth of a distinct cell to beam search beside its probability: just enough that a robot in the
-/// middle of nothing goes somewhere else. Without it a clairvoyant robot stands still where nothing
-/// burns around it and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step; with the filter it makes no
-/// difference (36.4 and 36.6; 8 training worlds, burn-in 25,000, 1,500 steps).
+/// Bonus of beam search for each distinct cell, in addition to its probability.
+///
+/// It is just large enough that a robot moves away from a region without value. Without it, a clairvoyant robot stays
+/// where nothing burns, and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step. With the filter it makes no difference
+/// (36.4 and 36.6). Both were measured on 8 training worlds with burn-in 25,000 over 1,500 steps.
 pub const BEAM_BONUS: f32 = 0.02;
 
-/// A belief that paths may be planned on.
+/// The belief that paths are planned on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BasisKind {
-    /// The predictor `u_{k+1}` of where the world stands when the path is observed, as in the authors' code.
+    /// The predictor `u_{k+1}` of the states that the path will observe, as in the authors' code.
     Predictor,
-    /// The estimate `p_k` of where it stands (the paper as printed, eqs. 13 to 15).
+    /// The estimate `p_k` of the current states, as printed in the paper (eqs. 13 to 15).
     Estimate,
 }
 
+/// The quantity that a path collects at its cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Target {
     /// The probability of one state: the paper's actions `a_k < S`.
     State(usize),
     /// The entropy of the belief: the paper's action `a_k = S`.
     Entropy,
-    /// Nothing but the visit itself.
+    /// The visit itself, whatever the belief.
     Coverage,
 }
 
 impl Target {
-    /// In a word, for observers; `states`: names of the belief's states.
+    /// Returns a one-word label for display. `states` are the names of the belief's states.
     ///
     /// # Panics
     /// If a state has no name.
@@ -48,31 +50,32 @@ impl Target {
     }
 }
 
-/// What a planner maximises: the sum over a path's cells of the target, plus a bonus per cell.
+/// The quantity that a planner maximises: the sum of the target over the path's cells, plus a bonus per distinct cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Objective {
     pub target: Target,
     pub coverage_bonus: f32,
     pub entropy: EntropyKind,
-    /// Whether a cell's value counts at every visit (eq. 15 as printed), not only at the first (the
-    /// authors' code, and the reward).
+    /// Whether a cell's value counts at every visit, as printed in eq. 15. Otherwise it counts at the first visit only,
+    /// as in the authors' code and in the reward.
     pub revisits: bool,
 }
 
-/// What each cell of the grid is worth to a planner. All numbers are finite.
+/// The value of each cell of the grid to a planner. All numbers are finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellValues {
-    /// On the path.
+    /// The value of a cell on the path.
     value: Grid<f32>,
     coverage_bonus: f32,
     revisits: bool,
-    /// In sight of the path, where the sensor sees beyond it.
+    /// The value of a cell in sight of the path, if observing cells counts and the sensor sees beyond the path.
     in_sight: Option<Grid<f32>>,
     airspace: Airspace,
 }
 
 impl Objective {
-    /// Value of distinct cells alone; for [`Target::Coverage`], their number.
+    /// Creates an objective that counts distinct cells once and has no bonus. For [`Target::Coverage`], the bonus is 1,
+    /// so the score is the number of distinct cells.
     pub fn new(target: Target) -> Self {
         let coverage_bonus = if target == Target::Coverage { 1.0 } else { 0.0 };
         Self {
@@ -83,7 +86,7 @@ impl Objective {
         }
     }
 
-    /// The authors' code: 1 per distinct cell on top of the target, and the mean of the entropy terms.
+    /// Creates the objective of the authors' code, with a bonus of 1 per distinct cell and [`EntropyKind::Mean`].
     pub fn paper(target: Target) -> Self {
         Self {
             target,
@@ -93,15 +96,17 @@ impl Objective {
         }
     }
 
-    /// What the cells are worth under a belief, on a grid that is open everywhere with a sensor of the path.
+    /// Computes the cells' values under a belief, on a grid without no-fly cells and with a sensor that sees the path
+    /// only.
     pub fn values(&self, belief: &Belief) -> CellValues {
         self.values_in(belief, &Airspace::open(belief.shape()))
     }
 
-    /// What the cells are worth under a belief. Entropy counts where it is seen, all else where it pays.
+    /// Computes the cells' values under a belief. Entropy counts in all observed cells. Other targets count where the
+    /// reward counts, see [`Airspace::pays`].
     ///
     /// # Panics
-    /// If the airspace is of another grid.
+    /// If the airspace has another grid.
     pub fn values_in(&self, belief: &Belief, airspace: &Airspace) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),
@@ -122,7 +127,7 @@ impl Objective {
 }
 
 impl CellValues {
-    /// Values of shape `[H, W]`, finite, and what each distinct cell is worth besides.
+    /// Creates values from finite numbers of shape `[H, W]`, and a bonus for each distinct cell.
     pub fn new(value: Grid<f32>, coverage_bonus: f32) -> Self {
         let (height, width) = value.dim();
         let shape = Shape::new(height, width).expect("invariant: a grid of cells");
@@ -135,16 +140,16 @@ impl CellValues {
         }
     }
 
-    /// The same where robots fly and see as an airspace has it; `in_sight`: what each distinct cell in sight of the path
-    /// is worth beside that, shape `[H, W]`, finite.
+    /// Applies the no-fly cells and the sensor of an airspace. `in_sight` has an additional finite value for each
+    /// distinct cell in sight of the path, shape `[H, W]`.
     ///
     /// # Panics
-    /// If the airspace is of another grid.
+    /// If the airspace has another grid.
     pub fn within(self, airspace: &Airspace, in_sight: Option<Grid<f32>>) -> Self {
         assert_eq!(
             airspace.shape(),
             self.shape(),
-            "airspace: expected the grid"
+            "airspace: expected the grid of the values"
         );
         Self {
             airspace: airspace.clone(),
@@ -153,11 +158,11 @@ impl CellValues {
         }
     }
 
-    /// What each distinct cell that is seen is worth, shape `[H, W]`, finite: those in sight of a path, or on it where the
-    /// sensor sees no further.
+    /// Creates values that count once for each observed cell, from finite numbers of shape `[H, W]`. If the sensor sees
+    /// the path only, these are the cells on the path.
     ///
     /// # Panics
-    /// If the airspace is of another grid.
+    /// If the airspace has another grid.
     pub fn in_sight_of(airspace: &Airspace, value: Grid<f32>) -> Self {
         if airspace.radius() == 0 {
             return Self::new(value, 0.0).within(airspace, None);
@@ -174,12 +179,12 @@ impl CellValues {
         &self.airspace
     }
 
-    /// What each distinct cell in sight of the path is worth, where sight counts.
+    /// Returns the value of each distinct cell in sight of the path, if observing cells counts.
     pub fn in_sight(&self) -> Option<&Grid<f32>> {
         self.in_sight.as_ref()
     }
 
-    /// Value of each cell without the bonus, on the path and in sight of it together, shape `[H, W]`.
+    /// Returns the sum of each cell's values on the path and in sight of it, without the bonus, shape `[H, W]`.
     pub fn worth(&self) -> Grid<f32> {
         match &self.in_sight {
             None => self.value.clone(),
@@ -187,17 +192,17 @@ impl CellValues {
         }
     }
 
-    /// Value of each cell without the bonus, shape `[H, W]`.
+    /// Returns the value of each cell on the path without the bonus, shape `[H, W]`.
     pub fn value(&self) -> ArrayView2<'_, f32> {
         self.value.view()
     }
 
-    /// Adds `weight` times a layer of shape `[H, W]`, whose numbers are finite, to the cells' values.
+    /// Adds `weight` times a layer of finite numbers, shape `[H, W]`, to the values of cells on the path.
     pub fn add(&mut self, weight: f32, layer: &Grid<f32>) {
         self.value.scaled_add(weight, layer);
     }
 
-    /// Adds `weight` times a layer of shape `[H, W]`, whose numbers are finite, to what each cell that is seen is worth.
+    /// Adds `weight` times a layer of finite numbers, shape `[H, W]`, to the values of observed cells.
     pub fn add_in_sight(&mut self, weight: f32, layer: &Grid<f32>) {
         if self.airspace.radius() == 0 {
             return self.add(weight, layer);
@@ -208,8 +213,10 @@ impl CellValues {
             .scaled_add(weight, layer);
     }
 
-    /// The same, with nothing left to gain at cells that a teammate visits or sees, by the row-major indices of those
-    /// visited, which may be named more than once. Where each visit counts, a teammate's takes nothing away.
+    /// Returns the values that remain after a teammate's path: cells that it visits or sees are worth nothing.
+    ///
+    /// `visited` lists the row-major indices of the teammate's cells, and may repeat them. With revisits, cells on the
+    /// path keep their value.
     pub fn without(&self, visited: &[usize]) -> Self {
         let mut left = self.clone();
         if !left.revisits {
@@ -231,12 +238,12 @@ impl CellValues {
         self.coverage_bonus
     }
 
-    /// Whether a cell's value counts at every visit.
+    /// Returns whether a cell's value counts at every visit.
     pub fn revisits(&self) -> bool {
         self.revisits
     }
 
-    /// Score of the path flown from `start` by [`Airspace::fly`]'s rules.
+    /// Computes the score of the path from `start`, flown by the rules of [`Airspace::fly`].
     pub fn score(&self, start: Cell, moves: &[Move]) -> f32 {
         let shape = self.shape();
         let mut visited = vec![false; shape.n_cells()];
@@ -255,7 +262,7 @@ impl CellValues {
         score
     }
 
-    /// The part of a path's score that is seen.
+    /// Computes the part of a path's score that comes from cells in sight.
     fn seen_score(&self, start: Cell, moves: &[Move]) -> f32 {
         let Some(in_sight) = &self.in_sight else {
             return 0.0;

@@ -1,7 +1,6 @@
-//! What a high-level decision chooses among (paper section III.E): options, each a whole plan, described by what it
-//! promises. Pure.
+//! The options of a high-level decision (paper section III.E). Each option plans a whole path, which features describe.
 //!
-//! A new option is a line of [`OPTIONS`].
+//! To add an option, add an entry to [`OPTIONS`].
 
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
@@ -9,24 +8,24 @@ use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_model::{Cell, Grid};
 
-/// What a path is for.
+/// An option: an objective for paths, with a name.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathOption {
-    /// Its name in tables and files.
+    /// The name in tables and files.
     pub name: &'static str,
-    /// What it is for, in a few words.
+    /// A short description.
     pub about: &'static str,
-    /// What a distinct cell is worth by itself, by the probability of what pays most, by its entropy, by its novelty.
+    /// Weights of a cell's value: a constant bonus, the probability of the paying state, the entropy and the novelty.
     worth: [f32; 4],
-    /// Paths that the plan looks ahead, at least 1; only the first is flown.
+    /// Number of consecutive paths in the plan, at least 1. The robot flies only the first.
     n_paths: usize,
-    /// Whose best region draws the path.
+    /// The layer whose best region attracts the path.
     goal: Option<Layer>,
 }
 
 const EXPLOIT: PathOption = PathOption {
     name: "exploit",
-    about: "what pays most, and a little for each new cell",
+    about: "the probability of the paying state, and a small bonus for each distinct cell",
     worth: [BEAM_BONUS, 1.0, 0.0, 0.0],
     n_paths: 1,
     goal: None,
@@ -34,62 +33,62 @@ const EXPLOIT: PathOption = PathOption {
 
 const BEST_REGION: PathOption = towards(
     "best_region",
-    "the region that promises more than any other, way included",
+    "the region with the largest surplus, discounted by distance",
     Layer::Surplus,
 );
 
-/// All options, in the order of a decision's numbers.
+/// All options. A decision is an index into this list.
 pub const OPTIONS: [PathOption; 8] = [
     EXPLOIT,
     exploit_and(
         "exploit_entropy_0.1",
-        "exploit, and .1 of each cell's entropy",
+        "exploit, plus 0.1 times each cell's entropy",
         0.1,
     ),
     exploit_and(
         "exploit_entropy_0.3",
-        "exploit, and .3 of each cell's entropy",
+        "exploit, plus 0.3 times each cell's entropy",
         0.3,
     ),
     explore("entropy", "the belief's entropy", [0.0, 0.0, 1.0, 0.0]),
     explore(
         "coverage",
-        "cells that were not seen for long",
+        "cells that have not been seen for long",
         [0.0, 0.0, 0.0, 1.0],
     ),
     PathOption {
         name: "exploit_ahead_3",
-        about: "exploit over three paths, of which the first is flown",
+        about: "exploit over three paths; the robot flies the first",
         n_paths: 3,
         ..EXPLOIT
     },
     BEST_REGION,
     towards(
         "unseen_region",
-        "the region that was least seen",
+        "the least seen region, discounted by distance",
         Layer::Novelty,
     ),
 ];
 
-/// Numbers that describe an option: see [`feature_names`].
+/// Number of features of an option: see [`feature_names`].
 pub const N_FEATURES: usize = 18 + OPTIONS.len();
 
-/// Rise in a cell's worth per cell nearer to the goal, so that over a path nearer cells outweigh what lies aside.
+/// Increase of a cell's value per cell of approach to the goal. It outweighs the values of cells off the way.
 const SLOPE: f32 = 0.3;
 
-/// Rows and columns around the goal's centre between which nothing draws the robot.
+/// Distance from the goal, in rows and in columns, within which the value does not increase.
 const GOAL_RADIUS: usize = 2;
 
-/// Share of a region's promise that is left after a path's way there.
+/// Discount of a region's sum for each path on the way to it.
 pub const KEPT_PER_PATH: f32 = 0.8;
 
-/// Sums over regions are divided by these, in the order of [`Layer::ALL`].
+/// Scales that divide sums over regions, in the order of [`Layer::ALL`].
 const REGION_SCALES: [f32; 4] = [25.0, 12.0, 169.0, 169.0];
 
-/// Mean probability of what pays over the grid, as a share of this.
+/// Scale that divides the grid's mean probability of the paying state.
 const MEAN_SCALE: f32 = 0.1;
 
-/// Steps after which no more is made of a robot's age.
+/// Upper limit of the number of flown paths in the features.
 const MOST_STEPS: u64 = 200;
 
 const fn exploit_and(name: &'static str, about: &'static str, entropy: f32) -> PathOption {
@@ -119,7 +118,7 @@ const fn towards(name: &'static str, about: &'static str, goal: Layer) -> PathOp
     }
 }
 
-/// What an option would do, and what that promises.
+/// The plan of an option, and the features that describe it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Proposal {
     pub plan: Plan,
@@ -131,12 +130,15 @@ pub struct Proposal {
 pub struct OptionPlanner(BeamSearch);
 
 impl OptionPlanner {
-    /// `width` of the beam, at least one.
+    /// Creates a planner with a beam of `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
         Self(BeamSearch::new(width))
     }
 
-    /// All options for a robot, in the order of [`OPTIONS`].
+    /// Plans all options for a robot, in the order of [`OPTIONS`].
     pub fn propose(&mut self, outlook: &Outlook, robot: Cell) -> Vec<Proposal> {
         let facts = outlook.facts(robot);
         let proposals = OPTIONS.iter().enumerate().map(|(index, option)| {
@@ -148,7 +150,7 @@ impl OptionPlanner {
         proposals.collect()
     }
 
-    /// The path of one option.
+    /// Plans one option for a robot.
     pub fn plan(&mut self, option: &PathOption, outlook: &Outlook, robot: Cell) -> Plan {
         let goal = option.goal_on(outlook, robot);
         self.plan_to(option, outlook, robot, goal)
@@ -179,7 +181,7 @@ impl PathOption {
         self.goal.map(best)
     }
 
-    /// What the cells are worth on the way to a goal.
+    /// Returns the cells' values for the option, with an increase towards the goal if there is one.
     fn values(&self, outlook: &Outlook, goal: Option<Cell>) -> CellValues {
         let [bonus, probability, entropy, novelty] = self.worth;
         let mut value: Grid<f32> = Grid::zeros(outlook.shape().dim());
@@ -212,7 +214,7 @@ impl PathOption {
 }
 
 impl Outlook {
-    /// What of a moment holds for all options.
+    /// Returns the features that all options share.
     fn facts(&self, robot: Cell) -> [f32; 6] {
         let surplus = |centre| self.around(Layer::Surplus, centre) / REGION_SCALES[1];
         let best = self.centres().map(surplus).fold(0.0, f32::max);
@@ -228,7 +230,7 @@ impl Outlook {
     }
 }
 
-/// What an option's path promises, from a robot's cell to its end and its goal.
+/// Computes the features of an option's path. Without a goal, the path's end counts as the goal.
 fn features(
     index: usize,
     outlook: &Outlook,
@@ -268,9 +270,14 @@ fn features(
     features
 }
 
-/// A name for each number: means over the path's distinct cells of probability of what pays, entropy and novelty;
-/// sums over the regions at its end and at its goal; the way to the goal in sides of the grid; the best region, the
-/// robot's own, the grid's mean; the last reward per move, its running mean, paths flown; which option it is.
+/// Returns the name of each feature:
+///
+/// - sums of probability, entropy and novelty over the path's distinct cells, per move
+/// - scaled sums of all layers over the region at the path's end, and over the region at the goal
+/// - distance to the goal, as a share of the grid's sides
+/// - scaled surplus of the best region and of the robot's region, and the scaled mean probability of the grid
+/// - last reward per move, its running mean, and number of paths flown
+/// - one-hot code of the option
 pub fn feature_names() -> Vec<String> {
     let layers = ["probability", "surplus", "entropy", "novelty"];
     let path = ["probability", "entropy", "novelty"].map(|layer| format!("path_{layer}"));
@@ -293,7 +300,8 @@ pub fn feature_names() -> Vec<String> {
         .collect()
 }
 
-/// A rule by hand: the best region if it promises more, less its way, than what is around the robot; else exploits.
+/// Chooses an option by a hand-written rule: the best region if its discounted surplus exceeds the surplus around the
+/// robot, otherwise `exploit`.
 pub fn choose_by_rule(outlook: &Outlook, robot: Cell) -> &'static PathOption {
     let goal = outlook.best_region(Layer::Surplus, robot, KEPT_PER_PATH);
     let n_paths = distance(robot, goal) as f32 / outlook.n_moves as f32;
@@ -328,7 +336,7 @@ mod tests {
         Outlook::new(&belief, &Airspace::open(shape), 1, &memory, n_moves)
     }
 
-    /// The best score of all paths.
+    /// Returns the best score of all paths, by enumeration.
     fn best_of_all(values: &CellValues, start: Cell, n_moves: usize) -> f32 {
         let paths = (0..4_u64.pow(n_moves as u32)).map(|code| {
             let moves = (0..n_moves).map(|at| Move::from_low_bits(code >> (2 * at)));

@@ -1,4 +1,4 @@
-//! What each cell of the grid promises a robot, and each region around a cell.
+//! The prospects of a robot: layers of values per cell, such as probability and novelty, and their sums over regions.
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::planning::memory::{Memory, Recent};
@@ -6,23 +6,23 @@ use emberwatch_model::Pays;
 use emberwatch_model::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
 
-/// A region is the cells within so many rows and columns of its centre, cut at the grid's edge.
+/// Radius of a region. It contains the cells within this number of rows and columns of its centre, inside the grid.
 pub const REGION_RADIUS: usize = 6;
 
-/// Rows and columns from one region's centre to the next, where regions are compared.
+/// Distance between the centres of the regions that are compared, in rows and in columns.
 const CENTRE_STRIDE: usize = 4;
 
-/// Probability of the state that pays beyond which a cell counts as worth flying to.
+/// Probability of the paying state above which a cell is worth flying to.
 const LIKELY: f32 = 0.3;
 
-/// What of a cell counts, from 0 to 1.
+/// A quantity of each cell, from 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layer {
     /// Probability of the state that pays most.
     Probability,
-    /// What that exceeds .3 by.
+    /// Excess of this probability over 0.3, or 0.
     Surplus,
-    /// Entropy of the belief, as a share of the greatest.
+    /// Entropy of the belief, as a share of the maximum `log S`.
     Entropy,
     /// [`Memory::novelty`].
     Novelty,
@@ -37,27 +37,27 @@ impl Layer {
     ];
 }
 
-/// The layers of a moment, with their sums over regions.
+/// The layers at one step, with sums over regions.
 #[derive(Debug, Clone)]
 pub struct Outlook {
     airspace: Airspace,
     layers: [Grid<f32>; 4],
     sums: [Sums; 4],
-    /// Paths are this long.
+    /// Number of moves of a path.
     pub n_moves: usize,
-    /// What the robot's paths brought.
+    /// The rewards of the robot's recent paths.
     pub recent: Recent,
 }
 
-/// Sums over all rectangles from the top left cell (a summed-area table), shape `[H + 1, W + 1]`.
+/// A summed-area table: sums over all rectangles that start at the top left cell, shape `[H + 1, W + 1]`.
 #[derive(Debug, Clone)]
 struct Sums(Grid<f64>);
 
 impl Outlook {
-    /// `target`: the state that pays most.
+    /// Computes the layers. `target` is the state that pays most.
     ///
     /// # Panics
-    /// If the airspace is of another grid than the belief.
+    /// If the airspace and the belief have different grids.
     pub fn new(
         belief: &Belief,
         airspace: &Airspace,
@@ -68,7 +68,7 @@ impl Outlook {
         assert_eq!(
             airspace.shape(),
             belief.shape(),
-            "airspace: expected the grid"
+            "airspace: expected the belief's grid"
         );
         let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
         let probability = belief.probability(target).to_owned();
@@ -89,7 +89,7 @@ impl Outlook {
         outlook.without_visits(&closed.map(|(cell, _)| cell).collect::<Vec<_>>())
     }
 
-    /// The same, with nothing to gain by a visit to some cells.
+    /// Sets layers to 0 in visited cells, except the layers that count in sight.
     fn without_visits(mut self, visited: &[usize]) -> Self {
         for layer in Layer::ALL {
             if !self.counts_in_sight(layer) {
@@ -102,7 +102,7 @@ impl Outlook {
         self
     }
 
-    /// The same, with nothing to gain at cells that another robot visits, and nothing to learn at those that it sees.
+    /// Sets layers to 0 in cells that another robot visits, or sees if the layer counts in sight.
     pub fn without(mut self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         for layer in Layer::ALL {
@@ -123,25 +123,25 @@ impl Outlook {
         &self.airspace
     }
 
-    /// Whether a layer counts where it is seen, not only on the path.
+    /// Returns whether a layer counts in all cells in sight, not only on the path.
     pub fn counts_in_sight(&self, layer: Layer) -> bool {
         let pays_in_sight = self.airspace.pays() == Pays::Seen;
         self.airspace.radius() > 0
             && (pays_in_sight || matches!(layer, Layer::Entropy | Layer::Novelty))
     }
 
-    /// A layer's cells, shape `[H, W]`.
+    /// Returns a layer, shape `[H, W]`.
     pub fn layer(&self, layer: Layer) -> &Grid<f32> {
         &self.layers[layer as usize]
     }
 
-    /// The sum of a layer over the grid.
+    /// Returns the sum of a layer over the grid.
     pub fn total(&self, layer: Layer) -> f32 {
         let (height, width) = self.shape().dim();
         self.sums[layer as usize].0[[height, width]] as f32
     }
 
-    /// The sum of a layer over the region around a cell.
+    /// Returns the sum of a layer over the region around a cell.
     pub fn around(&self, layer: Layer, centre: Cell) -> f32 {
         let (height, width) = self.shape().dim();
         let first = |at: usize| at.saturating_sub(REGION_RADIUS);
@@ -153,15 +153,15 @@ impl Outlook {
         (sum + sums[[top, left]]).max(0.0) as f32
     }
 
-    /// Centres of the regions that are compared.
+    /// Lists the centres of the regions that are compared.
     pub fn centres(&self) -> impl Iterator<Item = Cell> + use<> {
         let (height, width) = self.shape().dim();
         let along = |side: usize| ((CENTRE_STRIDE / 2).min(side - 1)..side).step_by(CENTRE_STRIDE);
         along(height).flat_map(move |row| along(width).map(move |col| Cell { row, col }))
     }
 
-    /// The centre of the best region beyond half a path, where each path of the way there costs a share; the robot's
-    /// own cell if none promises anything.
+    /// Returns the centre of the best region that is more than half a path away, by the layer's discounted sum. Each
+    /// path on the way there multiplies the sum by `kept_per_path`. If all sums are 0, returns the robot's own cell.
     pub fn best_region(&self, layer: Layer, robot: Cell, kept_per_path: f32) -> Cell {
         let mut best = (0.0, robot);
         for centre in self.centres() {
@@ -179,7 +179,7 @@ impl Outlook {
     }
 }
 
-/// Moves from one cell to another.
+/// Returns the number of moves from one cell to another.
 pub fn distance(from: Cell, to: Cell) -> usize {
     from.row.abs_diff(to.row) + from.col.abs_diff(to.col)
 }
@@ -244,7 +244,7 @@ mod tests {
     fn the_best_region_is_away_and_worth_its_way() {
         let shape = Shape::new(64, 64).expect("test shape");
         let mut states = Grid::zeros((64, 64));
-        // Two fires: one cell near, two cells two paths further away.
+        // Two fires: a burning cell nearby, and two burning cells several paths away.
         for (row, col) in [(2, 20), (40, 50), (41, 50)] {
             states[[row, col]] = 2;
         }

@@ -1,47 +1,47 @@
-//! The [`Reach`]: the part of the grid that a path can reach, so that a plan's cost depends on the
-//! path's length and not on the grid's size.
+//! The [`Reach`] is the part of the grid that a path can reach. With it, the time to plan depends on the path's length,
+//! not on the grid's size.
 
 use crate::planning::planner::PlanningProblem;
 use emberwatch_model::grid::Cell;
 use emberwatch_model::path::Move;
 use std::ops::Range;
 
-/// The rectangle of cells within T rows and T columns of the start, with what they are worth.
+/// The rectangle of cells within T rows and T columns of the start, and their values.
 ///
-/// Where it ends inside the grid no path of T moves gets past it, so clamping to the reach is
-/// clamping to the grid.
+/// No path of T moves crosses a border of the reach that lies inside the grid. So clamping moves to the reach has the
+/// same effect as clamping them to the grid.
 #[derive(Debug, Default)]
 pub(super) struct Reach {
     pub rows: usize,
     pub cols: usize,
-    /// Where the robot starts, in reach coordinates.
+    /// The start's row and column in the reach.
     pub start: (usize, usize),
-    /// Score of the first visit of each cell, and of each later visit; row-major. No-fly cells have minus infinity.
+    /// The score of the first visit and of each later visit to each cell, row-major. Minus infinity in no-fly cells.
     pub gains: Vec<[f32; 2]>,
-    /// What is in sight, where that counts.
+    /// The cells in sight, if they count.
     pub sight: Option<Sight>,
 }
 
-/// The cells in sight of a [`Reach`], with what each is worth to the first who sees it.
+/// The cells in sight of a [`Reach`], and their values when seen for the first time.
 #[derive(Debug)]
 pub(super) struct Sight {
     radius: usize,
     rows: usize,
     cols: usize,
-    /// Where the reach begins.
+    /// Row and column of the reach's upper left cell.
     first: (usize, usize),
     values: Vec<f32>,
 }
 
 impl Reach {
-    /// Becomes the reach of a problem, keeping its memory.
+    /// Computes the reach of a problem. Reuses the buffers.
     pub fn look_at(&mut self, problem: &PlanningProblem<'_>) {
         let (values, n_moves) = (problem.values, problem.n_moves);
         let shape = values.shape();
         let Cell { row, col } = problem.start;
         assert!(
             shape.contains(problem.start),
-            "start {} is off the {shape} grid",
+            "start: expected a cell of the {shape} grid, got {}",
             problem.start
         );
         let (top, left) = (row.saturating_sub(n_moves), col.saturating_sub(n_moves));
@@ -87,7 +87,7 @@ impl Reach {
         row as usize * self.cols + col as usize
     }
 
-    /// Where a move takes the robot; off the reach it stays, as [`Move::apply`] has it on the grid.
+    /// Returns the cell after a move. A move off the reach leaves the robot in place, like [`Move::apply`] on the grid.
     #[inline]
     pub fn after(&self, step: Move, row: u32, col: u32) -> (u32, u32) {
         match step {
@@ -104,8 +104,8 @@ impl Sight {
         self.rows * self.cols
     }
 
-    /// The rows and columns that a move may show for the first time, between two cells of the reach; `was_seen`: whether
-    /// all around the first cell was seen.
+    /// Returns the rows and columns that a move between two cells of the reach may show for the first time. `was_seen`
+    /// is whether the surroundings of the first cell are already seen.
     #[inline]
     fn newly_seen(&self, from: (u32, u32), to: (u32, u32), was_seen: bool) -> [Range<usize>; 2] {
         let around = |at: u32, first: usize, side: usize| {
@@ -118,7 +118,7 @@ impl Sight {
         if !was_seen {
             return now;
         }
-        // A move changes the row or the column, by one: what it adds lies at one end.
+        // A move changes the row or the column by one, so it adds cells at one end only.
         let added = |now: &Range<usize>, before: &Range<usize>| {
             if now.start < before.start {
                 now.start..before.start
@@ -133,7 +133,7 @@ impl Sight {
         }
     }
 
-    /// What a move shows for the first time is worth, given a bit for each cell that was seen.
+    /// Returns the value of the cells that a move shows for the first time. `seen` has a bit for each cell.
     #[inline]
     pub fn gain(&self, seen: &[u64], from: (u32, u32), to: (u32, u32), was_seen: bool) -> f32 {
         let [rows, cols] = self.newly_seen(from, to, was_seen);
@@ -147,7 +147,7 @@ impl Sight {
         gain
     }
 
-    /// Marks what a move shows as seen.
+    /// Marks the cells that a move shows as seen.
     pub fn mark(&self, seen: &mut [u64], from: (u32, u32), to: (u32, u32), was_seen: bool) {
         let [rows, cols] = self.newly_seen(from, to, was_seen);
         for row in rows {

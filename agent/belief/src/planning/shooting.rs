@@ -11,29 +11,29 @@ use serde::{Deserialize, Serialize};
 /// The paper's N: 2048 samples.
 pub const PAPER_SAMPLES: usize = 2048;
 
-/// Moves in one word of random bits.
+/// Number of moves in one word of random bits.
 const MOVES_PER_WORD: usize = 32;
 
-/// Samples whose positions are computed side by side: two SSE registers of `i16`.
+/// Number of samples whose positions are computed in parallel: two SSE registers of `i16`.
 const LANES: usize = 16;
 
 /// Row and column that each [`Move`] adds, in the order of its wire value.
 const OFFSETS: [(i32, i32); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
-/// How a sample's moves become cells.
+/// The rule that converts a sample's moves to cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Integration {
-    /// Each move is clamped to the grid on its own: what the robot does.
+    /// Each move is clamped to the grid on its own, as the robot does.
     #[default]
     ClampEachMove,
-    /// The moves are added up without regard to the grid and each sum is clamped, as in the authors'
-    /// code. A sample that leaves the grid by five cells stays at the border until it has come back
-    /// five; the robot is sent against the border instead, to the same cells.
+    /// The moves are summed without regard to the grid, and each partial sum is clamped, as in the authors' code. A
+    /// sample that leaves the grid by five cells stays at the border until it has returned by five. The robot reaches
+    /// the same cells by moves against the border.
     ClampSum,
 }
 
-/// Random shooting; ties go to the sample drawn first.
+/// A planner that draws random paths and keeps the best. If scores tie, the sample drawn first wins.
 #[derive(Debug)]
 pub struct Shooting {
     n_samples: usize,
@@ -41,26 +41,26 @@ pub struct Shooting {
     reach: Reach,
     slots: Vec<Slot>,
     stamp: u32,
-    /// Random bits of [`LANES`] samples, sample by sample.
+    /// The random bits of [`LANES`] samples, one sample after the other.
     words: Vec<u64>,
-    /// The cells that these samples visit, move by move.
+    /// The cells that these samples visit, one move after the other.
     cells: Vec<[(i16, i16); LANES]>,
 }
 
-/// A cell of the reach, with all that a visit reads or writes in one place.
+/// A cell of the reach. All data that a visit reads or writes is in one place.
 #[derive(Debug, Clone, Copy)]
 struct Slot {
-    /// As in [`Reach::gains`].
+    /// The gains of the first and of a later visit, as in [`Reach::gains`].
     gains: [f32; 2],
-    /// The sample that was last here.
+    /// The number of the last sample that visited the cell.
     stamp: u32,
 }
 
 impl Integration {
-    /// The moves that take the robot, which clamps each move, over the cells of a sample.
+    /// Returns the moves by which the robot, which clamps each move, visits the cells of a sample.
     ///
-    /// Clamped sums follow each other at a distance of one cell or none. Where there is none the sum
-    /// is beyond a border, so the robot flies against that border to stay in place.
+    /// Successive clamped sums are one cell apart, or equal. If they are equal, the sum is beyond a border, and the
+    /// robot moves against that border to stay in place.
     pub fn as_flown(self, shape: Shape, start: Cell, sampled: &[Move]) -> Vec<Move> {
         if self == Self::ClampEachMove {
             return sampled.to_vec();
@@ -85,9 +85,15 @@ impl Integration {
 }
 
 impl Shooting {
-    /// Shooting with `n_samples` samples, at least one.
+    /// Creates a planner that draws `n_samples` samples.
+    ///
+    /// # Panics
+    /// If `n_samples` is 0.
     pub fn new(n_samples: usize, integration: Integration) -> Self {
-        assert!(n_samples > 0, "shooting: expected at least one sample");
+        assert!(
+            n_samples > 0,
+            "shooting: expected at least one sample, got 0"
+        );
         Self {
             n_samples,
             integration,
@@ -99,7 +105,7 @@ impl Shooting {
         }
     }
 
-    /// What the authors' code does: 2048 samples, clamped after the sum. Its objective is
+    /// Creates the planner of the authors' code, with 2048 samples and clamped sums. Its objective is
     /// [`super::Objective::paper`].
     pub fn paper() -> Self {
         Self::new(PAPER_SAMPLES, Integration::ClampSum)
@@ -118,9 +124,9 @@ impl Shooting {
         self.cells.resize(problem.n_moves, [(0, 0); LANES]);
     }
 
-    /// Fills in the cells of [`LANES`] samples, two bits a move from the low end of each word.
+    /// Computes the cells of [`LANES`] samples. Each move takes two bits, from the low end of each word.
     ///
-    /// All lanes do the same arithmetic on `i16`, which the compiler turns into vector instructions.
+    /// All lanes do the same arithmetic on `i16`, which the compiler translates into vector instructions.
     fn integrate<const CLAMP_SUM: bool>(&mut self) {
         let Reach {
             rows, cols, start, ..
@@ -136,7 +142,7 @@ impl Shooting {
                     std::array::from_fn(|lane| (self.words[lane * n_words + word] >> shift) as u16);
             }
             for lane in 0..LANES {
-                // The offsets of `OFFSETS`: -1 or 1, to the row if the higher bit is zero.
+                // As in `OFFSETS`: the lower bit selects -1 or 1, and the higher bit selects the row (0) or column (1).
                 let offset = 2 * (bits[lane] & 1) as i16 - 1;
                 let along_rows = (bits[lane] >> 1 & 1) as i16 - 1;
                 bits[lane] >>= 2;
@@ -151,10 +157,10 @@ impl Shooting {
         }
     }
 
-    /// Score of the sample in one lane.
+    /// Computes the score of the sample in one lane.
     ///
-    /// Whether a cell is new is as random as the moves, so it must not become a branch (3.5 times as
-    /// slow, measured), which the compiler makes of an `if` or a mask here: it is an index.
+    /// Whether a cell is new is as unpredictable as the moves, so a branch makes the loop 3.5 times slower (measured).
+    /// The compiler would turn an `if` or a mask into a branch, so the code uses it as an index.
     fn score(&mut self, lane: usize) -> f32 {
         self.stamp += 1;
         let mut score = 0.0;
@@ -167,7 +173,7 @@ impl Shooting {
         score
     }
 
-    /// The random bits of the best sample, and its score.
+    /// Returns the random bits of the best sample, and its score.
     fn best<const CLAMP_SUM: bool>(&mut self, problem: &PlanningProblem<'_>) -> (Vec<u64>, f32) {
         let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
         let n_words = self.words.len() / LANES;
@@ -187,8 +193,8 @@ impl Shooting {
     }
 }
 
-/// The same where no-fly cells or sight count: moves that lead into no-fly cells are replaced, each move is clamped,
-/// and each path is scored by itself.
+/// Plans by random shooting if there are no-fly cells, or if cells in sight count. It replaces moves into no-fly cells,
+/// clamps each move, and scores one path at a time.
 fn best_of_flown(problem: &PlanningProblem<'_>, n_samples: usize) -> Plan {
     let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
     let n_words = problem.n_moves.div_ceil(MOVES_PER_WORD);

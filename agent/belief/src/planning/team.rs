@@ -1,20 +1,22 @@
-//! One plan for several robots: what one of them visits is worth nothing to the others.
+//! A joint plan for several robots. A cell that one of them visits is worth nothing to its teammates.
 //!
-//! The robots are planned one after the other, each on the values that the paths before it leave. Then each in turn
-//! plans again against all others (best response), and keeps the better of its two paths, so the team never loses.
+//! The robots plan one after the other, each on the values that remain after its teammates' paths. Then each robot
+//! plans again, given all other paths (best response), and keeps the better of its two paths. So the team's value never
+//! falls.
 
 use crate::planning::objective::CellValues;
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_model::Cell;
 use emberwatch_model::randomness::split_mix;
 
-/// How often each robot answers the others' paths.
+/// Default number of best-response rounds.
 pub const ROUNDS: usize = 2;
 
-/// Plans a path for each robot. A plan's score counts only cells that no teammate's path visited when it was made.
+/// Plans a path for each robot. A plan's score counts only cells that no teammate's path visited at the time of
+/// planning.
 ///
-/// `seed` and `step` are those of the planner's random numbers. In each round the robot that was planned last is left
-/// out, as it knew the others' paths: one robot alone is planned once, whatever the rounds.
+/// `seed` and `step` select the planner's random numbers. Each round omits the robot that planned last, because it
+/// already knew all other paths. A single robot therefore plans only once, whatever `rounds` is.
 pub fn plan_team(
     planner: &mut dyn Planner,
     values: &CellValues,
@@ -28,7 +30,7 @@ pub fn plan_team(
     let mut visited: Vec<Vec<usize>> = Vec::with_capacity(n_robots);
     let mut n_unchanged = 0;
     for turn in 0..n_robots + rounds * n_robots.saturating_sub(1) {
-        // Nobody gains any more.
+        // Stop when no robot can improve.
         if turn >= n_robots && n_unchanged + 1 >= n_robots {
             break;
         }
@@ -60,7 +62,7 @@ pub fn plan_team(
     plans
 }
 
-/// Seed of the random numbers of a world's robot: the world's own for the first.
+/// Returns the seed of a robot's random numbers. The first robot has the world's seed.
 pub fn robot_seed(seed: u64, robot: usize) -> u64 {
     match robot {
         0 => seed,

@@ -1,4 +1,4 @@
-//! Plans around no-fly cells and for what is seen beside a path, against all paths.
+//! Tests plans with no-fly cells and with cells in sight of the path, against an enumeration of all paths.
 
 use super::fields::Field;
 use emberwatch_belief::planning::team::plan_team;
@@ -13,7 +13,7 @@ use proptest::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Free cells with a way out, of a grid where a quarter is closed.
+/// Closes a quarter of a grid's cells at random, but not the start or the cells next to it.
 fn airspace(key: u64, shape: Shape, start: Cell, radius: usize, pays: Pays) -> Airspace {
     let closed = |index: usize| split_mix(key, index as u64).is_multiple_of(4);
     let map = Grid::from_shape_fn(shape.dim(), |(row, col)| {
@@ -23,7 +23,8 @@ fn airspace(key: u64, shape: Shape, start: Cell, radius: usize, pays: Pays) -> A
     Airspace::new(shape, Some(Arc::new(map)), radius, 1, pays)
 }
 
-/// The score of robots' paths by sets of cells: each that counts once, but with revisits the value of each visit.
+/// Computes the score of the robots' paths from the set of their cells, each of which counts once. With revisits, each
+/// visit counts.
 fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]]) -> f32 {
     let shape = air.shape();
     let value = |at: (usize, usize)| match objective.target {
@@ -54,7 +55,7 @@ fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]])
     counted.into_iter().map(value).sum::<f32>() + bonus
 }
 
-/// Whether a path has no move into a no-fly cell.
+/// Checks that no move of a path leads into a no-fly cell.
 fn avoids(air: &Airspace, start: Cell, moves: &[Move]) -> bool {
     let mut cell = start;
     moves.iter().all(|step| {
@@ -101,12 +102,12 @@ proptest! {
             let plan = planner.plan(&problem);
             let flown = score(objective, &field, &air, &[&plan.moves]);
             prop_assert!((plan.score - flown).abs() < 1e-4, "{} {flown}", plan.score);
-            // With revisits, two paths over the same cells can have different scores; beam search keeps only one of them.
+            // With revisits, paths over the same cells can have different scores. Beam search keeps only one of them.
             let is_best = (plan.score - best).abs() < 1e-4;
             prop_assert!(!is_exact || revisits || is_best, "{} {best}", plan.score);
             prop_assert!(avoids(&air, start, &plan.moves));
         }
-        // Teammates gain nothing from what another sees or visits.
+        // A robot gains nothing from cells that a teammate sees or visits.
         let (team, random) = ([start; 2], (problem.seed, problem.step));
         let team = plan_team(&mut BeamSearch::new(20), &values, &team, 5, random, 0);
         let paths = [0, 1].map(|robot| &*team[robot].moves);

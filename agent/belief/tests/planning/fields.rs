@@ -1,4 +1,4 @@
-//! Random problems.
+//! Random planning problems.
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
@@ -6,10 +6,10 @@ use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Cell, Probabilities, Shape};
 use proptest::prelude::*;
 
-/// Seed and step of the planners' random numbers.
+/// The seed and the step that select the planners' random numbers.
 pub const RANDOM: (u64, u64) = (3, 5);
 
-/// A belief of random numbers about two states, and where the robots start.
+/// A random belief about two states, and the robots' starts.
 #[derive(Debug, Clone)]
 pub struct Field {
     pub belief: Belief,
@@ -36,7 +36,7 @@ impl Field {
         Objective::new(Target::State(0)).values(&self.belief)
     }
 
-    /// That of the first robot.
+    /// Returns the planning problem of the first robot.
     pub fn problem<'a>(&self, values: &'a CellValues) -> PlanningProblem<'a> {
         PlanningProblem {
             start: self.starts[0],

@@ -1,4 +1,4 @@
-//! Planners of one robot on open grids.
+//! Tests of planners for one robot on grids without no-fly cells.
 
 use super::fields::{Field, fields, objectives};
 use emberwatch_belief::planning::{
@@ -58,7 +58,7 @@ proptest! {
 
     #[test]
     fn shooting_finds_the_first_of_its_best_samples(field in fields(8, 70, 1)) {
-        // Numbers of cells have no rounding and many ties.
+        // Coverage scores are whole numbers, which have no rounding errors and many ties.
         let values = Objective::new(Target::Coverage).values(&field.belief);
         let (problem, shape) = (field.problem(&values), values.shape());
         for integration in [Integration::ClampEachMove, Integration::ClampSum] {

@@ -1,4 +1,4 @@
-//! Plans of several robots.
+//! Tests of plans for several robots.
 
 use super::fields::{Field, RANDOM, fields, objectives};
 use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
@@ -10,7 +10,7 @@ use emberwatch_model::{Cell, Move, Shape};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 
-/// Robots, and what cells are worth to them.
+/// Robots, and the cells' values to them.
 struct Team<'a> {
     field: &'a Field,
     values: CellValues,
@@ -27,7 +27,7 @@ impl<'a> Team<'a> {
         plan_team(planner, &self.values, starts, n_moves, RANDOM, rounds)
     }
 
-    /// What the team gains: each cell once, however many robots visit it, unless each visit counts.
+    /// Returns the team's gain. Each cell counts once, however many robots visit it, unless each visit counts.
     fn worth(&self, plans: &[Plan]) -> f64 {
         let paths: Vec<&[Move]> = plans.iter().map(|plan| &*plan.moves).collect();
         self.worth_of(&paths)
@@ -50,7 +50,7 @@ impl<'a> Team<'a> {
     }
 }
 
-/// Sums of `f32` in another order.
+/// Tolerance for sums of `f32` in another order.
 const ROUNDING: f64 = 1e-4;
 
 proptest! {
@@ -93,13 +93,13 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
             let starts = starts.map(|(row, col)| Cell { row, col }).to_vec();
             let field = Field::new(shape, starts, 2, seed);
             let team = Team::new(&field, Objective::new(Target::State(0)));
-            // A beam of 16 holds all paths.
+            // A beam of width 16 holds all paths.
             let plan = |rounds| team.worth(&team.plan(&mut BeamSearch::new(16), rounds));
             let pairs = paths.iter().flat_map(|a| paths.iter().map(move |b| (a, b)));
             let optimum = pairs.map(|(a, b)| team.worth_of(&[a, b]));
             let (worth, optimum) = (plan(ROUNDS), optimum.fold(0.0, f64::max));
             assert!(worth <= optimum + ROUNDING, "{worth} above {optimum}");
-            // What a greedy team is worth at least (Fisher, Nemhauser and Wolsey, 1978).
+            // The guarantee for a greedy team (Fisher, Nemhauser and Wolsey, 1978).
             assert!(worth >= optimum / 2.0 - ROUNDING, "{worth} of {optimum}");
             n_best += usize::from(worth >= optimum - ROUNDING);
             n_all += 1;
@@ -107,7 +107,7 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
         }
     }
     assert!(3 * n_best >= 2 * n_all, "{n_best} of {n_all}");
-    // The first robot may take cells of which the second can reach no others.
+    // In a greedy team, the first robot may take the only cells that the second can reach.
     assert!(gained > gained_at_once + 0.1, "{gained} {gained_at_once}");
 }
 

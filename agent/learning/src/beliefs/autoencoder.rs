@@ -1,5 +1,5 @@
-//! The autoencoder as an estimator: a hidden vector that reads frames (paper eq. 9), and Bayes' rule at
-//! visited cells (eq. 10).
+//! The autoencoder as an estimator: frames update a hidden vector (paper eq. 9), and Bayes' rule corrects visited cells
+//! (eq. 10).
 
 pub use super::follower::Follower;
 
@@ -30,25 +30,25 @@ pub const AUTOENCODER: BeliefKind = BeliefKind {
     handover: None,
     build: |conditions| {
         let model = conditions.learned.get::<AutoencoderModel>();
-        let model = model.context("checkpoint: expected one of an autoencoder, got none")?;
+        let model = model.context("checkpoint: expected a learned autoencoder, got none")?;
         let estimator = AutoencoderEstimator::new(&model.autoencoder);
         Ok(Box::new(estimator.context("checkpoint")?))
     },
 };
 
-/// What Algorithm 1 learned: all that acting on it needs.
+/// The result of Algorithm 1: everything that an agent needs to act on its belief.
 #[derive(Debug)]
 pub struct AutoencoderModel {
     pub autoencoder: Autoencoder,
-    /// Chooses an objective by the hidden vector (paper section III.E).
+    /// Chooses an objective from the hidden vector (paper section III.E).
     pub dqn: Dqn,
-    /// What the paths are planned on that the DQN values.
+    /// The belief that paths were planned on while the DQN was trained.
     pub basis: BasisKind,
-    /// The state that pays most.
+    /// The state with the highest reward.
     pub target: usize,
 }
 
-/// Two that were read are never taken for the same.
+/// Two loaded models are never equal, because networks are not compared.
 impl PartialEq for AutoencoderModel {
     fn eq(&self, _: &Self) -> bool {
         false
@@ -69,7 +69,7 @@ impl LearnedBelief for AutoencoderModel {
         world.check_observations(shape.n_observations, 1)?;
         ensure!(
             shape.grid == world.shape,
-            "checkpoint: expected a network for {} cells as the world's, got one for {}",
+            "checkpoint: expected a network for the world's grid, {}, got one for {}",
             world.shape,
             shape.grid
         );
@@ -85,12 +85,12 @@ pub struct AutoencoderEstimator {
 }
 
 impl AutoencoderEstimator {
-    /// Before the first frame.
+    /// Creates the estimator before its first frame.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
         Ok(Self::at(network, Follower::new(network)?))
     }
 
-    /// Where a follower of the network stands.
+    /// Creates an estimator that continues from a follower of the network.
     pub fn at(network: &Autoencoder, follower: Follower) -> Self {
         Self {
             network: network.clone(),
@@ -101,7 +101,7 @@ impl AutoencoderEstimator {
 }
 
 impl Estimator for AutoencoderEstimator {
-    /// Bayes' rule with the learned `O` at visited cells (eq. 10); the predictor elsewhere.
+    /// Applies Bayes' rule with the learned `O` at visited cells (eq. 10). Other cells keep the predictor.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         let mut estimate = self.follower.prediction().clone();
         let likelihood = likelihood(&self.network).map_err(failed)?;
@@ -132,7 +132,7 @@ fn failed(error: NetworkError) -> EstimatorError {
     EstimatorError::Network(error.into())
 }
 
-/// `P(y | x)` of a network, shape `[S, O]`.
+/// Returns `P(y | x)` of a network, shape `[S, O]`.
 pub fn likelihood(autoencoder: &Autoencoder) -> Result<Array2<f64>, NetworkError> {
     let shape = autoencoder.shape();
     let matrix = autoencoder.observation_matrix()?;

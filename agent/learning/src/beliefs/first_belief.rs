@@ -1,4 +1,4 @@
-//! A filter's first belief: simulating it may take long, so it is announced, and kept for later runs.
+//! A filter's first belief. Its simulation may take long, so it is logged, and the result is cached for later runs.
 
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::kept_belief::KeptBelief;
@@ -6,10 +6,10 @@ use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_model::ModelError;
 use emberwatch_model::{Model, Shape};
 
-/// Cells that a core moves by one step in a second: 64 x 64 of the wildfire in 3.4 us.
+/// Cell steps per second and core: 64 x 64 cells of the wildfire in 3.4 us.
 const CELLS_PER_SECOND: f64 = 1.2e9;
 
-/// The belief before the first frame, see [`Prior::belief`].
+/// Returns the belief before the first frame, from the cache if possible. See [`Prior::belief`].
 pub fn first_belief(
     prior: Prior,
     model: &Model,
@@ -33,7 +33,7 @@ pub fn first_belief(
     );
     let belief = prior.belief(model, shape, seed)?;
     if let Some(Err(error)) = kept.map(|kept| kept.write(&belief)) {
-        tracing::debug!("the first belief is not kept: {error}");
+        tracing::debug!("the first belief was not cached: {error}");
     }
     Ok(belief)
 }

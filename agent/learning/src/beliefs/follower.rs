@@ -1,20 +1,21 @@
-//! What the autoencoder knows of one world: its hidden vector and its predictor (paper eq. 9).
+//! The autoencoder's recurrent state in one world: its hidden vector and its predictor (paper eq. 9).
 
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Frame, Probabilities};
 use emberwatch_network::{Autoencoder, NetworkError, Window};
 use serde::{Deserialize, Serialize};
 
-/// What a network knows of one world. Every method takes the same network.
+/// The recurrent state of a network in one world. All methods must receive the same network.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Follower {
     /// `h_k`.
     pub hidden: Vec<f32>,
+    /// The predictor `u_{k+1}`.
     pub prediction: Belief,
 }
 
 impl Follower {
-    /// Before the first frame: `h ~ N(0, I)`, the same for a network's seed.
+    /// Creates the state before the first frame: `h ~ N(0, I)`, determined by the network's seed.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
         let hidden = network.first_hidden();
         let prediction = accepted(network.predict(&hidden)?);
@@ -25,7 +26,7 @@ impl Follower {
         Self { hidden, prediction }
     }
 
-    /// After a frame (eq. 9).
+    /// Returns the state after a frame (eq. 9).
     pub fn after(&self, network: &Autoencoder, frame: &Frame) -> Result<Self, NetworkError> {
         let hidden = network.advance(&Window::new([frame]), &self.hidden)?;
         let prediction = accepted(network.predict(&hidden)?);

@@ -1,4 +1,4 @@
-//! What a kind of belief is, and what there is to build one from.
+//! Kinds of belief, and the inputs of their constructors.
 
 use super::world_form::WorldForm;
 use crate::learned::Learned;
@@ -8,81 +8,81 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
 use std::fmt;
 
-/// A kind of belief.
+/// A kind of belief: its constructor, names and properties.
 pub struct BeliefKind {
-    /// Its name in policies, such as `known+spatial`.
+    /// Name in policies, such as `known+spatial`.
     pub name: &'static str,
-    /// Its name in files, settings and views, such as `spatial_filter`.
+    /// Name in files, settings and views, such as `spatial_filter`.
     pub label: &'static str,
-    /// What it is, in a few words.
+    /// Short description.
     pub about: &'static str,
     pub input: Input,
-    /// Whether it predicts with the true model.
+    /// Whether it uses the true model.
     pub knows_model: bool,
-    /// What it was learned by, if it was.
+    /// The learner of this kind. `None` if nothing is learned.
     pub learned_by: Option<LearnedBy>,
-    /// The legend of its policies in charts, and their colour: red, green, blue.
+    /// Legend and colour (red, green, blue) of its policies in charts.
     pub chart: (&'static str, [u8; 3]),
-    /// Of a kind that knows the model: names the beliefs that agents of this kind leave to each other.
+    /// Names the format in which agents hand over this belief. Only for kinds that know the model.
     pub handover: Option<fn(&Model) -> String>,
-    /// Makes one before its first frame.
+    /// Builds an estimator before its first frame.
     pub build: fn(&Conditions<'_>) -> Result<Box<dyn Estimator>>,
 }
 
-/// What changes a belief besides the prediction.
+/// The data that correct a belief.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Input {
     Nothing,
     Frames,
-    /// The hidden states X_k: an oracle.
+    /// The hidden states X_k, for oracles.
     States,
-    /// The hidden states X_{k+1} that the next path meets: a clairvoyant.
+    /// The hidden states X_{k+1} that the next path will meet, for clairvoyants.
     NextStates,
 }
 
-/// What a belief was learned by.
+/// The learner of a kind of belief.
 pub struct LearnedBy {
-    /// The learner: `train --learner NAME`.
+    /// Name, as in `train --learner NAME`.
     pub learner: &'static str,
-    /// Whether that learns what to plan for, too (paper Algorithm 1).
+    /// Whether it also learns which objective to plan for (paper Algorithm 1).
     pub decides: bool,
-    /// What that learned, if it was read from a checkpoint.
+    /// Finds the learned model among the values from checkpoints.
     pub find: fn(&Learned) -> Option<&dyn LearnedBelief>,
 }
 
-/// What a learner left in a checkpoint for a kind of belief.
+/// A learned model for a kind of belief, from a checkpoint.
 pub trait LearnedBelief {
-    /// The state that pays most, as its learner found it.
+    /// Returns the state with the highest estimated reward.
     fn target(&self) -> usize;
 
-    /// States of the belief; they have numbers, not the names of the model's.
+    /// Returns the number of the belief's states. Learned states have numbers instead of names.
     fn n_states(&self) -> usize;
 
-    /// Refuses worlds of another form than those that it was learned in.
+    /// Checks that a world has the form of the worlds in which the model was learned.
     fn check_world(&self, world: &WorldForm) -> Result<()>;
 }
 
-/// What a belief is about, and what there is to build it from.
+/// The inputs from which a belief is built.
 #[derive(Debug, Clone, Copy)]
 pub struct Conditions<'a> {
     pub shape: Shape,
-    /// The model, for filters and predictions, where it is known.
+    /// The true model, if it is known.
     pub model: Option<&'a Model>,
-    /// The first belief of kinds that are about the model's states.
+    /// The first belief, for kinds that use the model's states.
     pub prior: Option<&'a Belief>,
     pub learned: &'a Learned,
 }
 
 impl<'a> Conditions<'a> {
-    /// The model.
+    /// Returns the model.
     ///
     /// # Errors
-    /// If it is not known.
+    /// If the model is unknown.
     pub fn model(&self) -> Result<&'a Model> {
-        self.model.context("model: expected one, got none")
+        self.model.context("model: expected a model, got none")
     }
 
-    /// The first belief.
+    /// Returns the first belief.
     ///
     /// # Errors
     /// If there is none.
@@ -93,15 +93,15 @@ impl<'a> Conditions<'a> {
 }
 
 impl BeliefKind {
-    /// Whether what to plan for was learned with it (paper Algorithm 1).
+    /// Whether its learner also learns which objective to plan for (paper Algorithm 1).
     pub fn decides(&self) -> bool {
         self.learned_by.as_ref().is_some_and(|by| by.decides)
     }
 
-    /// What was learned for it; `None` if nothing has to be.
+    /// Returns the learned model. `None` if this kind needs none.
     ///
     /// # Errors
-    /// If it has to, and no checkpoint holds it.
+    /// If this kind needs a learned model and no checkpoint contains it.
     pub fn learned<'a>(&self, learned: &'a Learned) -> Result<Option<&'a dyn LearnedBelief>> {
         let Some(by) = &self.learned_by else {
             return Ok(None);
@@ -115,19 +115,19 @@ impl BeliefKind {
         })
     }
 
-    /// Refuses worlds in which it cannot be built, from settings and checkpoints alone.
+    /// Checks that the belief can be built for worlds of a form, given the checkpoints.
     ///
     /// # Errors
-    /// If what it needs was not learned, or in worlds of another form.
+    /// If the learned model is missing, or was learned in worlds of another form.
     pub fn check(&self, learned: &Learned, world: &WorldForm) -> Result<()> {
         let learned = self.learned(learned)?;
         learned.map_or(Ok(()), |learned| learned.check_world(world))
     }
 
-    /// The names of the states that it is about.
+    /// Returns the names of the belief's states.
     ///
     /// # Errors
-    /// If there is neither a model nor what was learned.
+    /// If both the model and a learned model are missing.
     pub fn state_names(&self, conditions: &Conditions<'_>) -> Result<Vec<String>> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => numbered_states(learned.n_states()),
@@ -135,10 +135,10 @@ impl BeliefKind {
         })
     }
 
-    /// The state that pays most, among its own.
+    /// Returns the belief's index of the state with the highest reward.
     ///
     /// # Errors
-    /// As [`Self::state_names`].
+    /// Like [`Self::state_names`].
     pub fn target(&self, conditions: &Conditions<'_>) -> Result<usize> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => learned.target(),
@@ -159,7 +159,7 @@ impl fmt::Debug for BeliefKind {
     }
 }
 
-/// Names of states that were learned.
+/// Returns names for learned states.
 pub fn numbered_states(n_states: usize) -> Vec<String> {
     let states = 0..n_states;
     states.map(|state| format!("state {state}")).collect()

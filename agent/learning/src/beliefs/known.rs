@@ -1,4 +1,4 @@
-//! Bayes filters of the true model (paper section III.A, masked as in III.C).
+//! Bayes filters with the true model (paper section III.A, masked as in III.C).
 //!
 //! They differ in their prediction (mean field, second order or cavities), and in whether corrections reach the
 //! neighbours of visited cells.
@@ -12,7 +12,7 @@ use emberwatch_model::Model;
 pub const KNOWN: BeliefKind = BeliefKind {
     name: "known",
     label: "known_model",
-    about: "the Bayes filter of the true model",
+    about: "the Bayes filter with the true model",
     input: Input::Frames,
     knows_model: true,
     learned_by: None,
@@ -24,7 +24,7 @@ pub const KNOWN: BeliefKind = BeliefKind {
 pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
     name: "known+second-order",
     label: "second_order_filter",
-    about: "known, predicting with the mean of the ratio in eq. 3",
+    about: "known, with a second-order mean of the ratio in eq. 3",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::SecondOrder)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::SecondOrder)?)),
     ..KNOWN
@@ -33,7 +33,7 @@ pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
     label: "cavity_filter",
-    about: "known, predicting without a cell's own echo in its neighbours",
+    about: "known, predicting a cell without its own influence on its neighbours",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::Cavities)?)),
     ..KNOWN
@@ -42,7 +42,7 @@ pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
     label: "spatial_filter",
-    about: "known, and observations also correct neighbouring cells",
+    about: "known, where observations also correct neighbouring cells",
     handover: Some(|model| spatial_handover(model, PredictionKind::MeanField)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::MeanField)?)),
     ..KNOWN
@@ -51,19 +51,19 @@ pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
     label: "spatial_cavity_filter",
-    about: "known+spatial, predicting as known+cavities does",
+    about: "known+spatial, predicting like known+cavities",
     handover: Some(|model| spatial_handover(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::Cavities)?)),
     ..KNOWN
 };
 
-/// Builds the filter of the true model.
+/// Builds the filter with the true model.
 fn filter(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<BayesFilter> {
     let model = conditions.model()?;
     Ok(BayesFilter::known(model, conditions.prior()?)?.predicting_known(model, kind))
 }
 
-/// Builds the filter of the true model with corrections that reach the neighbours of visited cells.
+/// Builds the filter with the true model whose corrections reach the neighbours of visited cells.
 fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialFilter> {
     let (filter, state) = (
         filter(conditions, kind)?,
@@ -72,7 +72,7 @@ fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialF
     Ok(SpatialFilter::new(filter, state, Correlations::default()))
 }
 
-/// Names the bytes of a spatial filter, see `Handover::kind`.
+/// Names the handover format of a spatial filter, see `Handover::kind`.
 fn spatial_handover(model: &Model, kind: PredictionKind) -> String {
     SpatialFilter::handover_of(
         &BayesFilter::handover_of_known(model, kind),

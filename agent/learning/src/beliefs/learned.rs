@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 pub const LEARNED: BeliefKind = BeliefKind {
     name: "learned",
     label: "learned_filter",
-    about: "a Bayes filter whose parameters were learned",
+    about: "a Bayes filter with learned parameters",
     input: Input::Frames,
     knows_model: false,
     learned_by: Some(LearnedBy {
@@ -35,7 +35,7 @@ pub const LEARNED: BeliefKind = BeliefKind {
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     label: "learned_spatial_filter",
-    about: "learned, and observations also correct neighbouring cells",
+    about: "learned, where observations also correct neighbouring cells",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
     },
@@ -45,7 +45,7 @@ pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
 pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+cavities",
     label: "learned_cavity_filter",
-    about: "learned, predicting as known+cavities does",
+    about: "learned, predicting like known+cavities",
     build: |conditions| {
         Ok(model(conditions)?.estimator(false, PredictionKind::Cavities, conditions.shape))
     },
@@ -55,7 +55,7 @@ pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
 pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+spatial+cavities",
     label: "learned_spatial_cavity_filter",
-    about: "learned+spatial, predicting as known+cavities does",
+    about: "learned+spatial, predicting like known+cavities",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::Cavities, conditions.shape))
     },
@@ -65,7 +65,7 @@ pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
 /// Returns the learned filter of the checkpoint.
 fn model<'a>(conditions: &Conditions<'a>) -> Result<&'a LearnedModel> {
     let model = conditions.learned.get::<LearnedModel>();
-    model.context("checkpoint: expected one of a filter, got none")
+    model.context("checkpoint: expected a learned filter, got none")
 }
 
 /// A learned filter: everything that an agent needs to act on its belief.
@@ -76,7 +76,7 @@ pub struct LearnedModel {
     pub tables: Tables,
     /// The state with the highest reward.
     pub target: usize,
-    /// How the target state of one cell correlates with that state in its neighbours.
+    /// Correlations of the target state between neighbouring cells.
     pub correlations: Correlations,
 }
 
@@ -135,7 +135,7 @@ pub struct SavedModel {
 }
 
 impl SavedModel {
-    /// Takes the stored part from a model.
+    /// Extracts the stored part of a model.
     pub fn of(model: &LearnedModel) -> Self {
         Self {
             dimensions: model.parameters.dimensions,
@@ -159,7 +159,7 @@ impl SavedModel {
     }
 }
 
-/// Checks that the target is a state.
+/// Checks that the target is the index of a state.
 pub fn check_target(target: usize, n_states: usize) -> Result<()> {
     let expected = format!("less than {n_states}");
     check(target < n_states, "target", expected, target)
@@ -180,9 +180,8 @@ pub fn sees_own_state(part: &Part<'_>) -> bool {
     shape.is_some_and(|shape| shape.len() == 5)
 }
 
-/// Completes the dimensions of a stored filter with the dimensions that only its tensors contain.
-///
-/// These are the number of observation matrices, and whether there are own-state kernels.
+/// Completes the dimensions of a stored filter with those that only its tensors reveal: the number of observation
+/// matrices, and whether there are own-state kernels.
 ///
 /// # Errors
 /// If they are out of range, or the filter has kernels for zones.
@@ -202,7 +201,7 @@ pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensio
         ..dimensions
     };
     let checked = dimensions.check();
-    checked.map_err(|error| wrong("dimensions", "dimensions of a learned filter", error))
+    checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))
 }
 
 /// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.

@@ -33,7 +33,7 @@ const FILTER: &str = "filter.";
 pub const NEURAL: BeliefKind = BeliefKind {
     name: "neural",
     label: "neural_belief",
-    about: "a learned network on the grid, from last observations to predicted ones",
+    about: "a learned network that predicts observations from the last ones",
     input: Input::Frames,
     knows_model: false,
     learned_by: Some(LearnedBy {
@@ -45,7 +45,7 @@ pub const NEURAL: BeliefKind = BeliefKind {
     handover: None,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
-        let model = model.context("checkpoint: expected one of a neural belief, got none")?;
+        let model = model.context("checkpoint: expected a learned neural belief, got none")?;
         let estimator = model.estimator(conditions.shape);
         Ok(Box::new(estimator.context("checkpoint")?))
     },
@@ -54,11 +54,11 @@ pub const NEURAL: BeliefKind = BeliefKind {
 pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     name: "neural+sensor",
     label: "neural_sensor_belief",
-    about: "neural about states, with the true model's observation matrix",
+    about: "neural, converted to states by the true model's observation matrix",
     knows_model: true,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
-        let model = model.context("checkpoint: expected one of a neural belief, got none")?;
+        let model = model.context("checkpoint: expected a learned neural belief, got none")?;
         let estimator = model.estimator(conditions.shape).context("checkpoint")?;
         let likelihood = conditions.model()?.likelihood().clone();
         Ok(Box::new(estimator.with_sensor(likelihood)?))
@@ -128,10 +128,10 @@ pub fn estimator(
     Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 
-/// Creates a network with first parameters, which a checkpoint then replaces.
+/// Creates a network with initial parameters, which a checkpoint then replaces.
 ///
 /// # Errors
-/// If no world has this number of observations.
+/// If the number of observations is out of range.
 pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelief> {
     let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
     let fits = fits.contains(&n_observations);
@@ -166,7 +166,7 @@ pub struct SavedNeuralModel {
 }
 
 impl SavedNeuralModel {
-    /// Takes the stored part from a model.
+    /// Extracts the stored part of a model.
     pub fn of(model: &NeuralModel) -> Self {
         let filter = model.filter.as_deref();
         Self {
@@ -238,12 +238,12 @@ impl NeuralEstimator {
         let (expected, got) = (self.likelihood.dim(), likelihood.dim());
         ensure!(
             expected == got,
-            "the sensor: expected as many observations as states, {}, got a matrix {got:?}",
-            expected.0
+            "sensor: expected an observation matrix of shape {expected:?}, got {got:?}"
         );
         let inverse = inverse(&likelihood);
-        let inverse = inverse
-            .context("the sensor: expected states that look different, got some that look alike")?;
+        let inverse = inverse.context(
+            "sensor: expected an invertible observation matrix, got states that look alike",
+        )?;
         self.likelihood = likelihood;
         self.inverse = Some(inverse);
         self.set_predicted(self.belief.probabilities().clone());

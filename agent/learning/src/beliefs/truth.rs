@@ -1,4 +1,4 @@
-//! Beliefs of policies that are told the hidden states, and of one that believes the same for ever.
+//! Beliefs that ignore frames: oracles, which receive the hidden states, and the constant first belief.
 
 use super::kind::{BeliefKind, Input};
 use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
@@ -6,7 +6,7 @@ use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
 pub const NONE: BeliefKind = BeliefKind {
     name: "none",
     label: "none",
-    about: "the first belief, for ever",
+    about: "the first belief, never updated",
     input: Input::Nothing,
     knows_model: false,
     learned_by: None,
@@ -31,7 +31,7 @@ pub const TRUTH: BeliefKind = BeliefKind {
 pub const NEXT_TRUTH: BeliefKind = BeliefKind {
     name: "next_truth",
     label: "next_truth",
-    about: "the hidden states that the path will meet; only in `compare`",
+    about: "the hidden states that the next path will meet; only in `compare`",
     input: Input::NextStates,
     build: |conditions| Ok(Box::new(Clairvoyant(conditions.prior()?))),
     ..TRUTH

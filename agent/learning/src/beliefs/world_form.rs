@@ -1,4 +1,4 @@
-//! What a world must have in common with those that a belief was learned in.
+//! The properties that a world must share with the worlds in which a belief was learned.
 
 use anyhow::{Result, ensure};
 use emberwatch_model::{Model, Shape};
@@ -7,14 +7,14 @@ use emberwatch_model::{Model, Shape};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorldForm {
     pub shape: Shape,
-    /// Values that a cell may show, of all matrices together.
+    /// Number of values that a cell may show, for all observation matrices together.
     pub n_observations: usize,
-    /// Observation matrices of the sensor, at least 1.
+    /// Number of observation matrices of the sensor, at least 1.
     pub n_matrices: usize,
 }
 
 impl WorldForm {
-    /// That of a model's worlds on a grid.
+    /// Returns the form of a model's worlds on a grid.
     pub fn of(model: &Model, shape: Shape) -> Self {
         Self {
             shape,
@@ -23,17 +23,17 @@ impl WorldForm {
         }
     }
 
-    /// Refuses a belief about other observations.
+    /// Checks a belief's number of observations and of observation matrices.
     pub fn check_observations(&self, n_observations: usize, n_matrices: usize) -> Result<()> {
         let (expected, got) = (self.n_observations, n_observations);
         ensure!(
             got == expected,
-            "checkpoint: expected {expected} observations as the world's, got {got}"
+            "checkpoint: expected the world's {expected} observations, got {got}"
         );
         let (expected, got) = (self.n_matrices, n_matrices);
         ensure!(
             got == expected,
-            "checkpoint: expected {expected} observation matrices as the world's sensor has, got {got}"
+            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}"
         );
         Ok(())
     }

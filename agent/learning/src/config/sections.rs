@@ -1,4 +1,4 @@
-//! The sections of `config/agent.toml`, which says what each setting means.
+//! The sections of `config/agent.toml`, which explains each setting.
 
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::belief::EntropyKind;
@@ -7,10 +7,10 @@ use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Below 1, so that Adam's means move.
-const MOST_BETA: f64 = 0.999_999;
+/// Maximum decay of Adam's means. It is below 1, so that the means change.
+const MAX_BETA: f64 = 0.999_999;
 
-/// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
+/// Terms that planners maximise besides the target in a policy's name (paper eqs. 13 to 15).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ObjectiveConfig {
     pub shooting_bonus: f32,
@@ -41,18 +41,18 @@ pub struct LearningConfig {
     pub explore_share: f64,
 }
 
-/// What the kernels of a learned filter see.
+/// The inputs of a learned filter's kernels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum KernelKind {
     /// The states of the neighbours (paper eq. 4).
     Neighbours,
-    /// The cell's own state, too: each has a kernel of its own.
+    /// Also the cell's own state: there is one kernel for each own state.
     Own,
 }
 
 impl KernelKind {
-    /// Each kind with its name, and what such kernels see.
+    /// Each kind with its name and a description.
     pub const ALL: [(Self, &str, &str); 2] = [
         (
             Self::Neighbours,
@@ -62,7 +62,7 @@ impl KernelKind {
         (
             Self::Own,
             "own",
-            "The cell's own state, too: each has a kernel of its own",
+            "Also the cell's own state, with one kernel for each own state",
         ),
     ];
 
@@ -82,7 +82,7 @@ impl fmt::Display for KernelKind {
     }
 }
 
-/// How `train --learner neural` learns.
+/// Settings of `train --learner neural`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NeuralConfig {
     pub steps: u64,
@@ -95,7 +95,7 @@ pub struct NeuralConfig {
     pub explore_share: f64,
 }
 
-/// How the dynamic autoencoder learns (paper sections III.B and III.C).
+/// Settings for training the dynamic autoencoder (paper sections III.B and III.C).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AutoencoderConfig {
     pub states: usize,
@@ -108,7 +108,7 @@ pub struct AutoencoderConfig {
     pub step_size: StepSize,
 }
 
-/// How the DQN of Algorithm 1 learns (paper section III.E).
+/// Settings for training the DQN of Algorithm 1 (paper section III.E).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NetworkDqnConfig {
     #[serde(flatten)]
@@ -116,10 +116,10 @@ pub struct NetworkDqnConfig {
     pub step_size: StepSize,
 }
 
-/// What `train --learner decisions` learns on, and how.
+/// Settings of `train --learner decisions`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DecisionsConfig {
-    /// The name or the label of the belief that decisions are made on.
+    /// The name or the label of the belief that decisions are based on.
     pub estimator: String,
     pub filter_steps: u64,
     pub beam_width: usize,
@@ -134,11 +134,11 @@ pub struct DecisionsConfig {
     pub final_rate: f32,
 }
 
-/// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
+/// A vanishing step size: `rate (1 + n / steady)^-power` at iteration n.
 ///
-/// With powers of more than one half and at most one, sums of step sizes diverge and those of their
-/// squares do not. The autoencoder's power is larger than the DQN's, so that the quotient of the two
-/// vanishes too (paper eq. 20, `eps_sys / eps_dqn -> 0`). A power of 0 keeps the step size.
+/// If the power is above 1/2 and at most 1, the sum of the step sizes diverges, and the sum of their squares converges.
+/// The autoencoder's power is larger than the DQN's, so that their quotient vanishes as well (paper eq. 20,
+/// `eps_sys / eps_dqn -> 0`). With a power of 0, the step size is constant.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StepSize {
     pub rate: f64,
@@ -146,10 +146,10 @@ pub struct StepSize {
     pub power: f64,
 }
 
-/// A setting's name, its value, and the least and the greatest that it may be.
+/// A setting's name, its value, and its minimum and maximum.
 pub(super) type Range<'a> = (&'a str, f64, f64, f64);
 
-/// Refuses the first setting that is out of its range.
+/// Checks that all settings are within their ranges.
 pub(super) fn check(section: &str, settings: &[Range<'_>]) -> Result<()> {
     for &(name, got, least, most) in settings {
         if !(least..=most).contains(&got) {
@@ -179,8 +179,8 @@ impl LearningConfig {
             ("replay_frames", self.replay_frames as f64, 1.0, 1.6e7),
             ("rate", self.rate, 0.0, 1.0),
             ("observation_rate", self.observation_rate, 0.0, 100.0),
-            ("beta1", self.beta1, 0.0, MOST_BETA),
-            ("beta2", self.beta2, 0.0, MOST_BETA),
+            ("beta1", self.beta1, 0.0, MAX_BETA),
+            ("beta2", self.beta2, 0.0, MAX_BETA),
             ("final_rate", self.final_rate, 0.0, 1.0),
             ("updates_per_step", self.updates_per_step, 0.0, 1e3),
             ("anchor", self.anchor, 0.0, 1e3),
@@ -189,7 +189,7 @@ impl LearningConfig {
         check("learning.", &ranges)
     }
 
-    /// Share of the step size at an update: 1, then falling linearly to `final_rate`.
+    /// Returns the factor on the step size at an update: first 1, then falling linearly to `final_rate`.
     pub fn rate_at(&self, update: u64) -> f64 {
         let fallen = update.saturating_sub(self.steady_updates) as f64;
         let share = 1.0 - fallen / self.falling_updates.max(1) as f64;
@@ -222,14 +222,14 @@ impl AutoencoderConfig {
             ("hidden", self.hidden as f64, 1.0, 256.0),
             ("window", window, 2.0, 1e4),
             ("replay_frames", self.replay_frames as f64, window, 1e5),
-            ("betas", beta1, 0.0, MOST_BETA),
-            ("betas", beta2, 0.0, MOST_BETA),
+            ("betas", beta1, 0.0, MAX_BETA),
+            ("betas", beta2, 0.0, MAX_BETA),
         ];
         check("autoencoder.", &ranges)?;
         check("autoencoder.step_size.", &self.step_size.ranges())
     }
 
-    /// As the network takes them, with the first step size.
+    /// Returns the settings for the network, with the initial step size.
     pub fn settings(&self) -> AutoencoderSettings {
         AutoencoderSettings {
             encoding: self.encoding,
@@ -244,7 +244,7 @@ impl AutoencoderConfig {
     }
 }
 
-/// `most_kept`: of the replay.
+/// Checks the settings of a DQN. `most_kept` is the maximum capacity of the replay buffer, in transitions.
 fn check_dqn(section: &str, dqn: &DqnSettings, most_kept: f64) -> Result<()> {
     let batch = dqn.batch as f64;
     let ranges = [
@@ -266,7 +266,7 @@ impl NetworkDqnConfig {
         check("dqn.step_size.", &self.step_size.ranges())
     }
 
-    /// As the network takes them, with the first step size.
+    /// Returns the settings for the network, with the initial step size.
     pub fn settings(&self) -> DqnSettings {
         self.learning.with_rate(self.step_size.rate as f32)
     }
@@ -288,14 +288,14 @@ impl DecisionsConfig {
         check("decisions.", &ranges)
     }
 
-    /// As the network takes them.
+    /// Returns the settings for the network, with the initial step size.
     pub fn settings(&self) -> DqnSettings {
         self.learning.with_rate(self.rate)
     }
 }
 
 impl StepSize {
-    /// The step size of an iteration, counted from 0.
+    /// Returns the step size of an iteration, counted from 0.
     pub fn at(&self, iteration: u64) -> f64 {
         self.rate * (1.0 + iteration as f64 / self.steady.max(1) as f64).powf(-self.power)
     }
@@ -308,7 +308,7 @@ impl StepSize {
     }
 }
 
-/// 0 stands for as many states as observations.
+/// Returns the range of a number of states. 0 means as many states as observations.
 fn states(states: usize) -> Range<'static> {
     let least = if states == 0 { 0.0 } else { 2.0 };
     ("states", states as f64, least, 64.0)

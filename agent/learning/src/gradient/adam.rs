@@ -3,7 +3,7 @@
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use serde::{Deserialize, Serialize};
 
-/// Added to the root of the second moment: the paper's.
+/// Added to the root of the second moment, as in that paper.
 const EPSILON: f64 = 1e-8;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -22,7 +22,7 @@ impl Adam {
         }
     }
 
-    /// One step, with a step size for each tensor and the decays of the two means.
+    /// Makes one step. `rates` has a step size for each tensor, and the betas are the decays of the two means.
     pub fn step(
         &mut self,
         parameters: &mut Parameters,
@@ -75,8 +75,8 @@ mod tests {
             assert!(near, "{got:?} {expected:?}");
         };
         close(&parameters.tensors[0], &[-0.5, 0.5, 0.0, -0.5]);
-        // Against minus the same gradient: the mean is (.9 * .1 - .1) g = -.01 g over 1 - .81, the
-        // square g^2 again.
+        // Then the negative gradient: the mean is (.9 * .1 - .1) g = -.01 g, divided by 1 - .81. The mean square is g^2
+        // again.
         gradient.tensors[0] = vec![-3.0, 0.2, 0.0, -1.0];
         adam.step(&mut parameters, &gradient, rates, betas);
         let back = 0.5 * 0.01 / 0.19;

@@ -1,16 +1,16 @@
-//! Correlations of planes with dense kernels, and their derivatives by the weights.
+//! Correlations of planes with dense kernels, and their derivatives with respect to the weights.
 //!
-//! [`emberwatch_model::Transition`] computes the forward part too; it gains from weights that are zero or
-//! alike, of which a learned kernel has none, and does not know derivatives.
+//! [`emberwatch_model::Transition`] also computes the forward part. It is fast for sparse or repeated weights, which
+//! learned kernels lack, and it has no gradient.
 
 use crate::gradient::layout::{LANES, Layout};
 use pulp::{Simd, bytemuck};
 use std::ops::Range;
 
-/// Planes computed at once: with [`WIDE`] vectors of cells they fill the registers.
+/// Number of planes computed at once. Together with [`WIDE`] vectors of cells, they fill the registers.
 const GROUP: usize = 3;
 
-/// Vectors of cells computed at once.
+/// Number of vectors of cells computed at once.
 const WIDE: usize = 4;
 
 /// `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
@@ -22,13 +22,13 @@ pub(super) struct Convolution {
     weights: Vec<f32>,
 }
 
-/// What the products are added to.
+/// The initial value of the sums.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Base<'a> {
     Zero,
-    /// A number for each plane.
+    /// One number for each plane.
     Biases(&'a [f32]),
-    /// What the planes hold.
+    /// The present values of the planes.
     Planes,
 }
 
@@ -45,7 +45,7 @@ impl Convolution {
         self.weights.len() / (self.n_from * self.layout.n_taps())
     }
 
-    /// That of derivatives, from `to` to `from`: `w[from, to, KH - 1 - row, KW - 1 - col]`.
+    /// Returns the convolution of the derivatives, from `to` to `from`: `w[from, to, KH - 1 - row, KW - 1 - col]`.
     pub(super) fn turned(&self) -> Self {
         let (n_from, n_taps) = (self.n_from, self.layout.n_taps());
         let mut turned = Vec::with_capacity(self.weights.len());
@@ -58,7 +58,7 @@ impl Convolution {
         Self::new(self.layout, self.n_to(), turned)
     }
 
-    /// One row of the grid.
+    /// Computes one row of the grid.
     #[inline(always)]
     pub(super) fn row<S: Simd>(
         &self,
@@ -78,7 +78,7 @@ impl Convolution {
         }
     }
 
-    /// The same for the planes from `first` on.
+    /// Computes a row for `G` planes, from `first` on.
     #[inline(always)]
     fn group<S: Simd, const G: usize>(
         &self,
@@ -101,7 +101,7 @@ impl Convolution {
         }
     }
 
-    /// The same for `B` vectors of cells.
+    /// Computes `B` vectors of cells for `G` planes.
     #[inline(always)]
     fn block<S: Simd, const G: usize, const B: usize>(
         &self,
@@ -152,7 +152,7 @@ impl Convolution {
         }
     }
 
-    /// Adds the derivatives by the weights, of derivatives `h` by some rows and columns of the result.
+    /// Adds the derivatives with respect to the weights. `h`, the derivatives of the result, are zero outside `region`.
     #[inline(always)]
     pub(super) fn add_weight_gradient<S: Simd>(
         &self,
@@ -177,7 +177,7 @@ impl Convolution {
         }
     }
 
-    /// The gradients of one row of the kernel from a plane to `G` planes, three taps a time.
+    /// Adds the gradient of one row of the kernel from a plane to `G` planes, three weights at a time.
     #[inline(always)]
     fn taps<S: Simd, const G: usize>(
         &self,
@@ -204,7 +204,7 @@ impl Convolution {
         }
     }
 
-    /// `C` of these gradients, from a tap on.
+    /// Adds the gradient of `C` weights in a row of the kernel, from `first` on.
     #[inline(always)]
     fn some_taps<S: Simd, const G: usize, const C: usize>(
         &self,
@@ -243,7 +243,7 @@ impl Convolution {
     }
 }
 
-/// The rows and vectors of columns outside of which a gradient is zero.
+/// Rows and columns outside of which a gradient is zero. The columns are whole vectors.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Region {
     pub(super) rows: Range<usize>,
@@ -257,7 +257,7 @@ impl Region {
         self.cols = widened(&self.cols, col..col + LANES);
     }
 
-    /// The cells that the kernel reaches from these.
+    /// Returns the region that the kernel reaches from this region.
     pub(super) fn reached(&self, layout: &Layout) -> Self {
         if self.rows.is_empty() {
             return Self::default();
@@ -273,7 +273,7 @@ impl Region {
         }
     }
 
-    /// Places of the vectors in a row.
+    /// Returns the indices of the vectors in a row.
     #[inline(always)]
     pub(super) fn places<S: Simd>(
         &self,

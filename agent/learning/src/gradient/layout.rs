@@ -1,11 +1,11 @@
-//! Where a cell of a state lies in planes with a margin of zeros, so that no cell is special.
+//! The memory layout of one plane per state. Margins of zeros allow kernels to treat all cells alike.
 
 use emberwatch_model::Shape;
 
-/// Cells that the widest vectors hold; those of each kind of processor divide it.
+/// Number of cells in the widest SIMD vectors. It is a multiple of the vector length of every processor.
 pub(super) const LANES: usize = 16;
 
-/// Half a kernel of margin on each side, and on the right up to whole [`LANES`] and one more.
+/// Planes with margins of half a kernel. The width is a multiple of [`LANES`], with at least [`LANES`] further columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) shape: Shape,
@@ -14,18 +14,18 @@ pub(super) struct Layout {
     pub(super) kernel_width: usize,
     /// Rows of margin above the grid.
     pub(super) above: usize,
-    /// Columns of margin on its left.
+    /// Columns of margin to the left of the grid.
     pub(super) left: usize,
-    /// Places from one row to the next.
+    /// Offset from one row to the next.
     pub(super) stride: usize,
-    /// Places from one state to the next.
+    /// Offset from one state to the next.
     pub(super) plane: usize,
 }
 
 impl Layout {
     pub(super) fn new(shape: Shape, n_states: usize, kernel: (usize, usize)) -> Self {
         let (kernel_height, kernel_width) = kernel;
-        // A model's kernels are at most 15 wide (`MAX_KERNEL_SIDE`): one more vector is room enough.
+        // Kernels are at most 15 wide (`MAX_KERNEL_SIDE`), so that one further vector is enough.
         let stride = shape.width().next_multiple_of(LANES) + LANES;
         Self {
             shape,
@@ -39,38 +39,38 @@ impl Layout {
         }
     }
 
-    /// Taps of the kernel between two states.
+    /// Returns the number of weights of the kernel between two states.
     pub(super) fn n_taps(&self) -> usize {
         self.kernel_height * self.kernel_width
     }
 
-    /// Planes of zeros, one per state.
+    /// Allocates planes of zeros, one per state.
     pub(super) fn planes(&self) -> Vec<f32> {
         vec![0.0; self.n_states * self.plane]
     }
 
-    /// Columns that are computed: whole vectors.
+    /// Returns the number of computed columns, a multiple of the vector length.
     pub(super) fn columns(&self) -> usize {
         self.shape.width().next_multiple_of(LANES)
     }
 
-    /// Place of the first cell of a row, in the first state's plane.
+    /// Returns the index of a row's first cell in the first state's plane.
     pub(super) fn row(&self, row: usize) -> usize {
         (row + self.above) * self.stride + self.left
     }
 
-    /// Place of a cell, in the first state's plane.
+    /// Returns the index of a cell in the first state's plane.
     pub(super) fn place(&self, cell: usize) -> usize {
         self.row(cell / self.shape.width()) + cell % self.shape.width()
     }
 
-    /// 1 for each column of the grid, 0 for those up to whole vectors.
+    /// Returns 1 for each column of the grid, and 0 for each further computed column.
     pub(super) fn mask(&self) -> Vec<f32> {
         let on_grid = |col| f32::from(u8::from(col < self.shape.width()));
         (0..self.columns()).map(on_grid).collect()
     }
 
-    /// Copies beliefs `[S, H, W]` inside the margins.
+    /// Copies a belief `[S, H, W]` into the planes, inside the margins.
     pub(super) fn load(&self, from: &[f32], to: &mut [f32]) {
         let states = from.chunks_exact(self.shape.n_cells());
         for (cells, plane) in states.zip(to.chunks_exact_mut(self.plane)) {
@@ -80,7 +80,7 @@ impl Layout {
         }
     }
 
-    /// The reverse of [`Self::load`].
+    /// Copies the planes into a belief `[S, H, W]`, the reverse of [`Self::load`].
     pub(super) fn unload(&self, from: &[f32], to: &mut [f32]) {
         let states = to.chunks_exact_mut(self.shape.n_cells());
         for (cells, plane) in states.zip(from.chunks_exact(self.plane)) {

@@ -1,25 +1,26 @@
 //! The operator `Phi_w` (paper eqs. 2 and 3, without bias) for dense kernels, and its derivatives.
 //!
-//! Forward, `v[m] = sum_n sum_a w[m, n, a] p[n, . + a]` and `u = v / sum_m v`. Backward, from
-//! `g = dL/du`: `h = dL/dv = (g - sum_m g[m] u[m]) / sum_m v`; `dL/dw[m, n, a] = sum_cells h[m]
-//! p[n, . + a]`; `dL/dp` is the correlation of `h` with the kernel turned and its states exchanged.
+//! Forward: `v[m] = sum_n sum_a w[m, n, a] p[n, . + a]` and `u = v / sum_m v`.
+//! Backward, from `g = dL/du`: `h = dL/dv = (g - sum_m g[m] u[m]) / sum_m v`, and
+//! `dL/dw[m, n, a] = sum_cells h[m] p[n, . + a]`. `dL/dp` is the correlation of `h` with the kernel, rotated by 180
+//! degrees and with its states exchanged.
 //!
-//! Where each state `o` that a cell itself can be in has a kernel of its own, whose centre sees `o` itself:
+//! With own-state kernels, there is one kernel for each state `o` of the cell itself, and its centre sees `o`. Forward:
 //! `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with `d[o] = sum_m g[m] q[o, m]`:
-//! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has `d[o]` too.
+//! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has the additional term `d[o]`.
 
 use crate::gradient::convolution::{Base, Convolution, Region, load, store};
 use crate::gradient::layout::Layout;
 use pulp::Simd;
 use std::ops::Range;
 
-/// Weights `w[to, from, row, col]`, or `w[own, to, from, row, col]`, laid out for a grid.
+/// The operator for a grid. Weights are `w[to, from, row, col]`, with own-state kernels `w[own, to, from, row, col]`.
 #[derive(Debug, Clone)]
 pub(super) struct Operator {
     pub(super) layout: Layout,
     forward: Convolution,
     backward: Convolution,
-    /// Where kernels see the cell's own state: the weights of their centres, `[own, to]`.
+    /// The centre weights of own-state kernels, `[own, to]`.
     centres: Option<Vec<f32>>,
     mask: Vec<f32>,
 }
@@ -38,13 +39,13 @@ impl Operator {
         }
     }
 
-    /// Planes of `v` and `h`.
+    /// Allocates planes for `v` and `h`.
     pub(super) fn weighed_planes(&self) -> Vec<f32> {
         vec![0.0; self.forward.n_to() * self.layout.plane]
     }
 
-    /// `u = Phi_w(p)` in planes. Of a kernel of all cells `factors` (one plane) gets `1 / sum_m v`, 0 beside the
-    /// grid; of others `v` is room.
+    /// Computes `u = Phi_w(p)`. Without own-state kernels, `factors` (one plane) receives `1 / sum_m v`, which is 0
+    /// outside of the grid. With own-state kernels, `v` is a buffer.
     #[inline(always)]
     pub(super) fn forward<S: Simd>(
         &self,
@@ -68,7 +69,7 @@ impl Operator {
         }
     }
 
-    /// `h` from `g` in some rows and columns; `g` becomes `d`, and `u` is no more, where kernels see the cell's own state.
+    /// Computes `h` from `g` in a region. With own-state kernels, it replaces `g` by `d` and overwrites `u`.
     #[inline(always)]
     pub(super) fn backward_normalise<S: Simd>(
         &self,
@@ -87,7 +88,7 @@ impl Operator {
                     }
                 }
                 Some(centres) => {
-                    // Whole rows: h is 0 where g is.
+                    // Whole rows are computed: h is 0 where g is 0.
                     self.forward.row(simd, p, h, Base::Biases(centres), row);
                     self.unmix(simd, p, u, g, h, row);
                 }
@@ -95,7 +96,7 @@ impl Operator {
         }
     }
 
-    /// Adds `dL/dw` of some rows and columns of `h` to `gradient`; [`Self::end_gradient`] is still to come.
+    /// Adds `dL/dw` for a region of `h` to `gradient`. Call [`Self::end_gradient`] after the last region.
     #[inline(always)]
     pub(super) fn add_weight_gradient<S: Simd>(
         &self,
@@ -109,15 +110,15 @@ impl Operator {
             .add_weight_gradient(simd, p, h, region, gradient);
     }
 
-    /// A centre that sees the cell's own state has the sum of `h` as its derivative. As beliefs sum to one, that is the sum
-    /// of what the states that it could see have.
+    /// Completes the gradient of own-state kernels. The derivative with respect to a centre weight is the sum of `h`
+    /// over all cells. As beliefs sum to one, this equals the sum of the centre's derivatives over all seen states.
     pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
         if self.centres.is_some() {
             end_gradient(&self.layout, gradient);
         }
     }
 
-    /// `dL/dp` from `h`, and from `d` in `g`, in some rows.
+    /// Computes `dL/dp` in some rows, from `h` and, with own-state kernels, from `d` in `g`.
     #[inline(always)]
     pub(super) fn backward_correlate<S: Simd>(
         &self,
@@ -135,7 +136,7 @@ impl Operator {
         }
     }
 
-    /// One row of eq. 3.
+    /// Applies eq. 3 to one row.
     #[inline(always)]
     fn normalise<S: Simd>(&self, simd: S, u: &mut [f32], factors: &mut [f32], row: usize) {
         for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
@@ -149,7 +150,7 @@ impl Operator {
         }
     }
 
-    /// The reverse of [`Self::normalise`], for the cells from a place on: `h`.
+    /// Computes `h` for one vector of cells, the reverse of [`Self::normalise`].
     #[inline(always)]
     fn unnormalise<S: Simd>(
         &self,
@@ -172,7 +173,7 @@ impl Operator {
         }
     }
 
-    /// One row of `u` from `v`, by the cell's own state.
+    /// Computes one row of `u` from `v` with own-state kernels.
     #[inline(always)]
     fn mix<S: Simd>(&self, simd: S, p: &[f32], v: &[f32], u: &mut [f32], row: usize) {
         let Layout {
@@ -197,7 +198,7 @@ impl Operator {
         }
     }
 
-    /// The reverse of [`Self::mix`]: `h` in the place of `v`, and `d` in that of `g`.
+    /// Applies [`Self::mix`] backward to one row: replaces `v` (in `h`) by `h`, and `g` by `d`.
     #[inline(always)]
     fn unmix<S: Simd>(
         &self,
@@ -236,11 +237,11 @@ impl Operator {
         }
     }
 
-    /// `1 / sum_m v` of the planes from `first` on, 0 beside the grid.
+    /// Returns `1 / sum_m v` for the planes from `first` on, which is 0 outside of the grid.
     #[inline(always)]
     fn factor<S: Simd>(&self, simd: S, v: &[f32], first: usize, at: usize, col: usize) -> S::f32s {
         let mask = load::<S>(&self.mask, col);
-        // Beside the grid the sum may be 0, where no factor is wanted.
+        // Outside of the grid, the sum may be 0. Adding 1 there avoids a division by zero.
         let mut total = simd.sub_f32s(simd.splat_f32s(1.0), mask);
         for state in first..first + self.layout.n_states {
             total = simd.add_f32s(total, load::<S>(v, state * self.layout.plane + at));
@@ -249,8 +250,8 @@ impl Operator {
     }
 }
 
-/// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
-/// all states that it could see.
+/// Returns two values for each own state and next state: the index of the centre weight for the own state, and the
+/// indices of the centre weights for all states.
 fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     let (n_states, n_taps) = (layout.n_states, layout.n_taps());
     (0..n_states * n_states).map(move |weighed| {
@@ -262,7 +263,7 @@ fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     })
 }
 
-/// Takes the weights of centres that see the cell's own state out of kernels, `[own, to]`; zeros are left.
+/// Extracts the centre weights of own-state kernels, `[own, to]`, and sets all centre weights of the kernels to zero.
 fn take_centres(layout: &Layout, weights: &mut [f32]) -> Vec<f32> {
     let take = |(own, all): (usize, Vec<usize>)| {
         let weight = weights[own];
@@ -272,7 +273,7 @@ fn take_centres(layout: &Layout, weights: &mut [f32]) -> Vec<f32> {
     centres(layout).map(take).collect()
 }
 
-/// [`Operator::end_gradient`] of kernels that see the cell's own state.
+/// Adds the gradients of all centre weights to the own state's weight, see [`Operator::end_gradient`].
 fn end_gradient(layout: &Layout, gradient: &mut [f64]) {
     for (own, all) in centres(layout) {
         let sum: f64 = all.iter().map(|&at| gradient[at]).sum();

@@ -1,9 +1,9 @@
-//! Updates of the unknown parameters from what the replay holds.
+//! Updates of the unknown parameters from the replay buffer.
 //!
-//! As many streams as there are windows in an update run through the replay's blocks in random
-//! order, each with the belief that it has come to; at the end of a block that belief is handed on
-//! to the block after it. So every window starts from a belief that knows the frames before it,
-//! though gradients only run back through the window.
+//! Each update learns from one window per stream. The streams run through the buffer's blocks in random order, and each
+//! carries its belief from window to window. At the end of a block, this belief is stored in the track's next block. So
+//! every window starts from a belief that depends on the earlier frames, though gradients only reach back through the
+//! window.
 
 use crate::checkpoint::{check, check_counts, check_numbers};
 use crate::config::LearningConfig;
@@ -18,11 +18,11 @@ use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Parts that the streams are dealt into, each with its own work space: as many threads are of use.
-/// The parts do not depend on the number of threads, nor does the order in which gradients are added.
+/// Number of groups of streams, each with its own buffers: the maximum number of useful threads. Groups and the order
+/// of summation do not depend on the number of threads.
 const N_PARTS: usize = 8;
 
-/// Learns the parameters; holds all that a later update depends on but the replay.
+/// Learns the parameters. Contains everything that a later update depends on, except the replay buffer.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Optimiser {
     parameters: Parameters,
@@ -31,7 +31,7 @@ pub struct Optimiser {
     seed: u64,
     pub shape: Shape,
     pub(crate) streams: Vec<Stream>,
-    /// Blocks still to be run through in this lap.
+    /// Remaining blocks of this lap, which is one pass through all blocks in random order.
     lap: Vec<u64>,
     n_laps: u64,
     #[serde(skip)]
@@ -41,24 +41,24 @@ pub struct Optimiser {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
     pub number: u64,
-    /// Minus the mean log-likelihood of a visited cell, before the update.
+    /// Negative mean log-likelihood per visited cell, before the update.
     pub loss: f64,
     pub rate: f64,
 }
 
-/// A place in the replay, and the belief before the frame there.
+/// A position in the replay buffer, and the belief before the frame there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stream {
     block: Option<u64>,
     n_done: usize,
     belief: Vec<f32>,
-    /// Room for the belief after the next window.
+    /// Buffer for the belief after the next window.
     #[serde(skip)]
     end: Vec<f32>,
 }
 
 impl Optimiser {
-    /// Before the first update; the streams are not yet in any block.
+    /// Creates an optimiser before the first update. The streams have no block yet.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
         let tables = parameters.tables();
         let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
@@ -81,10 +81,11 @@ impl Optimiser {
         }
     }
 
-    /// Goes on from another's parameters; where its streams were if it was cut the same way.
+    /// Resumes with the parameters and moments of another optimiser. Its streams continue if both use the same windows
+    /// and grid.
     ///
     /// # Errors
-    /// Names what no such streams have.
+    /// If the saved streams are invalid.
     pub fn resume(&mut self, other: Self) -> Result<()> {
         if self.cut() == other.cut() {
             self.resume_streams(other.streams)?;
@@ -112,7 +113,7 @@ impl Optimiser {
         Ok(())
     }
 
-    /// Grid, window, windows of a block, streams: what places in a replay depend on.
+    /// Returns the settings that positions in the replay buffer depend on: grid, window, windows per block, streams.
     pub fn cut(&self) -> (Shape, [usize; 3]) {
         let config = &self.config;
         let cut = [config.window, config.block_windows, config.streams];
@@ -135,11 +136,11 @@ impl Optimiser {
         self.parameters.dimensions
     }
 
-    /// One update; `None` while the replay has no block for each stream, or nothing was seen.
-    /// `sure`: the state to be seen almost surely.
+    /// Makes one update. Returns `None` if there are fewer blocks than streams, or the windows show no cell.
+    /// `sure` is the state that is observed almost surely, see `add_anchor`.
     ///
     /// # Errors
-    /// For numbers that are not finite; the parameters are then as they were.
+    /// If a number is not finite. The parameters then remain unchanged.
     pub fn update(
         &mut self,
         replay: &mut BlockReplay,
@@ -149,14 +150,14 @@ impl Optimiser {
             return Ok(None);
         }
         if let Some(tensor) = self.parameters.not_finite() {
-            return Err(self.wrong(tensor, "a parameter that is not"));
+            return Err(self.wrong(tensor, "a NaN or infinite parameter"));
         }
         self.place_streams(replay);
         let outcomes = self.run_windows(replay);
         let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
-        // Before a belief that is not finite gets into the replay.
+        // Checked before such a belief is stored in the replay buffer.
         if !log_likelihood.is_finite() {
-            return Err(self.wrong("loss", "a sum that is not"));
+            return Err(self.wrong("loss", "a NaN or infinite sum"));
         }
         self.move_streams(replay);
         if n_seen == 0 {
@@ -173,7 +174,7 @@ impl Optimiser {
         self.step(loss, &gradient).map(Some)
     }
 
-    /// Takes the streams out of their blocks: the replay is another.
+    /// Detaches the streams from their blocks, because the replay buffer was replaced.
     pub fn leave_replay(&mut self) {
         self.lap.clear();
         self.streams
@@ -181,7 +182,7 @@ impl Optimiser {
             .for_each(|stream| stream.block = None);
     }
 
-    /// Gives streams at the end of a block, or whose block is gone, another one.
+    /// Assigns a new block to each stream whose block is finished or was dropped.
     fn place_streams(&mut self, replay: &BlockReplay) {
         for index in 0..self.streams.len() {
             let stream = &self.streams[index];
@@ -197,12 +198,12 @@ impl Optimiser {
         }
     }
 
-    /// Windows of a block, the last of which may be shorter.
+    /// Returns the number of windows of a block. The last window may be shorter.
     fn n_windows(&self, block: &Block) -> usize {
         block.frames.len().div_ceil(self.config.window)
     }
 
-    /// The next block of the lap, or the first of a new lap through all blocks.
+    /// Returns the next block of the lap. Starts a new lap through all blocks if the lap has ended.
     fn next_block<'a>(&mut self, replay: &'a BlockReplay) -> (u64, &'a Block) {
         loop {
             match self.lap.pop() {
@@ -253,8 +254,8 @@ impl Optimiser {
         }
     }
 
-    /// The prior `anchor * ln P(y | x)` on the observation that a state shows most: "there is a
-    /// state which is observable with negligible uncertainties" (paper section III.E, remark), from the path.
+    /// Adds the gradient of the prior `anchor * ln P(y | x)` on a state's most likely observation from the path: "there
+    /// is a state which is observable with negligible uncertainties" (paper section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let dimensions = self.dimensions();
         let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());
@@ -270,7 +271,7 @@ impl Optimiser {
         let number = self.adam.n_steps + 1;
         let gradient = self.parameters.chain(by_tables);
         if let Some(tensor) = gradient.not_finite() {
-            return Err(self.wrong(tensor, "a gradient that is not"));
+            return Err(self.wrong(tensor, "a NaN or infinite gradient"));
         }
         let rate = self.config.rate * self.config.rate_at(number - 1);
         let observation_rate = rate * self.config.observation_rate;
@@ -279,21 +280,21 @@ impl Optimiser {
         let (mut parameters, mut adam) = (self.parameters.clone(), self.adam.clone());
         adam.step(&mut parameters, &gradient, rates, betas);
         if let Some(tensor) = parameters.not_finite() {
-            return Err(self.wrong(tensor, "a step to a number that is not"));
+            return Err(self.wrong(tensor, "a NaN or infinite step"));
         }
         parameters.bound();
         (self.parameters, self.adam) = (parameters, adam);
         Ok(Update { number, loss, rate })
     }
 
-    /// What the update under way met.
+    /// Creates an error about the update in progress.
     fn wrong(&self, tensor: &str, what: &str) -> anyhow::Error {
         let update = self.adam.n_steps + 1;
         anyhow!("update {update}: {tensor}: expected finite numbers, got {what}")
     }
 }
 
-/// Sums in the order of the streams.
+/// Adds up the outcomes in the order of the streams.
 fn add_up(outcomes: &[Outcome], dimensions: Dimensions) -> (f64, usize, [Vec<f64>; 3]) {
     let mut gradient = dimensions.lengths().map(|length| vec![0.0; length]);
     let (mut log_likelihood, mut n_seen) = (0.0, 0);

@@ -1,10 +1,9 @@
-//! One stream through one window of frames: the filter's recursion forward, its derivatives backward.
+//! One stream through one window of frames: the filter's recursion forward, and its derivatives backward.
 //!
-//! Forward, for each frame: `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then `u = Phi_w(p)`
-//! (eq. 6). The value is the sum of `ln b(y)' u` over visited cells: how well each frame was
-//! predicted. Backward runs the same steps in reverse and stops at the window's first predictor
-//! (truncated backpropagation). Gradients are zero far from the cells that later frames visit, and
-//! only the region where they are not is computed.
+//! For each frame, the forward pass computes `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then
+//! `u = Phi_w(p)` (eq. 6). Its value is the log-likelihood, the sum of `ln b(y)' u` over visited cells. The backward
+//! pass runs the same steps in reverse, and stops at the window's first predictor (truncated backpropagation).
+//! Gradients are zero far from the cells that later frames visit, and only the remaining region is computed.
 
 use crate::gradient::convolution::Region;
 use crate::gradient::layout::Layout;
@@ -16,27 +15,28 @@ use pulp::{Arch, Simd, WithSimd};
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Derivatives of `-log_likelihood` by the kernel, the likelihood and the first belief.
+    /// Derivatives of `-log_likelihood` with respect to the kernel, the likelihood and the first belief.
     pub gradient: [Vec<f64>; 3],
     /// Sum of `ln P(y)` over visited cells.
     pub log_likelihood: f64,
     pub n_seen: usize,
 }
 
-/// The recursion with its work space: give each thread its own.
+/// The recursion with its buffers. Each thread needs its own.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     operator: Operator,
     tables: Tables,
-    /// Posteriors of each frame, and the predictor after the last.
+    /// Posterior of each frame, and the predictor after the last frame.
     planes: Vec<Vec<f32>>,
-    /// One over the weights' sums behind each of them.
+    /// Normalising factors of each predictor: the reciprocals of the weights' sums.
     factors: Vec<Vec<f32>>,
     seen: Vec<Visit>,
-    /// Predictors of the seen cells before their correction, S of each.
+    /// Predictors of the seen cells before their correction, S numbers for each cell.
     predictors: Vec<f32>,
-    /// `dL/dp` or `dL/du`; `dL/dv`, and forward room for `v`.
+    /// `dL/dp` or `dL/du`.
     by_belief: Vec<f32>,
+    /// `v` in the forward pass, and `dL/dv` in the backward pass.
     by_weights: Vec<f32>,
 }
 
@@ -49,7 +49,7 @@ struct Visit {
 }
 
 impl Recursion {
-    /// For windows of up to `n_frames` frames.
+    /// Creates a recursion for windows of up to `n_frames` frames.
     pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
         let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
@@ -66,18 +66,18 @@ impl Recursion {
         }
     }
 
-    /// Takes other parameters of the same dimensions.
+    /// Replaces the parameters by others with the same dimensions.
     pub fn set(&mut self, tables: &Tables) {
         let n_own = tables.dimensions.n_own();
         self.operator = Operator::new(self.operator.layout, n_own, &tables.kernel);
         self.tables.clone_from(tables);
     }
 
-    /// Runs over frames from the belief `[S, H, W]` that an earlier window ended with, or from the first belief, which
-    /// learns too; `end` gets the predictor after the last.
+    /// Runs over frames from `start`, the belief `[S, H, W]` at the end of an earlier window. `None` starts from the
+    /// learned first belief. `end` receives the predictor after the last frame.
     ///
     /// # Panics
-    /// If there are more frames than there is room for, or cells off the grid.
+    /// If there are more frames than in [`Self::new`], or if cells are off the grid.
     pub fn run(
         &mut self,
         start: Option<&[f32]>,
@@ -101,7 +101,7 @@ impl Recursion {
         self.predictors.clear();
     }
 
-    /// Eq. 5 on a frame's cells; returns the sum of `ln b(y)' u`.
+    /// Applies eq. 5 to a frame's cells. Returns the sum of `ln b(y)' u`.
     fn correct(&mut self, frame: usize, sightings: &[Sighting]) -> f64 {
         let layout = self.operator.layout;
         let n_states = layout.n_states;
@@ -133,7 +133,7 @@ impl Recursion {
         log_likelihood
     }
 
-    /// Eq. 6.
+    /// Applies eq. 6.
     #[inline(always)]
     fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
@@ -156,7 +156,7 @@ impl Recursion {
         }
     }
 
-    /// Eq. 5 backward: `dL/dp` of a frame's cells becomes `dL/du`, and their predictors are put back.
+    /// Applies eq. 5 backward: converts `dL/dp` of a frame's cells to `dL/du`, and restores their predictors.
     fn uncorrect(&mut self, frame: usize, outcome: &mut Outcome, region: &mut Region) {
         let layout = self.operator.layout;
         let (n_states, width) = (layout.n_states, layout.shape.width());
@@ -174,7 +174,7 @@ impl Recursion {
             }
             for state in 0..n_states {
                 let u = self.predictors[first + state];
-                // The 1 is of -ln(evidence) itself.
+                // The 1 is the derivative of -ln(evidence) itself.
                 let by_joint = (self.by_belief[at(state)] - mean - 1.0) / evidence;
                 outcome.gradient[1][entry(state)] += f64::from(by_joint * u);
                 self.by_belief[at(state)] = by_joint * self.tables.likelihood[entry(state)];
@@ -184,7 +184,7 @@ impl Recursion {
         }
     }
 
-    /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
+    /// Applies eqs. 2 and 3 backward, from `dL/du` of a frame to `dL/dp` of the previous frame. Returns its region.
     #[inline(always)]
     fn unpredict<S: Simd>(
         &mut self,
@@ -204,7 +204,7 @@ impl Recursion {
         reached
     }
 
-    /// The gradient of the first belief, which is the same in every cell.
+    /// Adds the gradient of the first belief. All cells share the same first belief.
     fn add_initial_gradient(&self, outcome: &mut Outcome) {
         let layout = self.operator.layout;
         for row in 0..layout.shape.height() {
@@ -225,8 +225,8 @@ struct Pass<'a> {
     end: &'a mut [f32],
 }
 
-/// All of it is inlined, down to the innermost loop, to be compiled for the vectors of each kind of processor. Results
-/// may differ in the last bits between these kinds, never between runs or numbers of threads on one.
+/// Everything is inlined, down to the innermost loop, so that it is compiled for the vectors of each kind of processor.
+/// Results may differ in the last bits between kinds of processors, but not between runs or numbers of threads.
 impl WithSimd for Pass<'_> {
     type Output = Outcome;
 

@@ -1,4 +1,4 @@
-//! What every learner does, and what it is told.
+//! The interface of all learners, and their inputs.
 
 use super::update::ModelUpdate;
 use crate::beliefs::WorldForm;
@@ -17,29 +17,29 @@ use emberwatch_network::Device;
 use std::fmt;
 use std::ops::Range;
 
-/// A kind of learner: its constructor, and the facts that commands ask for.
+/// A kind of learner: its constructor, and the properties that commands need.
 pub struct LearnerKind {
-    /// Its name: `train --learner NAME`.
+    /// Name, as in `train --learner NAME`.
     pub name: &'static str,
-    /// What it learns, in a few words.
+    /// Short description of the result.
     pub about: &'static str,
-    /// How its checkpoints call it: first as it writes them, then as earlier releases did.
+    /// Names of its kind of checkpoint: the name that it writes, then names from earlier releases.
     pub checkpoints: &'static [&'static str],
-    /// Names of the numbers of its updates beside loss and rate.
+    /// Names of the values that its updates report besides loss and step size.
     pub columns: &'static [&'static str],
-    /// Whether it follows one robot of one world alone.
+    /// Whether it supports only a single robot in a single world.
     pub is_single: bool,
-    /// World steps of a whole training under these settings; 0: until stopped.
+    /// Returns the default number of world steps of a training. 0 means until stopped.
     pub steps: fn(&AgentConfig) -> u64,
-    /// Steps of an episode of a server that is started for it; `None`: without end.
+    /// Returns the number of steps per episode on a server that `train` starts. `None` means endless episodes.
     pub episode_steps: fn(&AgentConfig) -> Option<u64>,
-    /// World steps that a checkpoint has learned from.
+    /// Returns the number of world steps that a checkpoint has learned from.
     pub done: fn(&Contents) -> Result<u64>,
-    /// Sets what a checkpoint decides in the settings of a run that resumes it.
+    /// Copies the settings that a checkpoint determines to the settings of a run that resumes it.
     pub adopt: fn(&Contents, &mut AgentConfig),
-    /// Reads what policies act on from a checkpoint; returns whether there was another before.
+    /// Loads the values for policies from a checkpoint. Returns whether it replaced a different value.
     pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
-    /// Begins to learn, or goes on from a checkpoint.
+    /// Creates a learner, or resumes one from a checkpoint.
     pub begin: fn(Beginning<'_>) -> Result<Box<dyn Learner>>,
 }
 
@@ -55,37 +55,37 @@ impl fmt::Debug for LearnerKind {
     }
 }
 
-/// What a learner begins with.
+/// The inputs for creating a learner.
 #[derive(Clone)]
 pub struct Beginning<'a> {
     pub worlds: Worlds,
-    /// What the server says of itself.
+    /// The server's description of itself.
     pub info: &'a ServerInfo,
     pub config: &'a AgentConfig,
-    /// Of the checkpoint to go on from, if there is one.
+    /// The checkpoint to resume from, if any.
     pub contents: Option<&'a Contents>,
-    /// What was learned before, for learners that build on it.
+    /// Previously learned values, for learners that build on them.
     pub learned: &'a Learned,
-    /// Where networks compute.
+    /// The device on which networks compute.
     pub device: &'a Device,
-    /// Whether it only acts.
+    /// Whether the learner only acts, without learning.
     pub is_frozen: bool,
 }
 
-/// The robots to fly, as far as a learner is told.
+/// The learner's knowledge of its worlds and robots.
 #[derive(Debug, Clone)]
 pub struct Worlds {
-    /// Where robots may fly and what they see.
+    /// The cells that robots may fly over, and the range of their sensors.
     pub airspace: Airspace,
-    /// Number of values that an observed cell may show.
+    /// Number of observation values.
     pub n_observations: usize,
     pub n_moves: usize,
-    /// The numbers of the robots on the server.
+    /// The robots' numbers on the server.
     pub numbers: Range<u32>,
 }
 
 impl Worlds {
-    /// What beliefs must have been learned of.
+    /// Returns the form of the worlds, which learned beliefs must match.
     pub fn form(&self) -> WorldForm {
         WorldForm {
             shape: self.shape(),
@@ -98,17 +98,17 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// Refuses a sensor with several observation matrices, for networks.
+    /// Checks that the sensor has a single observation matrix, which networks require.
     pub(super) fn check_matrices(&self) -> Result<()> {
         let n_rings = self.airspace.n_rings();
         ensure!(
             n_rings == 1,
-            "learner: expected a sensor with one observation matrix, as networks learn such alone, got {n_rings}"
+            "learner: expected a sensor with one observation matrix, which networks require, got {n_rings}"
         );
         Ok(())
     }
 
-    /// A robot before it takes in what its world shows. `target`: what its belief calls the state that pays most.
+    /// Creates a rollout before its first correction. `target` is the index of the state with the highest reward.
     pub(super) fn rollout(
         &self,
         config: &AgentConfig,
@@ -132,56 +132,56 @@ impl Worlds {
     }
 }
 
-/// Which step of which run a robot saw, and from where: seed, episode, step k, row, column.
+/// A robot's position in time and space: the world's seed, episode, step k, then row and column.
 pub type Place = [u64; 5];
 
-/// What acts on several robots and learns from what they see.
+/// An actor that learns from the observations of its robots.
 pub trait Learning: Actor {
-    /// Whether its next frames should show every cell, where the server gives such.
+    /// Whether the next frames should show every cell, if the server permits.
     fn wants_full_frames(&self) -> bool {
         false
     }
 
-    /// Begins another episode of a robot.
+    /// Begins a robot's next episode.
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
-    /// Makes the updates that the steps since the last call have earned.
+    /// Makes the updates that are due after the steps since the last call.
     fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
 
-    /// From here on it acts on what was learned, as well as it knows: without random actions.
+    /// Stops exploration. From then on, the learner acts greedily.
     fn freeze(&mut self);
 
-    /// A robot's agent at its world, by its index.
+    /// Returns the rollout of a robot, by index.
     fn rollout(&self, index: usize) -> &Rollout;
 
-    /// The state that it thinks pays most.
+    /// Returns the state with the highest estimated reward.
     fn target(&self) -> usize;
 
-    /// World steps that were learned from, of all robots together.
+    /// Returns the number of world steps learned from, for all robots together.
     fn world_steps(&self) -> u64;
 
     fn n_updates(&self) -> u64;
 
-    /// Why a run of that many steps made no update, and what to do.
+    /// Explains why a run with this number of steps made no update, and what to do.
     fn lacks(&self, steps: u64) -> String;
 }
 
-/// What is kept of a learner between runs.
+/// A learner that can be saved and resumed.
 pub trait Saving {
-    /// Takes in what the robots see when it comes to them. Returns with how many of them it goes on where its checkpoint
-    /// left it.
+    /// Attaches the learner to its robots, given their present observations. Returns the number of robots that continue
+    /// from the checkpoint.
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
-    /// What a later run goes on from.
+    /// Returns the contents of a checkpoint from which a later run can resume.
     fn contents(&self) -> Result<Contents>;
 }
 
-/// What `train` drives: it acts, learns, and is saved.
+/// A learner for `train`: it acts, learns, and can be saved.
 pub trait Learner: Learning + Saving {}
 
 impl<L: Learning + Saving> Learner for L {}
 
-/// The cause where a run's steps have not earned an update. `name`: the setting.
+/// Explains that a run was too short for an update. `name` is the setting of the updates per step.
 pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
     format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }

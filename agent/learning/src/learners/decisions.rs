@@ -1,5 +1,5 @@
-//! Learns which option to fly (paper section III.E): on an estimator's belief all options are planned, and a DQN that
-//! reads each one's features says what it is worth.
+//! Learns which option to fly (paper section III.E). All options are planned on an estimator's belief, and a DQN scores
+//! each option from its features.
 
 mod base;
 mod run;
@@ -31,7 +31,7 @@ use std::collections::BTreeMap;
 
 pub const DECISIONS: LearnerKind = LearnerKind {
     name: "decisions",
-    about: "A DQN that chooses among options on an estimator's belief, which is learned first, unless it is given",
+    about: "A DQN that chooses among options on an estimator's belief, which is trained first unless given",
     checkpoints: &["decisions"],
     columns: &["dqn_loss", "dqn_rate", "epsilon"],
     is_single: false,
@@ -68,16 +68,16 @@ pub struct DecisionsLearner {
     policy: Policy,
     dqn: Dqn,
     runs: Vec<Run>,
-    /// Where a checkpoint left the worlds.
-    left: BTreeMap<u32, SavedRun>,
+    /// The state of each world's run in the checkpoint, until attached.
+    saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
-    /// Updates that steps have earned and that are not made yet.
+    /// Updates that are due but not made yet.
     earned: f64,
     is_frozen: bool,
 }
 
 impl DecisionsLearner {
-    /// Before the first step, or going on from a checkpoint of decisions on such a base.
+    /// Creates a learner, or resumes one from a checkpoint of decisions on the same kind of belief.
     pub fn new(
         base: Base,
         contents: Option<&Contents>,
@@ -89,7 +89,7 @@ impl DecisionsLearner {
             base,
             dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
             runs: Vec::new(),
-            left: BTreeMap::new(),
+            saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
             is_frozen: false,
@@ -102,7 +102,7 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// An agent before it takes in what its world shows.
+    /// Creates a rollout before its first correction.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
@@ -110,7 +110,7 @@ impl DecisionsLearner {
         Ok(worlds.rollout(config, policy, estimator, names, observation))
     }
 
-    /// A run that begins with what its world shows.
+    /// Creates a run from the first observation of an episode.
     fn begun(&self, observation: Observation) -> Result<Run> {
         let mut rollout = self.rollout_at(observation)?;
         rollout.correct()?;
@@ -118,7 +118,7 @@ impl DecisionsLearner {
         Ok(Run::begun(rollout, &self.dqn))
     }
 
-    /// Chooses a run's option: the best one, or while one is held at random, that.
+    /// Chooses a run's option: the option with the highest value, or a random option that is held for some steps.
     fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
         if self.is_frozen {
             return self.dqn.best(features);
@@ -127,7 +127,7 @@ impl DecisionsLearner {
         let mut rng = stream(self.config.seed, Purpose::Exploration, step);
         let mut random = |below: u64| rng.next_u64() % below;
         let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
-        // A held option lasts two or three steps, so that half as many begin.
+        // A held option lasts 2.5 steps on average (with the default settings), so that fewer of them begin.
         if held.n_steps == 0 && (random(1 << 24) as f32) < epsilon / 2.0 * (1 << 24) as f32 {
             held.option = random(OPTIONS.len() as u64) as usize;
             held.n_steps = 1 + random(self.config.decisions.longest_hold);
@@ -139,7 +139,7 @@ impl DecisionsLearner {
         held.option
     }
 
-    /// Plans all options of all robots, remembers what the last ones led to, and chooses the next ones.
+    /// Plans all options of all robots, stores the transitions of the last options, and chooses the next options.
     fn decide(&mut self) {
         let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
         let mut runs = std::mem::take(&mut self.runs);
@@ -154,7 +154,7 @@ impl DecisionsLearner {
         self.runs = runs;
     }
 
-    /// Share of the step size by now: falls linearly over the steps of a training.
+    /// Returns the present factor on the step size, which falls linearly over the steps of a training.
     fn rate_share(&self) -> f32 {
         let config = &self.config.decisions;
         let done = self.world_steps as f32 / config.steps.max(1) as f32;
@@ -179,7 +179,7 @@ impl DecisionsLearner {
         Ok(Contents::new(tensors, &state))
     }
 
-    /// Goes on from a checkpoint on the same base.
+    /// Loads a checkpoint of decisions on the same kind of belief.
     fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         saved.load_into(&mut self.dqn, contents)?;
@@ -187,10 +187,10 @@ impl DecisionsLearner {
         check(got == expected, "decisions.estimator", expected, got)?;
         self.world_steps = saved.world_steps;
         self.earned = saved.earned;
-        self.left = saved.worlds;
+        self.saved_runs = saved.worlds;
         let n_states = self.base.state_names.len();
-        let mut left = self.left.values();
-        left.try_for_each(|left| left.check(n_states, self.worlds.shape()))
+        let mut saved_runs = self.saved_runs.values();
+        saved_runs.try_for_each(|run| run.check(n_states, self.worlds.shape()))
     }
 }
 
@@ -287,19 +287,19 @@ impl Learning for DecisionsLearner {
 
 impl Saving for DecisionsLearner {
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut n_gone_on = 0;
+        let mut n_resumed = 0;
         for (world, observation) in self.worlds.numbers.clone().zip(observations) {
-            let left = self.left.remove(&world);
-            let run = match left.filter(|run| run.left.is_of(&observation)) {
-                Some(left) => {
-                    n_gone_on += 1;
-                    Run::restore(left, self.rollout_at(observation)?, &self.dqn)?
+            let saved = self.saved_runs.remove(&world);
+            let run = match saved.filter(|run| run.resume_point.is_of(&observation)) {
+                Some(saved) => {
+                    n_resumed += 1;
+                    Run::restore(saved, self.rollout_at(observation)?, &self.dqn)?
                 }
                 None => self.begun(observation)?,
             };
             self.runs.push(run);
         }
-        Ok(n_gone_on)
+        Ok(n_resumed)
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -1,5 +1,5 @@
-//! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
-//! the belief of the filter as it is.
+//! Learns the filter's parameters in several worlds at once. Robots first make random moves, and then plan on the
+//! belief of the present filter.
 
 pub mod fit;
 mod saved;
@@ -33,16 +33,16 @@ pub struct FilterLearner {
     fit: FilterFit,
     learned: LearnedModel,
     rollouts: Vec<Rollout>,
-    /// What was planned last, of each robot: its belief then, and its path.
+    /// The last plan of each robot, with the belief that it was based on.
     planned: Vec<(Belief, Plan)>,
-    /// Where a checkpoint left the robots.
-    left: BTreeMap<u32, SavedRobot>,
+    /// The state of each robot in the checkpoint.
+    saved_robots: BTreeMap<u32, SavedRobot>,
     is_frozen: bool,
 }
 
 pub const FILTER: LearnerKind = LearnerKind {
     name: "filter",
-    about: "A Bayes filter of the paper's form, with unknown parameters",
+    about: "A Bayes filter of the paper's form, with learned parameters",
     checkpoints: &["learned_filter", "learned_own_filter"],
     columns: &[],
     is_single: false,
@@ -92,7 +92,7 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
 }
 
 impl FilterLearner {
-    /// A learner before its first frame.
+    /// Creates a learner before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
         let fit = FilterFit::new(dimensions, worlds.shape(), config);
         Self::of(fit, BTreeMap::new(), worlds, config)
@@ -106,28 +106,28 @@ impl FilterLearner {
     ) -> Result<Self> {
         let SavedFilter {
             fit,
-            worlds: mut left,
+            worlds: mut saved_robots,
         } = contents.state()?;
         let shape = fit.optimiser.shape;
         let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape(), config)?;
-        let mut all = left.values();
+        let mut all = saved_robots.values();
         all.try_for_each(|robot| robot.check(dimensions.n_states, shape))?;
         if shape != worlds.shape() {
-            left.clear();
+            saved_robots.clear();
         }
-        Ok(Self::of(fit, left, worlds, config))
+        Ok(Self::of(fit, saved_robots, worlds, config))
     }
 
     fn of(
         fit: FilterFit,
-        left: BTreeMap<u32, SavedRobot>,
+        saved_robots: BTreeMap<u32, SavedRobot>,
         worlds: Worlds,
         config: &AgentConfig,
     ) -> Self {
         Self {
             learned: fit.learned(),
             fit,
-            left,
+            saved_robots,
             worlds,
             config: config.clone(),
             rollouts: Vec::new(),
@@ -136,7 +136,7 @@ impl FilterLearner {
         }
     }
 
-    /// A robot before it takes in what its world shows.
+    /// Creates a robot's rollout before its first correction.
     fn rollout_at(&self, observation: Observation) -> Rollout {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
@@ -152,7 +152,7 @@ impl FilterLearner {
         )
     }
 
-    /// A robot that has taken in what its world shows, with a track that begins there.
+    /// Begins a robot's track and its rollout with the first observation of an episode.
     fn begun(&mut self, robot: u32, observation: Observation) -> Result<Rollout> {
         self.fit.begin(robot);
         let frame = &observation.frame;
@@ -163,7 +163,7 @@ impl FilterLearner {
         Ok(rollout)
     }
 
-    /// Worlds whose robots walk at random: all at first, some for good; none of a frozen learner.
+    /// Returns the number of worlds whose robots move at random: first all, later a share, and none if frozen.
     fn n_walking(&self) -> usize {
         if self.is_frozen {
             return 0;
@@ -271,31 +271,32 @@ impl Learning for FilterLearner {
 impl Saving for FilterLearner {
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
         let robots = self.worlds.numbers.clone();
-        let mut n_gone_on = 0;
-        if !SavedRobot::any_is_of(&self.left, robots.clone(), &observations) {
-            // Frames of other worlds, perhaps of another model.
+        let mut n_resumed = 0;
+        if !SavedRobot::any_is_of(&self.saved_robots, robots.clone(), &observations) {
+            // The saved frames come from other worlds, maybe with another model.
             self.fit.forget();
         }
         for (robot, observation) in robots.zip(observations) {
-            let left = self.left.get(&robot);
-            let left = left.filter(|left| left.is_of(&observation) && self.fit.has_track(robot));
-            let rollout = if let Some(left) = left {
+            let saved = self.saved_robots.get(&robot);
+            let saved =
+                saved.filter(|saved| saved.is_of(&observation) && self.fit.has_track(robot));
+            let rollout = if let Some(saved) = saved {
                 let mut rollout = self.rollout_at(observation);
-                left.restore(&mut rollout.agent);
-                n_gone_on += 1;
+                saved.restore(&mut rollout.agent);
+                n_resumed += 1;
                 rollout
             } else {
                 self.begun(robot, observation)?
             };
             self.rollouts.push(rollout);
         }
-        Ok(n_gone_on)
+        Ok(n_resumed)
     }
 
     fn contents(&self) -> Result<Contents> {
         let saved = self.rollouts.iter().map(SavedRobot::of);
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
-        // As `SavedFilter`, without a copy of the learner.
+        // Encoded like `SavedFilter`, but without cloning the learner.
         let state = (&self.fit, worlds);
         Ok(Contents::new(self.fit.named_tensors(), &state))
     }

@@ -1,9 +1,9 @@
-//! The paper's Algorithm 1: a dynamic autoencoder estimates, a DQN chooses what the next path is for,
-//! shooting finds the path, and both networks learn from every step.
+//! The paper's Algorithm 1: a dynamic autoencoder estimates the state, a DQN chooses the objective of the next path,
+//! and shooting finds the path. Both networks learn from every step.
 //!
-//! One iteration: `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
-//! rule (eq. 10), an action from `h` (eq. 17), a path for it (eq. 15), the path's frame and reward; then one
-//! step of Adam on each network (eq. 19), with step sizes of their own ([`crate::config::StepSize`]).
+//! An iteration computes `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
+//! rule (eq. 10), an action from `h` (eq. 17), and a path for it (eq. 15). After the path's frame and reward, Adam
+//! makes one step on each network (eq. 19). Each network has its own step size ([`crate::config::StepSize`]).
 
 mod progress;
 
@@ -57,20 +57,20 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     )))
 }
 
-/// Refuses a server without the first frames that the settings ask for, which show every cell.
+/// Checks that the server permits the first frames that show every cell, if the settings require them.
 fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     let full_frames = config.autoencoder.full_frames;
     ensure!(
         progress.position.iterations >= full_frames || info.coverage != CoverageRule::Path,
         "autoencoder.full_frames: {full_frames} frames that show every cell need a server with --coverage client or \
-         full, or the setting 0"
+         full; set it to 0 for other servers"
     );
     Ok(())
 }
 
-/// Refuses episodes that are too short for a window, from which nothing could be learned.
+/// Checks that episodes are long enough for a window. Otherwise nothing could be learned.
 fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
-    // Recorded worlds may have longer episodes than their shortest.
+    // Some episodes of recorded worlds may be longer than the shortest episode, which the server reports.
     let is_cut = info.max_steps > 0 && info.recorded_world.is_none();
     let (window, n_frames) = (
         config.autoencoder.window as u64,
@@ -84,20 +84,20 @@ fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     Ok(())
 }
 
-/// An autoencoder and a DQN that are learned.
+/// The learner of an autoencoder and a DQN.
 pub struct NetworkLearner {
     worlds: Worlds,
     config: AgentConfig,
     progress: Progress,
     choices: Vec<Policy>,
-    /// Its world's, once it is attached.
+    /// The rollout, once attached to a world.
     rollout: Option<Rollout>,
-    /// The last decision, and the path that was planned for it.
+    /// The last decision, with its path.
     decision: Option<Decision>,
     is_frozen: bool,
 }
 
-/// The action of a step, what it was chosen on, and the path for it.
+/// The action of a step, the hidden vector that it was chosen from, its value, and the path.
 struct Decision {
     input: Vec<f32>,
     action: usize,
@@ -106,7 +106,7 @@ struct Decision {
 }
 
 impl NetworkLearner {
-    /// Goes on from some progress, or begins.
+    /// Creates a learner that continues from some progress.
     pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
             choices: network_choices(progress.autoencoder.shape().n_states),
@@ -119,12 +119,12 @@ impl NetworkLearner {
         }
     }
 
-    /// A rollout whose hidden vector is where another was, before it takes in what its world shows.
+    /// Creates a rollout that continues from a follower, before its next correction.
     fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
         let names = numbered_states(network.shape().n_states);
-        // The first choice is for the first state.
+        // The first choice has the first state as its target.
         let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
         worlds.rollout(&self.config, first, Box::new(estimator), names, observation)
     }
@@ -139,7 +139,7 @@ impl NetworkLearner {
         rollout.expect("invariant: a world begins before it is acted on")
     }
 
-    /// What the next action goes by: `h_{k+1}`, which has read the last frame.
+    /// Returns the input of the next action: `h_{k+1}`, which depends on the last frame.
     fn input(&self) -> Vec<f32> {
         follower(self.at_world()).hidden
     }
@@ -159,7 +159,7 @@ impl NetworkLearner {
         }
     }
 
-    /// Remembers what the last decision brought, and at the end of an episode the last ones before it.
+    /// Stores the transition of the last decision, and at the end of an episode the unfinished earlier transitions.
     fn remember(&mut self) {
         let decision = self.decision.as_ref();
         let decision = decision.expect("invariant: a step begins with a decision");
@@ -202,7 +202,7 @@ impl NetworkLearner {
         let Some(window) = window.filter(Window::has_targets) else {
             return Ok([None; 2]);
         };
-        // Both step sizes go by the iteration, as eq. 20 compares them.
+        // Both step sizes depend on the iteration, because eq. 20 compares them.
         let rate = config.step_size.at(self.progress.position.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
@@ -323,9 +323,9 @@ impl Saving for NetworkLearner {
     fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
-        let goes_on = self.progress.position.place == Some(place(&observation))
+        let resumes = self.progress.position.place == Some(place(&observation))
             && shown == Some(&observation.frame);
-        if goes_on {
+        if resumes {
             let follower = self.progress.position.follower.clone();
             let mut rollout = self.rollout_at(follower, observation);
             let estimate = self.progress.position.estimate.as_ref();
@@ -334,7 +334,7 @@ impl Saving for NetworkLearner {
         } else {
             self.begin(self.worlds.numbers.start, observation)?;
         }
-        Ok(usize::from(goes_on))
+        Ok(usize::from(resumes))
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -1,7 +1,7 @@
-//! Learns the neural belief on several worlds at once, from masked frames alone (paper eqs. 8 and 11).
+//! Learns the neural belief in several worlds at once, from masked frames alone (paper eqs. 8 and 11).
 //!
-//! Robots behave in ways that change: what is seen and what is not depends on behaviour, and the belief must hold for that
-//! of any policy. At first they explore; then most plan on the belief as it is.
+//! Which cells are seen depends on behaviour, and the belief must be valid for any policy. Therefore, robots change
+//! their behaviour from time to time. At first they explore. Later, most of them plan on the present belief.
 
 mod behaviour;
 mod replay;
@@ -20,7 +20,7 @@ use crate::config::AgentConfig;
 use crate::learners::base::{
     Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
 };
-use crate::learners::left::Left;
+use crate::learners::resume_point::ResumePoint;
 use crate::learners::update::ModelUpdate;
 use crate::parallel::in_parallel;
 use crate::policy::Policy;
@@ -36,7 +36,7 @@ use std::collections::BTreeMap;
 
 pub const NEURAL: LearnerKind = LearnerKind {
     name: "neural",
-    about: "A network that keeps space, from what was seen to what will be seen",
+    about: "A convolutional network that predicts observations from earlier ones",
     checkpoints: &["neural_belief"],
     columns: &[],
     is_single: false,
@@ -59,20 +59,20 @@ pub struct NeuralLearner {
     worlds: Worlds,
     config: AgentConfig,
     network: NeuralBelief,
-    /// The filter that it corrects, if it does.
+    /// The filter whose prediction the network corrects, if any.
     filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
-    /// Where a checkpoint left the robots.
-    left: BTreeMap<u32, SavedRun>,
+    /// The state of each robot in the checkpoint, until attached.
+    saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
-    /// Updates that steps have earned and that are not made yet.
+    /// Updates that are due but not made yet.
     earned: f64,
     is_frozen: bool,
 }
 
-/// A robot at its world.
+/// A robot in its world.
 struct Run {
     rollout: Rollout,
     behaviour: Option<Behaviour>,
@@ -80,7 +80,7 @@ struct Run {
 }
 
 impl NeuralLearner {
-    /// Before the first frame, or going on from a checkpoint. `filter`: what it is to correct.
+    /// Creates a learner, or resumes one from a checkpoint. The network corrects the prediction of `filter`, if any.
     pub fn new(
         contents: Option<&Contents>,
         filter: Option<&LearnedModel>,
@@ -95,7 +95,7 @@ impl NeuralLearner {
             reward: RewardEstimate::new(n_observations),
             replay: LessonReplay::new(config.neural.replay_frames),
             runs: Vec::new(),
-            left: BTreeMap::new(),
+            saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
             is_frozen: false,
@@ -110,13 +110,13 @@ impl NeuralLearner {
         Ok(learner)
     }
 
-    /// The value that pays most, as far as rewards tell by now.
+    /// Returns the observation with the highest estimated reward, or the last one before any reward.
     fn paying(&self) -> usize {
         let last = self.worlds.n_observations - 1;
         self.reward.target().unwrap_or(last)
     }
 
-    /// A robot before it takes in what its world shows.
+    /// Creates a robot's rollout before its first correction.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
@@ -132,7 +132,7 @@ impl NeuralLearner {
         ))
     }
 
-    /// A robot that has taken in what its world shows, with a track that begins there.
+    /// Begins a robot's track and its run with the first observation of an episode.
     fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
         let mut rollout = self.rollout_at(observation)?;
         self.replay.begin(robot, self.worlds.shape());
@@ -147,12 +147,12 @@ impl NeuralLearner {
         })
     }
 
-    /// Share of the training that is done.
+    /// Returns the completed share of the training.
     fn progress(&self) -> f64 {
         self.world_steps as f64 / self.config.neural.steps.max(1) as f64
     }
 
-    /// Step size: falls linearly over the steps of a training.
+    /// Returns the step size, which falls linearly over the steps of a training.
     fn rate(&self) -> f64 {
         let config = &self.config.neural;
         config.rate * (1.0 - self.progress()).max(config.final_rate)
@@ -168,7 +168,7 @@ impl NeuralLearner {
         if saved.shape == shape {
             saved.check_worlds()?;
             self.replay.resume(saved.replay.into_owned());
-            (self.left, self.earned) = (saved.worlds, saved.earned);
+            (self.saved_runs, self.earned) = (saved.worlds, saved.earned);
         }
         (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
         Ok(())
@@ -176,9 +176,9 @@ impl NeuralLearner {
 }
 
 impl Run {
-    /// A run where a checkpoint left it, with a rollout that has not yet taken in what its world shows.
+    /// Restores a run from a checkpoint. The rollout has not been corrected yet.
     fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
-        saved.left.restore(&mut rollout.agent)?;
+        saved.resume_point.restore(&mut rollout.agent)?;
         Ok(Self {
             rollout,
             behaviour: saved.behaviour,
@@ -304,33 +304,35 @@ impl Learning for NeuralLearner {
 
 impl Saving for NeuralLearner {
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut left = std::mem::take(&mut self.left);
+        let mut saved_runs = std::mem::take(&mut self.saved_runs);
         let robots = self.worlds.numbers.clone().zip(&observations);
-        left.retain(|robot, left| {
+        saved_runs.retain(|robot, saved| {
             let mut robots = robots.clone();
-            robots.any(|(other, observation)| other == *robot && left.left.is_of(observation))
+            robots.any(|(other, observation)| {
+                other == *robot && saved.resume_point.is_of(observation)
+            })
         });
-        if left.is_empty() {
-            // Frames of other worlds, perhaps of another model.
+        if saved_runs.is_empty() {
+            // The saved frames come from other worlds, maybe with another model.
             self.replay.forget();
             self.earned = 0.0;
         }
         self.replay.end_others(&self.worlds.numbers);
-        let n_gone_on = left.len();
+        let n_resumed = saved_runs.len();
         for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
-            let run = match left.remove(&robot) {
-                Some(left) => Run::restore(left, self.rollout_at(observation)?)?,
+            let run = match saved_runs.remove(&robot) {
+                Some(saved) => Run::restore(saved, self.rollout_at(observation)?)?,
                 None => self.begun(robot, observation)?,
             };
             self.runs.push(run);
         }
-        Ok(n_gone_on)
+        Ok(n_resumed)
     }
 
     fn contents(&self) -> Result<Contents> {
         let runs = self.runs.iter();
         let runs = runs.map(|run| SavedRun {
-            left: Left::of(&run.rollout),
+            resume_point: ResumePoint::of(&run.rollout),
             behaviour: run.behaviour,
         });
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();

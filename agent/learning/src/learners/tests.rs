@@ -1,4 +1,4 @@
-//! Which belief learners plan on.
+//! The belief that learners plan on, and resuming from checkpoints.
 
 use crate::beliefs::learned::LearnedModel;
 use crate::beliefs::neural::NeuralModel;
@@ -68,7 +68,7 @@ fn observation(step: u64) -> Observation {
     }
 }
 
-/// One step; returns the posterior after its frame.
+/// Makes one step. Returns the posterior after its frame.
 fn fly(learner: &mut impl Learner, step: u64) -> Belief {
     learner.plan();
     let seen = vec![Seen::new([observation(step)])];
@@ -108,14 +108,14 @@ fn learners_plan_on_the_belief_that_settings_say() {
     }
 }
 
-/// The filter of a known model.
+/// A base with the known-model filter.
 fn known_base() -> Base {
     let known = (Model::wildfire(), Belief::uniform(3, worlds().shape()));
     let base = Base::new(&KNOWN, Some(known), Learned::default(), worlds().shape());
     base.expect("a model")
 }
 
-/// What a checkpoint holds after so many steps in a row.
+/// Makes steps with updates. Returns the contents of a checkpoint afterwards.
 fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     for step in steps {
         fly(learner, step);
@@ -124,7 +124,7 @@ fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     learner.contents().expect("whole")
 }
 
-/// What a filter knows before it has learned.
+/// A filter with its initial parameters.
 pub(crate) fn learned_filter(sees_own_state: bool) -> LearnedModel {
     let config = config(BasisKind::Estimate);
     FilterFit::new(dimensions(sees_own_state), worlds().shape(), &config).learned()
@@ -164,8 +164,8 @@ fn decisions_resume_bit_for_bit() {
         let base = base.expect("whole").expect("a belief");
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
-        let n_gone_on = resumed.attach(vec![observation(11)]).expect("possible");
-        assert_eq!(n_gone_on, 1);
+        let n_resumed = resumed.attach(vec![observation(11)]).expect("possible");
+        assert_eq!(n_resumed, 1);
         let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 12..18));
         assert!(contents[0] == contents[1], "{kind:?}");
         assert!(learner.n_updates() > 8, "{kind:?}");
@@ -207,7 +207,7 @@ fn decisions_learn_from_every_step_of_an_episode() {
             let discount = if ends { 0.0 } else { discount };
             assert!((got.discount - discount).abs() < 1e-6, "{n_steps}");
         }
-        // Those of the last steps lead to the same state.
+        // The transitions of the last steps lead to the same state.
         let short = &got[got.len().saturating_sub(4)..];
         assert!(short.iter().all(|it| it.next == short[0].next));
     }
@@ -234,13 +234,13 @@ fn a_neural_belief_resumes_bit_for_bit() {
         let left = learn(&mut learner, 1..12);
         let resumed = || neural(Some(&left), None, worlds()).expect("its own");
         let mut gone_on = resumed();
-        let n_gone_on = gone_on.attach(vec![observation(11)]).expect("possible");
-        assert_eq!(n_gone_on, 1);
+        let n_resumed = gone_on.attach(vec![observation(11)]).expect("possible");
+        assert_eq!(n_resumed, 1);
         let contents = [&mut learner, &mut gone_on].map(|learner| learn(learner, 12..16));
         assert!(contents[0] == contents[1] && learner.n_updates() > 11);
         let mut elsewhere = resumed();
-        let n_gone_on = elsewhere.attach(vec![observation(7)]).expect("possible");
-        assert_eq!((n_gone_on, elsewhere.n_updates()), (0, 11));
+        let n_resumed = elsewhere.attach(vec![observation(7)]).expect("possible");
+        assert_eq!((n_resumed, elsewhere.n_updates()), (0, 11));
     }
 }
 
@@ -259,12 +259,12 @@ fn what_does_not_fit_a_neural_belief_is_named() {
     refused(&left, two, "n_observations: expected 2, got 3");
     let mut without = left.clone();
     without.tensors.remove("head.bias");
-    let words = "head.bias: expected shape [3], got none";
+    let words = "head.bias: expected a tensor [3], got none";
     refused(&without, worlds(), words);
     let mut squares = left.clone();
     let tensor = squares.tensors.get_mut("adam.second.head.bias");
     tensor.expect("a moment").numbers[0] = -1.0;
-    let words = "adam.second.head.bias: expected numbers from 0 on, got -1";
+    let words = "adam.second.head.bias: expected no negative numbers, got -1";
     refused(&squares, worlds(), words);
     let cut = Contents {
         state: left.state[..left.state.len() - 1].to_vec(),

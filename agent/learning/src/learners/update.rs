@@ -1,20 +1,20 @@
-//! What an update of a model reports.
+//! Reports of model updates.
 
-/// An update, or that there was none.
+/// The report of an update, or of a step without one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelUpdate {
-    /// Number of updates of the model so far.
+    /// Number of the model's updates so far.
     pub number: u64,
-    /// The model's loss before it, if the model was updated.
+    /// The model's loss before the update, if the model was updated.
     pub loss: Option<f64>,
     /// The model's step size, if it was updated.
     pub rate: Option<f64>,
-    /// What [`super::LearnerKind::columns`] names.
+    /// The values named by [`super::LearnerKind::columns`].
     pub more: Vec<Option<f64>>,
 }
 
 impl ModelUpdate {
-    /// No update, after so many; `n_more`: length of [`super::LearnerKind::columns`].
+    /// Reports no update, after `number` updates. `n_more` is the length of [`super::LearnerKind::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

@@ -1,23 +1,23 @@
-//! Decisions that were learned: which option is worth most.
+//! Learned decisions: the choice of the option with the highest value.
 
 use crate::beliefs::BeliefKind;
 use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::Dqn;
 use std::sync::Arc;
 
-/// What policies with the goal `learned` and the planner `options` act on.
+/// The learned values that policies with the goal `learned` and the planner `options` use.
 #[derive(Debug, Clone)]
 pub struct LearnedDecisions {
     pub scorer: Arc<Dqn>,
-    /// The belief that they were learned on.
+    /// The belief that the decisions were learned on.
     pub belief: &'static BeliefKind,
-    /// What paths are planned on.
+    /// The belief that paths are planned on: the predictor or the estimate.
     pub basis: BasisKind,
-    /// Width of the beam search that plans the options.
+    /// Width of the beam search that plans options.
     pub beam_width: usize,
 }
 
-/// Two that were read are never taken for the same.
+/// Two loaded values are never equal, because networks are not compared.
 impl PartialEq for LearnedDecisions {
     fn eq(&self, _: &Self) -> bool {
         false

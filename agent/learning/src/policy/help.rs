@@ -1,4 +1,4 @@
-//! What policies are made of, a line each, for `--help` and `--policies help`.
+//! The list of all parts of policies, for `--help` and `--policies help`.
 
 use super::names::{GOALS, NAMED, OPTION_GOALS};
 use super::parts::Goal;
@@ -6,13 +6,13 @@ use super::planners::PLANNERS;
 use crate::beliefs::BELIEFS;
 use emberwatch_belief::planning::options::OPTIONS;
 
-/// The parts of policies and what each means, then the names of some.
+/// Returns a description of each part of a policy, then the policies that have a name.
 pub fn help() -> String {
     let goals = |goals: &'static [(Goal, &str, &str)]| {
         let goals = goals.iter();
         goals.map(|(_, name, about)| (*name, *about))
     };
-    let state = ("STATE", "a state of the model, by its name");
+    let state = ("STATE", "the probability of the state with this name");
     let options = OPTIONS.iter().map(|option| (option.name, option.about));
     let sections = [
         section("BELIEF", BELIEFS.iter().map(|it| (it.name, it.about))),
@@ -30,7 +30,7 @@ pub fn help() -> String {
     )
 }
 
-/// `lines`: what each is about, by its name.
+/// Formats a section. `lines` has the name and the description of each entry.
 fn section(title: &str, lines: impl Iterator<Item = (&'static str, &'static str)>) -> String {
     let lines: Vec<_> = lines.collect();
     let width = lines.iter().map(|(name, _)| name.len()).max().unwrap_or(0);

@@ -1,4 +1,4 @@
-//! Policies that are compared unless others are named.
+//! The policies that are compared by default.
 
 use super::decisions::LearnedDecisions;
 use super::parts::{Goal, Policy};
@@ -11,7 +11,7 @@ use crate::learned::Learned;
 use emberwatch_belief::planning::options::OPTIONS;
 use emberwatch_model::Model;
 
-/// The benchmark's ladder under a model, from the least to the most informed.
+/// Returns the policies of the benchmark under a model, from the least to the most informed.
 pub fn ladder(model: &Model) -> Vec<Policy> {
     use Goal::{Coverage, Exploit, ExploitOnly, Explore, Rule, State};
     let states = (0..model.n_states()).filter(|state| *state != model.target_state());
@@ -38,10 +38,10 @@ pub fn ladder(model: &Model) -> Vec<Policy> {
         .collect()
 }
 
-/// Learned beliefs that are compared unless others are named: each in its best form (`docs/filters.md`).
+/// Learned beliefs that are compared by default, each in its best variant (`docs/filters.md`).
 const LEARNED_BELIEFS: [&BeliefKind; 4] = [&LEARNED, &LEARNED_SPATIAL, &NEURAL, &AUTOENCODER];
 
-/// Lists the policies that checkpoints allow: shooting and beam search on each learned belief, and a DQN's decisions.
+/// Returns the default policies for checkpoints: shooting and beam search on learned beliefs, and a DQN's decisions.
 pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     use Goal::{Exploit, Explore};
     let policy = |belief, planner, goal| Policy::new(belief, planner, goal, model);
@@ -67,8 +67,8 @@ pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     policies
 }
 
-/// What is read off one table: random moves, then each option on a belief, the rule, and the learned choice unless the
-/// belief is told the states.
+/// Returns the policies for a table of all options on one belief: random moves, then each option, the rule, and the
+/// learned choice unless the belief is an oracle.
 pub fn options_table(belief: &'static BeliefKind, model: &Model) -> Vec<Policy> {
     let options = OPTIONS.iter().map(Goal::Option).chain([Goal::Rule]);
     let learned = (belief.input == Input::Frames).then_some(Goal::Learned);

@@ -1,4 +1,4 @@
-//! How policies are named: by their parts, `BELIEF/PLANNER/GOAL`, and a few by a name of their own.
+//! Names of policies: the names of their parts, `BELIEF/PLANNER/GOAL`, and short names for some policies.
 
 use super::parts::{Goal, Policy};
 use super::planners::{BY_OPTIONS, PLANNERS, PlannerKind};
@@ -8,7 +8,7 @@ use emberwatch_belief::planning::options;
 use emberwatch_model::Model;
 use emberwatch_model::built_in::listed;
 
-/// Names of policies and their parts: those of the benchmark and of what is learned by default.
+/// Short names of policies, each with its parts: policies of the benchmark and the default learned policies.
 pub(super) const NAMED: &[(&str, &str)] = &[
     ("random_walk", "none/random"),
     ("coverage", "none/shooting/coverage"),
@@ -32,45 +32,45 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("clairvoyant_beam", "next_truth/beam/exploit"),
 ];
 
-/// Begins the names of the ladder's policies for single states: `shooting_STATE` is `known/shooting/STATE`.
+/// Prefixes for policies whose goal is one state: `shooting_STATE` is short for `known/shooting/STATE`.
 const OF_STATE: (&str, &str) = ("shooting_", "known/shooting/");
 
-/// Goals of planners other than options, besides the states of the model.
+/// Goals of all planners except `options`. The states of the model are goals as well.
 pub(super) const GOALS: &[(Goal, &str, &str)] = &[
-    (Goal::Coverage, "coverage", "new cells, and nothing else"),
+    (Goal::Coverage, "coverage", "new cells only"),
     (Goal::Explore, "explore", "the belief's entropy"),
     (
         Goal::Exploit,
         "exploit",
-        "what pays most, and a little for each new cell",
+        "the state with the highest reward, with a small bonus for each new cell",
     ),
     (
         Goal::ExploitOnly,
         "exploit_only",
-        "what pays most, and nothing else",
+        "the state with the highest reward, without a bonus",
     ),
     (
         Goal::Learned,
         "learned",
-        "what a DQN chooses; of the autoencoder",
+        "the goal that a DQN chooses; only with the autoencoder",
     ),
 ];
 
-/// Goals of options, besides each option.
+/// Goals of the planner `options`. Each option is a goal as well.
 pub(super) const OPTION_GOALS: &[(Goal, &str, &str)] = &[
     (
         Goal::Rule,
         "rule",
-        "the best region if it promises more than here, else exploit",
+        "best_region if that region promises more than the surroundings, otherwise exploit",
     ),
     (
         Goal::Learned,
         "learned",
-        "the option that a DQN values most; needs --checkpoint",
+        "the option with the highest value under a DQN; needs --checkpoint",
     ),
 ];
 
-/// The name of a policy of these parts.
+/// Returns the name of the policy with the given parts.
 fn name(belief: &BeliefKind, planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
     let mut parts = format!("{}/{}", belief.name, planner.name);
     if planner.has_goal {
@@ -102,7 +102,7 @@ fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String
             );
             names
                 .nth(state)
-                .expect("invariant: names go on after the model's states")
+                .expect("invariant: numbered names follow the names of the model's states")
         }
         _ => {
             let found = goals.iter().find(|(other, ..)| *other == goal);
@@ -113,7 +113,7 @@ fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String
 }
 
 impl Policy {
-    /// A policy of these parts, by its name if it has one, else by the names of its parts.
+    /// Creates a policy from its parts. Its name is its short name if it has one, otherwise the names of its parts.
     pub fn new(
         belief: &'static BeliefKind,
         planner: &'static PlannerKind,
@@ -128,10 +128,10 @@ impl Policy {
         }
     }
 
-    /// The policy of a name, or of parts.
+    /// Parses a policy from its short name or the names of its parts.
     ///
     /// # Errors
-    /// Names the part that is wrong, and what it may be.
+    /// If a part is unknown. The error lists the valid names.
     pub fn named(name: &str, model: &Model) -> Result<Self> {
         let states = model.state_names().join(", ");
         let parts = parse(name, &|state| model.state_named(state), &states);
@@ -139,28 +139,28 @@ impl Policy {
     }
 }
 
-/// Checks a policy's name before the model is known, whose states are goals.
+/// Checks a policy's name while the model, whose states may be goals, is unknown.
 ///
 /// # Errors
-/// As [`Policy::named`], if it is a policy's under no model.
+/// Like [`Policy::named`], if the name is invalid under every model.
 pub fn check_name(name: &str) -> Result<()> {
-    // Any word may be a state's.
+    // Any word may be the name of a state.
     let is_word = |state: &str| (!state.is_empty()).then_some(0);
     parse(name, &is_word, "a state of the model").map(drop)
 }
 
-/// How a policy finds paths, by its name; `None` of a name that is none of ours.
+/// Returns the planner of the policy with a name. `None` for an unknown name, such as an external agent's.
 pub fn planner_of(name: &str) -> Option<&'static PlannerKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.1)
 }
 
-/// What a policy plans on, by its name; `None` of a name that is none of ours.
+/// Returns the belief of the policy with a name. `None` for an unknown name, such as an external agent's.
 pub fn belief_of(name: &str) -> Option<&'static BeliefKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.0)
 }
 
-/// The parts of a policy by the name that it had before policies were named by their parts: `BELIEF_PLANNER`,
-/// `BELIEF_OPTION`, `beam_GOAL` or `autoencoder_explore`. Tables and leaderboards have such names.
+/// Converts a legacy name to the names of the parts: `BELIEF_PLANNER`, `BELIEF_OPTION`, `beam_GOAL` or
+/// `autoencoder_explore`. Existing tables and leaderboards contain such names.
 fn former(name: &str) -> Option<String> {
     const BEGINNINGS: [(&str, &str); 10] = [
         ("known_", "known"),
@@ -193,7 +193,7 @@ fn former(name: &str) -> Option<String> {
 
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
-/// The parts of a policy. `state`: the number of a state by its name; `states`: what these names may be.
+/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the names for errors.
 fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
     let mut table = NAMED.iter();
     let parts = match table.find(|(known, _)| *known == name) {
@@ -203,8 +203,9 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
             _ => former(name).unwrap_or_else(|| name.to_owned()),
         },
     };
+    let one_of = |names: &str| format!("one of {names}");
     let wrong = |what: &str, expected: &str, got: &str| {
-        anyhow::anyhow!("policy {name:?}: {what}: expected one of {expected}, got {got:?}")
+        anyhow::anyhow!("policy {name:?}: {what}: expected {expected}, got {got:?}")
     };
     let words: Vec<&str> = parts.split('/').collect();
     let (belief, planner, goal) = match words.as_slice() {
@@ -218,19 +219,22 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     };
     let mut kinds = BELIEFS.iter().copied();
     let found = kinds.find(|kind| kind.name == belief);
-    let names = listed(BELIEFS.iter().map(|kind| kind.name));
+    let names = one_of(&listed(BELIEFS.iter().map(|kind| kind.name)));
     let belief = found.ok_or_else(|| wrong("belief", &names, belief))?;
     let mut planners = PLANNERS.iter().copied();
     let found = planners.find(|kind| kind.name == planner);
-    let names = listed(PLANNERS.iter().map(|kind| kind.name));
+    let names = one_of(&listed(PLANNERS.iter().map(|kind| kind.name)));
     let planner = found.ok_or_else(|| wrong("planner", &names, planner))?;
     let found = goal_of(belief, planner, goal, state);
-    let goals = goals_of(belief, planner, states);
+    let mut goals = goals_of(belief, planner, states);
+    if planner.has_goal {
+        goals = one_of(&goals);
+    }
     let goal = found.ok_or_else(|| wrong("goal", &goals, goal.unwrap_or_default()))?;
     Ok((belief, planner, goal))
 }
 
-/// Goals of a planner other than options, besides the states of the model.
+/// Returns the goals of a planner other than `options`, without the states of the model.
 fn goals(belief: &BeliefKind) -> impl Iterator<Item = &'static (Goal, &'static str, &'static str)> {
     let decides = belief.decides();
     let goals = GOALS.iter();
@@ -260,12 +264,12 @@ fn goal_of(
         let option = options.find(|option| Some(option.name) == name);
         return option.map(Goal::Option);
     }
-    // States that were learned have no names.
+    // Learned states have no names.
     let state = (belief.learned_by.is_none()).then(|| name.and_then(state));
     state.flatten().map(Goal::State)
 }
 
-/// What [`goal_of`] knows.
+/// Lists the names that [`goal_of`] accepts.
 fn goals_of(belief: &BeliefKind, planner: &'static PlannerKind, states: &str) -> String {
     if !planner.has_goal {
         return "no goal".into();
@@ -372,7 +376,7 @@ mod tests {
             ("known/beem/exploit", "planner: expected one of random, "),
             ("known/beam/ash", ", normal, latent, fire, got \"ash\""),
             ("known/options/fire", "goal: expected one of rule, learned,"),
-            ("none/random/exploit", "expected one of no goal, got \"ex"),
+            ("none/random/exploit", "goal: expected no goal, got \"ex"),
             ("known/beam/learned", "latent, fire, got \"learned\""),
             ("learned/beam/fire", "goal: expected one of coverage, "),
             ("shooting_ash", "got \"shooting_ash\""),

@@ -1,4 +1,4 @@
-//! The parts of a policy, and what they mean to an agent.
+//! The parts of a policy, and the objective and checkpoints that they imply.
 
 use super::decisions::LearnedDecisions;
 use super::planners::{BEAM, BY_OPTIONS, PlannerKind, SHOOTING};
@@ -9,39 +9,39 @@ use anyhow::{Context, Result, ensure};
 use emberwatch_belief::planning::options::PathOption;
 use emberwatch_belief::planning::{Objective, Target};
 
-/// What a policy plans on, how, and what for.
+/// A belief to plan on, a planner, and a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
-    /// Its name in commands, tables and files.
+    /// Name in commands, tables and files.
     pub name: String,
     pub belief: &'static BeliefKind,
     pub planner: &'static PlannerKind,
     pub goal: Goal,
 }
 
-/// What a policy plans for.
+/// The goal of a policy's paths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
-    /// New cells, and nothing else.
+    /// New cells only.
     Coverage,
     /// The belief's entropy.
     Explore,
-    /// What pays most, and a little for each new cell.
+    /// The state with the highest reward, with a small bonus for each new cell.
     Exploit,
-    /// What pays most, and nothing else.
+    /// The state with the highest reward, without a bonus.
     ExploitOnly,
-    /// A state of the model.
+    /// The probability of a state of the model.
     State(usize),
-    /// What a DQN chooses: an option, or on an autoencoder's hidden vector an objective.
+    /// The choice of a DQN: an option, or an objective if the DQN reads an autoencoder's hidden vector.
     Learned,
-    /// The option that a rule by hand chooses.
+    /// The option that a hand-written rule chooses.
     Rule,
-    /// One option, always.
+    /// Always the same option.
     Option(&'static PathOption),
 }
 
 impl Policy {
-    /// Beam search for what pays most on a belief, by the names of its parts: what learners act on.
+    /// Returns the policy of learners: beam search for the state with the highest reward, named by its parts.
     pub fn exploiting(belief: &'static BeliefKind) -> Self {
         Self {
             name: format!("{}/beam/exploit", belief.name),
@@ -51,20 +51,20 @@ impl Policy {
         }
     }
 
-    /// Whether a DQN decides among options.
+    /// Whether a DQN chooses among options.
     pub fn chooses_options(&self) -> bool {
         self.goal == Goal::Learned && *self.planner == BY_OPTIONS
     }
 
-    /// Whether it acts on what `train` learned.
+    /// Whether it needs a result of `train`.
     pub fn needs_checkpoint(&self) -> bool {
         self.goal == Goal::Learned || self.belief.learned_by.is_some()
     }
 
-    /// Refuses a checkpoint that lacks what it acts on; no checkpoint has to hold anything for some.
+    /// Checks that the checkpoints contain everything that the policy uses.
     ///
     /// # Errors
-    /// Says what `train` has to learn.
+    /// If something is missing. The error names the learner that creates it.
     pub fn check(&self, learned: &Learned) -> Result<()> {
         let of_policy = || format!("policy {:?} needs --checkpoint FILE", self.name);
         self.belief.learned(learned).with_context(of_policy)?;
@@ -74,10 +74,10 @@ impl Policy {
         Ok(())
     }
 
-    /// The decisions that were learned on its belief.
+    /// Returns the decisions that were learned on the policy's belief.
     ///
     /// # Errors
-    /// If there are none, or on another belief.
+    /// If there are none, or they were learned on another belief.
     pub fn decisions<'a>(&self, learned: &'a Learned) -> Result<&'a LearnedDecisions> {
         let decisions = learned.get::<LearnedDecisions>();
         let decisions =
@@ -85,12 +85,12 @@ impl Policy {
         let [expected, got] = [self.belief, decisions.belief].map(|belief| belief.name);
         ensure!(
             got == expected,
-            "expected decisions on the belief {expected}, got some on {got}"
+            "expected decisions on the belief {expected}, got decisions on {got}"
         );
         Ok(decisions)
     }
 
-    /// What it maximises under these settings; `target`: what the belief calls the state that pays most.
+    /// Returns the objective under the given settings. `target` is the index of the state with the highest reward.
     pub fn objective(&self, target: usize, config: &AgentConfig) -> Objective {
         let settings = &config.objective;
         let target = match self.goal {
@@ -115,8 +115,8 @@ impl Policy {
     }
 }
 
-/// What the DQN of Algorithm 1 chooses among (paper section IV, the actions `a_k`): the probability of each state, then
-/// the belief's entropy.
+/// Returns the choices of the DQN of Algorithm 1 (paper section IV, the actions `a_k`): the probability of each state,
+/// then the belief's entropy.
 pub fn network_choices(n_states: usize) -> Vec<Policy> {
     let states = (0..n_states).map(Goal::State);
     let goals = states.chain([Goal::Explore]);

@@ -1,26 +1,26 @@
-//! Kinds of planner: how a policy finds paths. A kind is an entry here, and a line in [`PLANNERS`].
+//! Kinds of planner, which find a policy's paths. Each kind is a constant in this file, with an entry in [`PLANNERS`].
 
 use crate::config::{AgentConfig, ObjectiveConfig};
 use emberwatch_belief::planning::{Ahead, BeamSearch, Planner, RandomWalk, Shooting};
 use std::fmt;
 
-/// All kinds.
+/// All kinds of planner.
 pub const PLANNERS: &[&PlannerKind] = &[&RANDOM, &SHOOTING, &BEAM, &AHEAD, &BY_OPTIONS];
 
-/// A kind of planner: its constructor and its facts.
+/// A kind of planner: its constructor, name and properties.
 pub struct PlannerKind {
-    /// Its name in policies.
+    /// Name in policies.
     pub name: &'static str,
-    /// What it does, in a few words.
+    /// Short description.
     pub about: &'static str,
-    /// What a new cell is worth to it beside the goal.
+    /// Returns the bonus for a new cell, in addition to the goal's value.
     pub bonus: fn(&ObjectiveConfig) -> f32,
-    /// Whether it plans for a goal.
+    /// Whether the planner needs a goal.
     pub has_goal: bool,
     pub build: fn(&AgentConfig) -> Box<dyn Planner + Send>,
 }
 
-/// Uniform moves: the paper's baseline.
+/// Uniformly random moves, the paper's baseline.
 pub const RANDOM: PlannerKind = PlannerKind {
     name: "random",
     about: "random moves, the paper's baseline; without a goal",
@@ -29,7 +29,7 @@ pub const RANDOM: PlannerKind = PlannerKind {
     build: |_| Box::new(RandomWalk),
 };
 
-/// The best of many random paths (paper section III.D).
+/// Random shooting: the best of many random paths (paper section III.D).
 pub const SHOOTING: PlannerKind = PlannerKind {
     name: "shooting",
     about: "the best of random paths, as in the paper",
@@ -51,15 +51,15 @@ pub const BEAM: PlannerKind = PlannerKind {
 
 pub const AHEAD: PlannerKind = PlannerKind {
     name: "ahead",
-    about: "beam search six paths ahead, of which the first is flown",
+    about: "beam search over six paths in a row; only the first is flown",
     build: |config| Box::new(Ahead::new(config.beam_width)),
     ..BEAM
 };
 
-/// One option or another (paper section III.E).
+/// A choice among options (paper section III.E).
 pub const BY_OPTIONS: PlannerKind = PlannerKind {
     name: "options",
-    about: "options, each planned by beam search",
+    about: "a choice among options, each planned by beam search",
     ..BEAM
 };
 

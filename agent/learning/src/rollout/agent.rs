@@ -1,4 +1,4 @@
-//! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
+//! One agent in one world: plan, correct, predict. Pure: communication is elsewhere.
 
 use crate::config::AgentConfig;
 use crate::parallel::in_parallel;
@@ -19,53 +19,53 @@ use emberwatch_network::Dqn;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// What a path that was not planned was for.
+/// The aim that observers see for a random path.
 const RANDOM_MOVES: &str = "random moves";
 
 const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
 
-/// A policy at work on one world.
+/// A policy that acts in one world.
 pub struct Agent {
     policy: Policy,
     chooser: Chooser,
     estimator: Box<dyn Estimator>,
     pub(crate) basis: BasisKind,
-    /// The last estimate p_k, where paths are planned on it.
+    /// The last estimate p_k, if paths are planned on it.
     estimate: Option<Belief>,
     planner: Box<dyn Planner + Send>,
     options: OptionPlanner,
     pub memory: Memory,
-    /// What the belief calls the state that pays most.
+    /// The belief's index of the state with the highest reward.
     target: usize,
-    /// What the last path was for, in a word or two.
+    /// Short description of the last path's purpose.
     aim: String,
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
-    /// Where its robots may fly and what they see.
+    /// The cells that robots may fly over, and the range of their sensors.
     airspace: Airspace,
 }
 
-/// What says what each path is for.
+/// Chooses the purpose of each path.
 pub enum Chooser {
-    /// Always this.
+    /// Always the same objective.
     Objective(Objective),
-    /// A DQN, given the estimator after its prediction (paper eq. 17).
+    /// A DQN, which reads the estimator after its prediction (paper eq. 17).
     Network(Decider),
     Options(OptionChooser),
 }
 
 pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
 
-/// What chooses among options.
+/// Chooses among options.
 pub enum OptionChooser {
     Always(&'static PathOption),
     Rule,
-    /// The option whose features are worth most to a DQN.
+    /// The option whose features have the highest value under a DQN.
     Scorer(Arc<Dqn>),
 }
 
-/// What an agent has beside its estimator and its policy.
+/// The parts of an agent besides its estimator and its policy.
 pub struct Setup {
     pub chooser: Chooser,
     pub basis: BasisKind,
@@ -73,16 +73,16 @@ pub struct Setup {
     pub beam_width: usize,
     pub state_names: Vec<String>,
     pub n_moves: usize,
-    /// Seed of the planner's random numbers: the agent's and the world's.
+    /// Seed of the planner's random numbers, from the agent's seed and the world's seed.
     pub seed: u64,
-    /// What the belief calls the state that pays most.
+    /// The belief's index of the state with the highest reward.
     pub target: usize,
-    /// Where its robots may fly and what they see.
+    /// The cells that robots may fly over, and the range of their sensors.
     pub airspace: Airspace,
 }
 
 impl Agent {
-    /// An agent before its first frame.
+    /// Creates an agent before its first frame.
     pub fn new(
         estimator: Box<dyn Estimator>,
         policy: &Policy,
@@ -113,17 +113,17 @@ impl Agent {
         }
     }
 
-    /// Where its robots may fly and what they see.
+    /// Returns the cells that robots may fly over, and the range of their sensors.
     pub fn airspace(&self) -> &Airspace {
         &self.airspace
     }
 
-    /// What the belief calls the state that pays most.
+    /// Returns the belief's index of the state with the highest reward.
     pub fn target(&self) -> usize {
         self.target
     }
 
-    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15).
+    /// Plans the paths for step k -> k + 1 from the robots' cells (paper eq. 15).
     pub fn plan(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         let objective = match &self.chooser {
             Chooser::Objective(objective) => *objective,
@@ -133,7 +133,7 @@ impl Agent {
         self.plan_for(objective, robots, step)
     }
 
-    /// As [`Self::plan`], for an objective other than the policy's.
+    /// Plans paths like [`Self::plan`], for the given objective instead of the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
         let aim = if !self.policy.planner.has_goal {
             RANDOM_MOVES.into()
@@ -144,7 +144,7 @@ impl Agent {
         self.plan_values(&values, &aim, robots, step)
     }
 
-    /// As [`Self::plan`], for values of cells; `aim`: what they stand for.
+    /// Plans paths like [`Self::plan`], for the given values of cells. `aim` describes the values to observers.
     pub fn plan_values(
         &mut self,
         values: &CellValues,
@@ -157,7 +157,7 @@ impl Agent {
         plan_team(planner, values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// As [`Self::plan`], on a belief other than the agent's.
+    /// Plans paths like [`Self::plan`], on the given belief instead of the agent's.
     #[cfg(test)]
     pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
         let own = self.estimate.replace(belief.clone());
@@ -166,29 +166,29 @@ impl Agent {
         plans
     }
 
-    /// All options from a robot's cell, with what they promise.
+    /// Plans all options from a robot's cell. Each proposal has the features of its option.
     pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
         self.options.propose(&self.outlook(), robot)
     }
 
-    /// The path of an option that was proposed and is flown now.
+    /// Records a proposed option as the aim of the next path, and returns its plan.
     pub fn take_up(&mut self, option: usize, proposal: Proposal) -> Plan {
         OPTIONS[option].name.clone_into(&mut self.aim);
         proposal.plan
     }
 
-    /// What the grid promises a robot now.
+    /// Computes the value that each part of the grid promises to a robot.
     fn outlook(&self) -> Outlook {
         let (belief, air) = (self.basis_belief(), &self.airspace);
         Outlook::new(belief, air, self.target, &self.memory, self.n_moves)
     }
 
-    /// The belief that paths are planned on.
+    /// Returns the belief that paths are planned on.
     pub fn basis_belief(&self) -> &Belief {
         self.estimate.as_ref().unwrap_or(self.estimator.belief())
     }
 
-    /// Each robot's choice, one after the other: what one of them visits is worth nothing to the next.
+    /// Plans an option for each robot in turn. Cells that an earlier robot visits have no value for later robots.
     fn plan_options(&mut self, robots: &[Cell]) -> Vec<Plan> {
         let mut outlook = self.outlook();
         let mut plans: Vec<Plan> = Vec::with_capacity(robots.len());
@@ -218,7 +218,7 @@ impl Agent {
         self.options.plan(option, outlook, robot)
     }
 
-    /// As [`Self::plan`], paths of random moves.
+    /// Plans random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();
         let new_cells = Objective::new(Target::Coverage);
@@ -227,16 +227,16 @@ impl Agent {
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// How well the belief predicts a frame; `None` of an estimator that predicts none.
+    /// Scores the belief's prediction of a frame. `None` if the estimator does not predict frames.
     pub fn score(&self, frame: &Frame) -> Option<Score> {
         let likelihood = self.estimator.likelihood()?;
         Some(score(self.estimator.belief(), &likelihood, frame))
     }
 
-    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for oracles, which must be told it.
+    /// Corrects the belief with a frame of X_k (paper eq. 5). `truth` is X_k, which oracles require.
     ///
     /// # Errors
-    /// Also if an oracle is not told. The belief is then as it was.
+    /// If the frame is impossible under the belief, or an oracle lacks the truth. The belief then remains unchanged.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
         self.estimator.correct(frame)?;
         if let Some(told) = self.estimator.told() {
@@ -246,17 +246,17 @@ impl Agent {
         Ok(())
     }
 
-    /// Takes in what the last path brought.
+    /// Records the reward of the last path.
     pub fn earn(&mut self, reward: f64) {
         self.memory.earn(reward, self.n_moves);
     }
 
-    /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
+    /// Predicts the belief about X_{k+1} from the belief about X_k (paper eq. 6).
     pub fn predict(&mut self) {
         Self::predict_all([self]);
     }
 
-    /// [`Self::predict`] of several agents.
+    /// Predicts the beliefs of several agents, like [`Self::predict`].
     pub fn predict_all<'a>(agents: impl IntoIterator<Item = &'a mut Self>) {
         let (mut together, mut alone) = (Vec::new(), Vec::new());
         for agent in agents {
@@ -276,19 +276,19 @@ impl Agent {
         }
     }
 
-    /// Goes on from an estimate p_k, if paths are planned on it.
+    /// Restores an estimate p_k, if paths are planned on it.
     pub fn remember_estimate(&mut self, estimate: Option<&Belief>) {
         if self.basis == BasisKind::Estimate {
             self.estimate = estimate.cloned();
         }
     }
 
-    /// Tells an oracle the state X_{k+1} that its next path will meet; others ignore it.
+    /// Passes the states X_{k+1}, which the next path will meet, to an oracle. Other estimators ignore them.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
         self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }
 
-    /// The belief: about X_k after `correct`, about X_{k+1} after `predict`.
+    /// Returns the belief, which is about X_k after `correct` and about X_{k+1} after `predict`.
     pub fn belief(&self) -> &Belief {
         self.estimator.belief()
     }
@@ -301,19 +301,19 @@ impl Agent {
         &mut *self.estimator
     }
 
-    /// Names what [`Self::handover`] gives; `None` of an agent whose bytes no other can go on from.
+    /// Names the format of [`Self::handover`]. `None` if no other agent can resume from this agent.
     pub fn handover_kind(&self) -> Option<String> {
         let kind = self.estimator.handover()?.kind();
         Some(handover_of(&kind))
     }
 
-    /// All that it knows of its world before X_{k+1}: what its estimator does, and its memory.
+    /// Encodes the agent's knowledge of its world before X_{k+1}: the estimator's state, and the agent's memory.
     pub fn handover(&self) -> Option<Vec<u8>> {
         let estimator = self.estimator.handover()?.to_bytes();
         Some([estimator, self.memory.to_bytes()].concat())
     }
 
-    /// Goes on from the bytes of an agent of the same kind. Returns false, and changes nothing, if they do not fit.
+    /// Resumes from the bytes of an agent of the same kind. If they do not fit, returns false and changes nothing.
     pub fn take_over(&mut self, bytes: &[u8]) -> bool {
         let shape = self.belief().shape();
         let Some(n_bytes) = bytes.len().checked_sub(Memory::n_bytes(shape)) else {
@@ -331,17 +331,17 @@ impl Agent {
         is_taken
     }
 
-    /// Goes on with another estimator, such as one with newer parameters.
+    /// Replaces the estimator, for example by one with newer parameters.
     pub fn set_estimator(&mut self, estimator: Box<dyn Estimator>) {
         self.estimator = estimator;
     }
 
-    /// The estimate p_k, where paths are planned on it.
+    /// Returns the estimate p_k, if paths are planned on it.
     pub fn estimate(&self) -> Option<&Belief> {
         self.estimate.as_ref()
     }
 
-    /// What it tells observers; `planning`: time that its last plan took.
+    /// Returns the message for observers. `planning` is the duration of the last planning.
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
@@ -357,7 +357,7 @@ impl Agent {
     }
 }
 
-/// Names what an agent hands over whose estimator's bytes are of a kind.
+/// Names the format of an agent's handover, given the format of its estimator's handover.
 pub fn handover_of(kind: &str) -> String {
     format!("{kind}; freshness [H, W] as f32, rewards, paths")
 }

@@ -1,4 +1,4 @@
-//! How a policy's agent is put together: its belief, its planner, and what decides.
+//! Construction of a policy's agent from its belief, its planner and its chooser.
 
 use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use crate::beliefs::autoencoder::AutoencoderModel;
@@ -10,19 +10,19 @@ use anyhow::{Context, Result};
 use emberwatch_belief::planning::{BasisKind, Objective};
 use std::sync::Arc;
 
-/// Refuses a policy in worlds where it cannot act, from settings and checkpoints alone.
+/// Checks that a policy can act in worlds of a form, given the checkpoints.
 ///
 /// # Errors
-/// If a checkpoint lacks what it acts on, or is of worlds of another form.
+/// If the checkpoints lack something that the policy uses, or were trained in worlds of another form.
 pub fn check(policy: &Policy, learned: &Learned, world: &WorldForm) -> Result<()> {
     policy.check(learned)?;
     policy.belief.check(learned, world)
 }
 
-/// A policy's agent before its first frame. `seed`: of its planner, from its own and the world's.
+/// Builds a policy's agent before its first frame. `seed` is the planner's, see [`AgentConfig::planner_seed`].
 ///
 /// # Errors
-/// As [`check`]; also if its network cannot be computed.
+/// Like [`check`], or if the computation of the network fails.
 pub fn agent(
     policy: &Policy,
     config: &AgentConfig,
@@ -52,8 +52,8 @@ pub fn agent(
     Ok(Agent::new(estimator, policy, config, setup))
 }
 
-/// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as its values are of
-/// such paths. A policy that is told the state that its path will meet plans on that.
+/// Returns the kind of belief that a policy plans on: the setting, or for a DQN the kind that it was trained with, as
+/// its values refer to such paths. A clairvoyant always plans on the next states.
 fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
     Ok(match policy.goal {
         Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,
@@ -84,10 +84,10 @@ fn chooser(
 
 fn network(learned: &Learned) -> Result<Arc<AutoencoderModel>> {
     let network = learned.shared::<AutoencoderModel>();
-    network.context("checkpoint: expected one of an autoencoder, got none")
+    network.context("checkpoint: expected a learned autoencoder, got none")
 }
 
-/// The DQN learned beside an autoencoder.
+/// Returns the function that chooses an objective by the DQN that was trained with an autoencoder.
 fn decider(config: &AgentConfig, network: Arc<AutoencoderModel>) -> Decider {
     let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
     let objectives = choices.map(|choice| choice.objective(network.target, config));

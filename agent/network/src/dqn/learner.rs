@@ -1,4 +1,4 @@
-//! The DQN itself: values of actions, and its updates.
+//! The DQN: action values, and updates.
 
 use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
@@ -14,38 +14,38 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fmt;
 
-/// Settings of the learner, as in files; there the optimiser has none.
+/// Settings of the learner, as in files. Files do not contain the optimiser's settings.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DqnSettings {
-    /// Transitions remembered.
+    /// Capacity of the replay buffer, in transitions.
     pub replay: usize,
-    /// Transitions an update learns from.
+    /// Number of transitions per update.
     pub batch: usize,
     /// Discount per step.
     pub gamma: f32,
-    /// Steps that a transition spans, fewer at the end of an episode, see [`Track`].
+    /// Number of steps per transition. Transitions at the end of an episode span fewer: see [`Track`].
     pub n_step: usize,
-    /// Share of the network in its target after each update.
+    /// Weight of the network in the update of its target network.
     pub tau: f32,
-    /// Chance of a random action at the first step.
+    /// Probability of a random action at the first step.
     pub epsilon: f32,
-    /// Chance of a random action in the end.
+    /// Probability of a random action after `epsilon_steps` steps.
     pub epsilon_end: f32,
-    /// Steps from the one to the other, in a straight line.
+    /// Number of steps over which the probability changes linearly from `epsilon` to `epsilon_end`.
     pub epsilon_steps: u64,
-    /// Whether the network, and not its target, picks the action whose value the target gives.
+    /// Whether to use double Q-learning: the network selects the next action, and the target network evaluates it.
     pub double: bool,
-    /// Whether an error of more than 1 counts by its size (Huber's loss), not by its square.
+    /// Whether to use the Huber loss, which is linear for errors above 1, instead of the squared error.
     pub huber: bool,
     /// Width of both hidden layers.
     pub width: usize,
-    /// The optimiser: by default the authors'.
+    /// Settings of the optimiser. The default is the authors'.
     #[serde(skip, default = "adam")]
     pub adam: AdamSettings,
 }
 
 impl DqnSettings {
-    /// What the authors ran.
+    /// Returns the authors' settings.
     pub fn paper() -> Self {
         Self {
             replay: 1000,
@@ -63,13 +63,13 @@ impl DqnSettings {
         }
     }
 
-    /// The same with another step size.
+    /// Replaces the learning rate.
     pub fn with_rate(mut self, learning_rate: f32) -> Self {
         self.adam.learning_rate = learning_rate;
         self
     }
 
-    /// Chance of a random action at a step.
+    /// Returns the probability of a random action at a step.
     pub fn epsilon_at(&self, step: u64) -> f32 {
         let share = (step as f32 / self.epsilon_steps.max(1) as f32).min(1.0);
         self.epsilon + (self.epsilon_end - self.epsilon) * share
@@ -83,19 +83,19 @@ fn adam() -> AdamSettings {
     }
 }
 
-/// What a decision is made on, and among.
+/// The sizes of a decision: its inputs and its choices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DqnShape {
-    /// Numbers that the network reads at once.
+    /// Number of inputs of the network.
     pub n_inputs: usize,
-    /// Values that it gives for them.
+    /// Number of outputs of the network.
     pub n_outputs: usize,
-    /// How often it reads for a decision: once, or for each candidate its own numbers.
+    /// Number of evaluations of the network per decision: one per candidate, or 1.
     pub n_candidates: usize,
 }
 
 impl DqnShape {
-    /// One vector, of which the network gives the value of each action.
+    /// Scores all actions from one input vector.
     pub fn of_actions(n_inputs: usize, n_actions: usize) -> Self {
         Self {
             n_inputs,
@@ -104,7 +104,7 @@ impl DqnShape {
         }
     }
 
-    /// Candidates, each with numbers of its own, of which the network gives the candidate's value.
+    /// Scores each candidate from its own features.
     pub const fn of_candidates(n_inputs: usize, n_candidates: usize) -> Self {
         Self {
             n_inputs,
@@ -113,35 +113,35 @@ impl DqnShape {
         }
     }
 
-    /// Numbers that a decision is made on.
+    /// Returns the number of inputs of a decision.
     pub fn n_numbers(&self) -> usize {
         self.n_inputs * self.n_candidates
     }
 
-    /// Choices of a decision.
+    /// Returns the number of choices of a decision.
     pub fn n_choices(&self) -> usize {
         self.n_outputs * self.n_candidates
     }
 }
 
-/// Values of actions, learned from transitions.
+/// A deep Q-network, which learns action values from transitions.
 pub struct Dqn {
     pub(super) settings: DqnSettings,
     pub(super) seed: u64,
     pub(super) shape: DqnShape,
     network: Perceptron,
     pub(super) adam: Adam,
-    /// Follows the network slowly.
+    /// The target network, which follows the network slowly.
     target: Perceptron,
     pub(super) target_variables: Variables,
-    /// The latest transitions, the oldest first.
+    /// The replay buffer, the oldest transition first.
     pub(super) memory: VecDeque<Transition>,
 }
 
 /// Linear layers with ReLU between them.
 struct Perceptron(Vec<Linear>);
 
-/// Transitions as tensors.
+/// A batch of transitions, as tensors.
 struct Batch {
     input: Tensor,
     action: Tensor,
@@ -151,7 +151,7 @@ struct Batch {
 }
 
 impl Perceptron {
-    /// Named as the layers of `torch.nn.Sequential`.
+    /// Creates the layers, with the names of `torch.nn.Sequential`.
     fn new(vb: &VarBuilder<'_>, sizes: [usize; 4]) -> CandleResult<Self> {
         let layers = sizes.windows(2).enumerate().map(|(index, sizes)| {
             let (vb, init) = (vb.pp(2 * index), uniform_init(sizes[0]));
@@ -172,7 +172,7 @@ impl Perceptron {
 }
 
 impl Dqn {
-    /// A learner whose target starts equal.
+    /// Creates a learner. The target network has the same initial variables as the network.
     pub fn new(settings: DqnSettings, shape: DqnShape, seed: u64) -> Self {
         let sizes = [
             shape.n_inputs,
@@ -181,7 +181,7 @@ impl Dqn {
             shape.n_outputs,
         ];
         let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, sizes);
-        // First values depend on the seed and names alone.
+        // Initial values depend only on the seed and the names.
         let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
         let ((network, variables), (target, target_variables)) = (made(), made());
         Self {
@@ -196,38 +196,42 @@ impl Dqn {
         }
     }
 
-    /// Settings, with the present step size.
+    /// Returns the settings, with the current learning rate.
     pub fn settings(&self) -> &DqnSettings {
         &self.settings
     }
 
-    /// Updates so far.
+    /// Returns the number of updates so far.
     pub fn n_updates(&self) -> u64 {
         self.adam.steps()
     }
 
-    /// Transitions remembered.
+    /// Returns the number of transitions in the replay buffer.
     pub fn n_remembered(&self) -> usize {
         self.memory.len()
     }
 
-    /// Changes the step size.
+    /// Sets the learning rate.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// The value of each choice of a decision, `Q(h, .)`.
+    /// Computes the value of each choice of a decision, `Q(h, .)`.
     ///
     /// # Panics
     /// If `input` has another length.
     pub fn values(&self, input: &[f32]) -> Vec<f32> {
-        assert_eq!(input.len(), self.shape.n_numbers(), "numbers of the input");
+        assert_eq!(
+            input.len(),
+            self.shape.n_numbers(),
+            "input: expected the DQN's number of inputs"
+        );
         let values = Tensor::from_slice(input, (1, input.len()), &Device::Cpu)
             .and_then(|input| self.choices(&self.network, &input)?.squeeze(0)?.to_vec1());
         on_cpu(values)
     }
 
-    /// Values of all choices, `[N, n_choices]`, from the numbers of N decisions.
+    /// Computes the values of all choices, `[N, n_choices]`, from the inputs of N decisions.
     fn choices(&self, network: &Perceptron, input: &Tensor) -> CandleResult<Tensor> {
         let n = input.dim(0)?;
         let input = input.reshape((n * self.shape.n_candidates, self.shape.n_inputs))?;
@@ -236,14 +240,14 @@ impl Dqn {
             .reshape((n, self.shape.n_choices()))
     }
 
-    /// The action of the largest value.
+    /// Returns the choice with the largest value.
     pub fn best(&self, input: &[f32]) -> usize {
         let values = self.values(input);
         let larger = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
         (0..values.len()).fold(0, larger)
     }
 
-    /// The best action, or with the chance of this step a random one.
+    /// Returns the best choice, or a random one with the probability of this step.
     pub fn act(&self, input: &[f32], step: u64) -> usize {
         let mut rng = stream(self.seed, Purpose::Exploration, step);
         if uniform(&mut rng) < self.settings.epsilon_at(step) {
@@ -253,13 +257,14 @@ impl Dqn {
         }
     }
 
-    /// Makes transitions of [`DqnSettings::n_step`] steps out of the single steps of an episode.
+    /// Returns an empty track, which combines the steps of an episode into transitions of [`DqnSettings::n_step`]
+    /// steps.
     pub fn track(&self) -> Track {
         Track::new(self.settings.n_step)
     }
 
-    /// Factor on the value of what follows one step: nothing follows the end of an episode that terminated. What
-    /// follows a truncated episode counts, because the world continues.
+    /// Returns the discount of the value after one step: 0 if the episode terminated, otherwise gamma. The value after
+    /// a truncated episode counts, because the world continues.
     pub fn discount(&self, is_terminated: bool) -> f32 {
         if is_terminated {
             0.0
@@ -268,23 +273,26 @@ impl Dqn {
         }
     }
 
-    /// Remembers a transition, and forgets the oldest if there are too many.
+    /// Adds a transition to the replay buffer. Removes the oldest if the buffer is full.
     ///
     /// # Panics
-    /// If it has other numbers of inputs or an action that there is not.
+    /// If the transition has another number of inputs or an invalid action.
     pub fn remember(&mut self, transition: Transition) {
-        assert!(self.fits(&transition), "transition: numbers or action");
+        assert!(
+            self.fits(&transition),
+            "transition: expected the DQN's inputs and actions"
+        );
         self.memory.push_back(transition);
         if self.memory.len() > self.settings.replay {
             self.memory.pop_front();
         }
     }
 
-    /// One step of Adam on a random batch, then of the target; the loss before it, or `None` while there
-    /// are fewer transitions than a batch.
+    /// Performs one step of Adam on a random batch, then updates the target network. Returns the loss before the step,
+    /// or `None` if there are fewer transitions than a batch.
     ///
     /// # Errors
-    /// [`NetworkError`] for a number that is not finite; nothing has changed then.
+    /// [`NetworkError`] if a number is not finite. An error changes nothing.
     pub fn update(&mut self) -> Result<Option<f32>, NetworkError> {
         if self.memory.len() < self.settings.batch.max(1) {
             return Ok(None);
@@ -296,10 +304,10 @@ impl Dqn {
         self.learn_batch(&batch).map(Some)
     }
 
-    /// [`Self::update`] on a given batch (eqs. 19 and 21).
+    /// Like [`Self::update`], on a given batch (eqs. 19 and 21).
     ///
     /// # Errors
-    /// [`NetworkError`] for a number that is not finite; nothing has changed then.
+    /// [`NetworkError`] if a number is not finite. An error changes nothing.
     pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NetworkError> {
         let batch = Batch::new(batch.iter(), self.shape)?;
         self.learn_batch(&batch)
@@ -323,7 +331,7 @@ impl Dqn {
         Ok(loss)
     }
 
-    /// The mean of `(Q(h, a) - (r + discount Q'(h', a')))^2`, or of its Huber loss.
+    /// Computes the mean of `(Q(h, a) - (r + discount Q'(h', a')))^2`, or of its Huber loss.
     fn loss(&self, batch: &Batch) -> CandleResult<Tensor> {
         let after = self.choices(&self.target, &batch.next)?.detach();
         let judge = if self.settings.double {
@@ -342,7 +350,8 @@ impl Dqn {
         }
     }
 
-    /// Whether a transition is of such decisions: an input is of one candidate, what follows of all.
+    /// Returns whether a transition fits the DQN. Its input is from one candidate, and its next input from all
+    /// candidates.
     pub(super) fn fits(&self, transition: &Transition) -> bool {
         transition.input.len() == self.shape.n_inputs
             && transition.next.len() == self.shape.n_numbers()
@@ -390,14 +399,14 @@ impl fmt::Debug for Dqn {
     }
 }
 
-/// The mean of half the squared differences, which grow linearly from 1 on.
+/// Computes the mean Huber loss: half the squared difference, which continues linearly for differences above 1.
 fn huber(got: &Tensor, goal: &Tensor) -> CandleResult<Tensor> {
     let size = (got - goal)?.abs()?;
     let near = size.minimum(1.0)?;
     (&near * (&size - (&near * 0.5)?)?)?.mean_all()
 }
 
-/// What candle gives for tensors of known sizes on the CPU.
+/// Unwraps the result of an operation on tensors of known sizes on the CPU, which cannot fail.
 pub(super) fn on_cpu<T>(result: CandleResult<T>) -> T {
     result.expect("invariant: sizes fit, and the CPU does not fail")
 }

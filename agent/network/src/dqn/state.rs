@@ -1,4 +1,4 @@
-//! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
+//! The saved state of a DQN, from which a run resumes: named tensors and a [`SavedDqn`].
 
 use super::learner::{Dqn, on_cpu};
 use super::track::{Track, Transition};
@@ -7,22 +7,22 @@ use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::variables::Variables;
 use serde::{Deserialize, Serialize};
 
-/// A DQN without its tensors, settings and seed.
+/// The state of a DQN except its tensors, settings and seed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDqn {
-    /// Updates so far.
+    /// Number of updates so far.
     pub n_updates: u64,
-    /// The replay, the oldest transition first.
+    /// The replay buffer, the oldest transition first.
     pub transitions: Vec<Transition>,
 }
 
 impl Dqn {
-    /// The network and its target by PyTorch's names, and Adam's moments.
+    /// Returns the tensors of a checkpoint: the network and its target network by PyTorch's names, and Adam's moments.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         on_cpu(named_numbers(&self.groups()))
     }
 
-    /// The network's variables, its target's, and Adam's moments.
+    /// Returns the variables of the network and of its target network, and Adam's moments.
     pub(super) fn groups(&self) -> [(&'static str, &Variables); 3] {
         [
             ("dqn.network.", self.adam.variables()),
@@ -31,7 +31,7 @@ impl Dqn {
         ]
     }
 
-    /// What else a resumed run needs.
+    /// Returns the other state that a resumed run needs.
     pub fn saved(&self) -> SavedDqn {
         SavedDqn {
             n_updates: self.n_updates(),
@@ -39,12 +39,12 @@ impl Dqn {
         }
     }
 
-    /// Takes over what [`Self::named_tensors`] and [`Self::saved`] gave, of a DQN of the same inputs and
-    /// actions: from here on, it learns as that one would have, bit for bit. Of a longer replay the latest
-    /// transitions stay. `find` gives the numbers of a name and shape.
+    /// Loads the results of [`Self::named_tensors`] and [`Self::saved`] of a DQN with the same inputs and actions.
+    /// Afterwards it learns exactly as the saved DQN would have learned, bit for bit. If the saved replay buffer
+    /// exceeds the capacity, it keeps the latest transitions. `find` returns the numbers for a name and a shape.
     ///
     /// # Errors
-    /// As of `find`, or for a transition of another DQN; nothing has changed then.
+    /// If `find` fails, or a transition does not fit the DQN. An error changes nothing.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -60,10 +60,11 @@ impl Dqn {
         Ok(())
     }
 
-    /// Resumes the saved track of an episode; without steps if its transitions were of another length.
+    /// Resumes the saved track of an episode. If the track has another [`n_step`](super::DqnSettings::n_step), returns
+    /// an empty track.
     ///
     /// # Errors
-    /// For a step of another DQN.
+    /// If a step does not fit the DQN.
     pub fn resume_track(&self, saved: Track) -> Result<Track, NetworkError> {
         let track = self.track();
         let length = saved.open.len();
@@ -89,12 +90,23 @@ impl Dqn {
             return Ok(());
         }
         let (n_inputs, n_outputs) = (self.shape.n_inputs, self.shape.n_outputs);
+        let n_next = self.shape.n_numbers();
+        let flaw = if is_finite {
+            ""
+        } else {
+            " and a number that is not finite"
+        };
         Err(NetworkError::Transition {
             at,
             expected: format!(
-                "{n_inputs} finite inputs, an action below {n_outputs} and a discount from 0 to 1"
+                "{n_inputs} inputs, {n_next} next inputs, an action below {n_outputs}, a discount from 0 to 1 and \
+                 finite numbers"
             ),
-            got: format!("{}, {action} and {discount}", input.len()),
+            got: format!(
+                "{} inputs, {} next inputs, action {action}, discount {discount}{flaw}",
+                input.len(),
+                next.len()
+            ),
         })
     }
 }

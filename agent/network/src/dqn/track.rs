@@ -1,33 +1,33 @@
-//! Transitions, and returns over several steps of one episode.
+//! Transitions, and n-step returns.
 
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
-/// One row `(h, a, r, h')` of the replay, with the discount of what follows `h'`.
+/// A transition `(h, a, r, h')` of the replay buffer, with the discount of the value of `h'`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Transition {
-    /// Before; of several candidates, the chosen one's numbers.
+    /// The input before the action. With several candidates, the features of the chosen candidate.
     pub input: Vec<f32>,
-    /// What was chosen; of several candidates, 0.
+    /// The action. With several candidates, 0.
     pub action: usize,
-    /// What it brought.
+    /// The reward.
     pub reward: f32,
-    /// After; of several candidates, the numbers of each.
+    /// The input after the action. With several candidates, the features of all candidates.
     pub next: Vec<f32>,
-    /// Factor on the value of `next`: `gamma` after one step, `gamma^m` after m, 0 where the episode terminated.
+    /// Factor on the value of `next`: `gamma` after one step, `gamma^m` after m steps, or 0 if the episode terminated.
     pub discount: f32,
 }
 
-/// The latest steps of one episode, whose n-step returns are not complete (Sutton and Barto, section 7.1).
+/// The latest steps of one episode, with incomplete n-step returns (Sutton and Barto, section 7.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Track {
     pub(super) n_step: usize,
-    /// Steps whose transition is not complete, the oldest first.
+    /// Steps with incomplete transitions, the oldest first.
     pub(super) open: VecDeque<Transition>,
 }
 
 impl Track {
-    /// An empty track, whose transitions span `n_step` steps.
+    /// Creates an empty track whose transitions span `n_step` steps.
     pub(super) fn new(n_step: usize) -> Self {
         Self {
             n_step: n_step.max(1),
@@ -35,8 +35,8 @@ impl Track {
         }
     }
 
-    /// Adds the episode's next step. Returns the transition that it completes, of `n` steps: the reward is
-    /// `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. `None` for the first `n - 1` steps.
+    /// Adds the episode's next step. Returns the transition over `n` steps that it completes, whose reward is
+    /// `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. Returns `None` for the first `n - 1` steps.
     pub fn add(&mut self, step: Transition) -> Option<Transition> {
         self.open.push_back(step);
         if self.open.len() < self.n_step {
@@ -45,12 +45,12 @@ impl Track {
         self.complete()
     }
 
-    /// Ends the episode: returns the transitions of its last steps, which span fewer than `n`, up to its last state.
+    /// Ends the episode. Returns the remaining transitions, which span fewer than `n` steps and end at the last state.
     pub fn end(&mut self) -> Vec<Transition> {
         std::iter::from_fn(|| self.complete()).collect()
     }
 
-    /// The transition from the oldest step to the latest.
+    /// Returns the transition from the oldest step to the latest.
     fn complete(&mut self) -> Option<Transition> {
         let next = self.open.back()?.next.clone();
         let later = self.open.iter().rev();
@@ -81,7 +81,7 @@ mod tests {
         }
     }
 
-    /// A transition from one step on, with the rewards of as many steps as given.
+    /// Creates a transition over `n_steps` steps from the step `first`.
     fn over(first: u8, reward: f32, n_steps: u8, discount: f32) -> Transition {
         Transition {
             reward,
@@ -107,7 +107,7 @@ mod tests {
 
     #[test]
     fn each_step_of_the_shortest_episode_is_one_transition() {
-        // 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6: all up to the last state, 7.
+        // The returns are 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6. All end at the last state, 7.
         let last = [
             over(4, 8.0, 3, 0.125),
             over(5, 8.0, 2, 0.25),

@@ -1,10 +1,12 @@
 //! Dropout, normalisation and ReLU between two convolutions, forward and backward.
 //!
-//! There are two steps, one before the normalisation and one after it; one of them is ReLU ([`Order`]).
+//! One step precedes the normalisation and one follows it. One of the two steps is ReLU, the other does nothing
+//! ([`Order`]).
 //!
-//! Only the planes of channels that dropout keeps are stored. Dropout makes a dropped channel zero, and normalisation and
-//! ReLU make that a constant, its *floor*. [`Activation::apply`] subtracts the floors, so that dropped channels are zero and
-//! need not be computed; the convolution adds what the floors contribute ([`super::stage`]).
+//! Only the planes of channels that dropout keeps are stored. Dropout sets a dropped channel to zero, which
+//! normalisation and ReLU map to a constant, the channel's *floor*. [`Activation::apply`] subtracts the floors, so that
+//! dropped channels are zero and need no computation. The convolution adds the contribution of the floors
+//! ([`super::stage`]).
 
 use super::cpu::{Frames, frames, sum};
 use super::norm::{Norm, Sums};
@@ -13,9 +15,9 @@ use crate::dropout::Mask;
 /// The order of ReLU and normalisation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Order {
-    /// ReLU, then the normalisation: the encoder. Dropout must scale by more than zero.
+    /// First ReLU, then the normalisation, as in the encoder. The scale of dropout must be positive.
     ReluFirst,
-    /// The normalisation, then ReLU: the decoder.
+    /// First the normalisation, then ReLU, as in the decoder.
     NormFirst,
 }
 
@@ -25,7 +27,7 @@ pub(super) struct Activation {
     /// `None` for the input of the encoder, which is not normalised.
     pub(super) norm: Option<Norm>,
     pub(super) mask: Mask,
-    /// The value of each channel where it is dropped; zero if none is.
+    /// The value of each channel in frames that drop it. All are 0 without dropout.
     pub(super) floors: Vec<f32>,
 }
 
@@ -58,7 +60,7 @@ impl ResultGradient<'_> {
 }
 
 impl Order {
-    /// The step before the normalisation.
+    /// Computes the step before the normalisation.
     #[inline(always)]
     fn first(self, z: f32) -> f32 {
         match self {
@@ -67,7 +69,7 @@ impl Order {
         }
     }
 
-    /// The step after the normalisation.
+    /// Computes the step after the normalisation.
     #[inline(always)]
     pub(super) fn second(self, y: f32) -> f32 {
         match self {
@@ -76,8 +78,8 @@ impl Order {
         }
     }
 
-    #[inline(always)]
     /// Adds a plane to the sums for the moments of the next normalisation.
+    #[inline(always)]
     pub(super) fn add_moments(self, sums: &mut Sums, channel: usize, z: &[f32]) {
         sums.add(
             channel,
@@ -115,8 +117,8 @@ impl Activation {
         }
     }
 
-    /// Computes the gradient `dy` of the normalisation's output from the gradient `dx` of the activation, and adds it to
-    /// the sums from which the normalisation's gradient follows.
+    /// Computes the gradient `dy` of the normalisation's output from the gradient `dx` of the activation, and adds it
+    /// to the sums from which the normalisation's gradient follows.
     #[inline(always)]
     pub(super) fn backward(
         &self,
@@ -137,7 +139,8 @@ impl Activation {
             |dy, z| [dy, dy * order.first(z)],
         );
         if !self.mask.keeps_all() {
-            // The gradient at dropped positions: that of all positions, which `Stage::finish` adds, minus that of kept ones.
+            // The gradient at dropped positions is the gradient at all positions, which `Stage::finish` adds, minus the
+            // gradient at kept positions.
             sums.lost[channel] -= f64::from(sum(dx));
         }
     }
@@ -185,7 +188,7 @@ impl Activation {
     }
 }
 
-/// Copies the kept planes of dense maps `[frames, channels, cells]`, and sums them for a normalisation.
+/// Copies the kept planes of dense maps `[frames, channels, cells]`, and computes their sums for a normalisation.
 pub(super) fn kept_planes(maps: &[f32], mask: &Mask, order: Order) -> (Frames, Sums) {
     let area = maps.len() / (mask.n_frames() * mask.channels());
     let (planes, sums) = frames(

@@ -1,13 +1,12 @@
-//! The loss of paper eqs. 8 and 11 at one cell.
+//! The loss of paper eqs. 8 and 11.
 //!
-//! At a visited cell the predictor is `u = softmax(logits)`, the predicted observation `q = O u`, and the
-//! loss the binary cross-entropy of all O channels: `-log q_y - sum over a != y of log(1 - q_a)`.
+//! At a visited cell, the predictor is `u = softmax(logits)` and the distribution of the observation is `q = O u`. The
+//! loss is the binary cross-entropy of all O channels: `-log q_y - sum over a != y of log(1 - q_a)`.
 
 use super::cpu::{Frames, frames, total};
 use crate::window::Window;
 
-/// Added inside logarithms, as by the authors: the loss stays finite where a probability is rounded to 0
-/// or 1.
+/// Added inside logarithms, as in the authors' code. It keeps the loss finite if a probability is rounded to 0 or 1.
 pub(crate) const LOG_FLOOR: f64 = 1e-10;
 
 /// The mean loss over a window's targets, in nats per cell, and its gradients.
@@ -60,11 +59,11 @@ pub(crate) fn window_loss(
     }
 }
 
-/// Sums over cells, and room for one.
+/// Sums over cells, and buffers for one cell.
 struct CellLoss<'a> {
     /// `O [observations, states]`, whose columns sum to one.
     observation: &'a [f32],
-    /// Of each cell in the loss.
+    /// The weight of each cell in the loss.
     weight: f32,
     loss: f64,
     d_observation: Vec<f64>,
@@ -86,10 +85,10 @@ impl<'a> CellLoss<'a> {
         }
     }
 
-    /// Adds the loss of a cell where `value` was seen, and puts the gradients of its logits in their place.
+    /// Adds the loss of a cell where `value` was observed, and replaces its logits by their gradients.
     ///
-    /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: the `q` sum to one, so at
-    /// most one other factor `1 - q_a` is small, and it is zero or at least 6e-8.
+    /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: the `q` sum to one, so
+    /// at most one other factor `1 - q_a` is small, and it is zero or at least 6e-8.
     #[inline(always)]
     fn add(&mut self, logits: &mut [f32], value: u8) {
         let largest = logits.iter().copied().fold(f32::MIN, f32::max);
@@ -129,7 +128,8 @@ impl<'a> CellLoss<'a> {
     }
 }
 
-/// The probability of what an observation's channel showed. Rounding may take `q` above one.
+/// Returns the probability of a channel's binary outcome: `q` if the channel was observed, otherwise `1 - q`. Rounding
+/// may make `q` larger than 1.
 #[inline(always)]
 fn term(q: f32, hit: bool) -> f32 {
     LOG_FLOOR as f32 + if hit { q } else { (1.0 - q).max(0.0) }

@@ -1,5 +1,5 @@
-//! Convolutions with dropout, normalisation and ReLU between them, over all frames of a window and with all gradients: the
-//! autoencoder's encoder and decoder.
+//! Chains of convolutions with dropout, normalisation and ReLU between them, over all frames of a window, with all
+//! gradients: the autoencoder's encoder and decoder.
 
 use super::activation::{Activation, Order, ResultGradient, kept_planes};
 use super::cpu::{Frames, numbers};
@@ -16,7 +16,7 @@ pub(crate) struct Chain {
 }
 
 impl Chain {
-    /// Runs the layers on maps `[frames, channels, rows, cols]` with their dropout, and returns the last result.
+    /// Runs the layers on maps `[frames, channels, rows, cols]` and their dropout mask. Returns the last result.
     ///
     /// `moments(layer, moments of the window)` returns the moments that the layer's normalisation uses.
     pub(crate) fn forward(
@@ -28,7 +28,7 @@ impl Chain {
         let has_norm = |layer: &Layer<'_>| layer.norm.is_some();
         assert!(
             layers[1..].iter().all(has_norm),
-            "invariant: only the first layer has no norm"
+            "invariant: only the first layer has no normalisation"
         );
         let (mut z, mut sums) = kept_planes(&numbers(maps)?, mask, order);
         let mut chain = Self {
@@ -55,8 +55,8 @@ impl Chain {
         Ok((chain, z))
     }
 
-    /// Returns the gradients of all layers from the gradient of the last result, in the order of [`Layer::tensors`]. If the
-    /// first layer has a normalisation, the gradient of the maps comes before them.
+    /// Computes the gradients of all layers from the gradient of the last result, in the order of [`Layer::tensors`].
+    /// If the first layer has a normalisation, the gradient of the maps precedes them.
     pub(crate) fn backward(&self, last: Frames) -> Result<Vec<f32>> {
         let (mut parts, mut gradient) = (Vec::new(), ResultGradient::Given(last));
         for (stage, z) in self.stages.iter().zip(&self.z).rev() {

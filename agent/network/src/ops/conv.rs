@@ -1,12 +1,14 @@
 //! The arithmetic of every convolution, one frame at a time: the forward pass and both gradients.
 //!
-//! A convolution reads a *large* map and produces a *small* one (of equal size at stride 1). A transposed convolution does the
-//! reverse. Each is the gradient of the other, so [`Conv::down`], [`Conv::up`] and [`Conv::add_weight_gradient`] serve both.
-//! Maps are `[channels, rows, cols]`, weights `[kernel rows, kernel cols, large channels, small channels]`.
+//! A convolution reads a *large* map and produces a *small* one (of equal size at stride 1). A transposed convolution
+//! does the reverse. Each is the gradient of the other, so [`Conv::down`], [`Conv::up`] and
+//! [`Conv::add_weight_gradient`] serve both. Maps are `[channels, rows, cols]`, weights
+//! `[kernel rows, kernel cols, large channels, small channels]`.
 //!
-//! All three are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into a zero-padded
-//! buffer, where the cells that one tap of the kernel reads for all output cells are one contiguous run. With a stride `s`, the
-//! large plane is split into `s * s` parts by the remainders of row and column, so that runs stay contiguous.
+//! All three are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into a
+//! zero-padded buffer, where the cells that one tap of the kernel reads for all output cells are one contiguous run.
+//! With a stride `s`, the large plane is split into `s * s` parts by the remainders of row and column, so that runs
+//! stay contiguous.
 //!
 //! Channels are passed as lists: channels dropped by dropout are neither read nor computed.
 
@@ -20,12 +22,12 @@ pub(crate) struct Sizes {
     pub(crate) large: [usize; 3],
     /// Channels, rows and columns of the small map.
     pub(crate) small: [usize; 3],
-    /// Rows and columns.
+    /// Rows and columns of the kernel.
     pub(crate) kernel: [usize; 2],
     pub(crate) stride: usize,
-    /// Zeros on each side of the large map.
+    /// Number of zeros on each side of the large map.
     pub(crate) padding: usize,
-    /// Steps between the cells that a kernel reads.
+    /// Distance between neighbouring cells that a kernel reads.
     pub(crate) dilation: usize,
 }
 
@@ -36,9 +38,9 @@ pub(crate) struct Conv {
     taps: Vec<Tap>,
     /// Rows and columns of each part of a padded large plane.
     part: [usize; 2],
-    /// Rows and columns of zeros above and left of a small plane.
+    /// Number of rows of zeros above a small plane, and of columns of zeros left of it.
     margin: [usize; 2],
-    /// Columns and numbers of a small plane with its margins.
+    /// Number of columns and of cells of a small plane with its margins.
     framed_cols: usize,
     framed: usize,
 }
@@ -46,23 +48,25 @@ pub(crate) struct Conv {
 /// One position of the kernel.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
-    /// Index of the part that it reads.
+    /// Index of the part that the tap reads.
     part: usize,
-    /// Rows and columns by which its run is shifted in that part.
+    /// Offset of its run in that part, in rows and columns.
     shift: [usize; 2],
 }
 
 /// Buffers for the maps of one frame.
-pub(crate) struct Room {
+pub(crate) struct Buffers {
     large: Vec<f32>,
     small: Vec<f32>,
     /// The small map with channels last, `[cells, channels]`.
-    turned: Vec<f32>,
-    /// Results including the padding between rows.
+    channels_last: Vec<f32>,
+    /// Results with the padding between rows.
     wide: Vec<f32>,
 }
 
 impl Conv {
+    /// Creates a convolution and its index tables.
+    ///
     /// # Panics
     /// If the sizes of the two maps do not match the kernel, stride, padding and dilation.
     pub(crate) fn new(sizes: Sizes) -> Self {
@@ -74,7 +78,7 @@ impl Conv {
                 .map_or(0, |rest| rest / sizes.stride + 1);
             assert!(
                 n > 0 && n == sizes.small[axis + 1],
-                "sizes of a convolution: {sizes:?}"
+                "convolution: inconsistent sizes: {sizes:?}"
             );
         }
         let Sizes {
@@ -100,45 +104,46 @@ impl Conv {
         }
     }
 
-    /// Numbers of the weights.
+    /// Returns the number of weights.
     pub(crate) fn n_weights(&self) -> usize {
         self.sizes.small[0] * self.sizes.large[0] * self.taps.len()
     }
 
-    /// Cells of the large map.
+    /// Returns the number of cells of the large map.
     pub(crate) fn large_area(&self) -> usize {
         self.sizes.large[1] * self.sizes.large[2]
     }
 
-    /// Cells of the small map.
+    /// Returns the number of cells of the small map.
     pub(crate) fn small_area(&self) -> usize {
         self.sizes.small[1] * self.sizes.small[2]
     }
 
-    /// Returns the size of a split plane.
+    /// Returns the number of cells of a split plane, with padding.
     fn split(&self) -> usize {
         self.sizes.stride * self.sizes.stride * self.part[0] * self.part[1]
     }
 
-    pub(crate) fn room(&self) -> Room {
+    /// Allocates buffers for one frame.
+    pub(crate) fn buffers(&self) -> Buffers {
         let Sizes { large, small, .. } = self.sizes;
         let wide = (small[0] * small[1] * self.part[1]).max(large[0] * self.framed);
-        Room {
+        Buffers {
             large: vec![0.0; large[0] * self.split()],
             small: vec![0.0; small[0] * self.framed],
-            turned: vec![0.0; self.small_area() * small[0]],
+            channels_last: vec![0.0; self.small_area() * small[0]],
             wide: vec![0.0; wide],
         }
     }
 
-    /// Copies a large plane to an index; the zeros around it stay.
+    /// Copies a large plane to the buffer with an index. The zeros around it stay.
     #[inline(always)]
-    pub(crate) fn put_large(&self, room: &mut Room, index: usize, plane: &[f32]) {
+    pub(crate) fn put_large(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let Sizes {
             stride, padding, ..
         } = self.sizes;
         let [part_rows, part_cols] = self.part;
-        let to = &mut room.large[index * self.split()..][..self.split()];
+        let to = &mut buffers.large[index * self.split()..][..self.split()];
         for (row, from) in plane.chunks_exact(self.sizes.large[2]).enumerate() {
             let row = row + padding;
             let first = row % stride * stride * part_rows + row / stride;
@@ -155,9 +160,9 @@ impl Conv {
 
     /// Copies all planes of a large map.
     #[inline(always)]
-    pub(crate) fn put_all_large(&self, room: &mut Room, map: &[f32]) {
+    pub(crate) fn put_all_large(&self, buffers: &mut Buffers, map: &[f32]) {
         for (index, plane) in map.chunks_exact(self.large_area()).enumerate() {
-            self.put_large(room, index, plane);
+            self.put_large(buffers, index, plane);
         }
     }
 
@@ -166,34 +171,34 @@ impl Conv {
         [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
     }
 
-    /// Copies a small plane to an index; the zeros around it stay.
+    /// Copies a small plane to the buffer with an index. The zeros around it stay.
     #[inline(always)]
-    pub(crate) fn put_small(&self, room: &mut Room, index: usize, plane: &[f32]) {
+    pub(crate) fn put_small(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let cols = self.sizes.small[2];
         let first = self.margin[0] * self.framed_cols + self.margin[1];
-        let to = room.small[index * self.framed + first..].chunks_mut(self.framed_cols);
+        let to = buffers.small[index * self.framed + first..].chunks_mut(self.framed_cols);
         for (to, from) in to.zip(plane.chunks_exact(cols)) {
             to[..cols].copy_from_slice(from);
         }
     }
 
-    /// Copies a small plane, transposed to channels last, for [`Self::add_weight_gradient`]. Other channels keep the values of
-    /// earlier frames until [`Self::forget_turned`].
+    /// Copies a small plane, transposed to channels last, for [`Self::add_weight_gradient`]. Other channels keep the
+    /// values of earlier frames until [`Self::clear_transposed`].
     #[inline(always)]
-    pub(crate) fn turn_small(&self, room: &mut Room, channel: usize, plane: &[f32]) {
-        let to = room.turned[channel..]
+    pub(crate) fn transpose_small(&self, buffers: &mut Buffers, channel: usize, plane: &[f32]) {
+        let to = buffers.channels_last[channel..]
             .iter_mut()
             .step_by(self.sizes.small[0]);
         to.zip(plane).for_each(|(to, from)| *to = *from);
     }
 
-    /// Copies all planes of a small map like [`Self::turn_small`].
+    /// Copies all planes of a small map like [`Self::transpose_small`].
     #[inline(always)]
-    pub(crate) fn turn_all_small(&self, room: &mut Room, map: &[f32]) {
-        /// Cells per block, which fits into the first-level cache.
+    pub(crate) fn transpose_all_small(&self, buffers: &mut Buffers, map: &[f32]) {
+        /// Number of cells per block. A block fits into the first-level cache.
         const CELLS: usize = 64;
         let n = self.sizes.small[0];
-        for (block, to) in room.turned.chunks_mut(CELLS * n).enumerate() {
+        for (block, to) in buffers.channels_last.chunks_mut(CELLS * n).enumerate() {
             for (channel, plane) in map.chunks_exact(self.small_area()).enumerate() {
                 let to = to[channel..].iter_mut().step_by(n);
                 to.zip(&plane[block * CELLS..])
@@ -202,22 +207,23 @@ impl Conv {
         }
     }
 
+    /// Sets the transposed small map to 0.
     #[inline(always)]
-    pub(crate) fn forget_turned(&self, room: &mut Room) {
-        room.turned.fill(0.0);
+    pub(crate) fn clear_transposed(&self, buffers: &mut Buffers) {
+        buffers.channels_last.fill(0.0);
     }
 
     /// Returns the transposed small map, `[cells, channels]`.
-    pub(crate) fn turned<'a>(&self, room: &'a Room) -> &'a [f32] {
-        &room.turned
+    pub(crate) fn channels_last<'a>(&self, buffers: &'a Buffers) -> &'a [f32] {
+        &buffers.channels_last
     }
 
-    /// Computes the given small channels from the given large channels in `room`, and adds them to `out`.
+    /// Computes the given small channels from the given large channels in `buffers`, and adds them to `out`.
     #[inline(always)]
     pub(crate) fn down(
         &self,
         weights: &[f32],
-        room: &mut Room,
+        buffers: &mut Buffers,
         [large, small]: [&[usize]; 2],
         out: &mut [f32],
     ) {
@@ -232,9 +238,9 @@ impl Conv {
         let width = self.part[1];
         let to = steps(small.len(), rows * width);
         let left = left_factor(weights, small, &factors);
-        let right = right_factor(&room.large, &runs, (rows - 1) * width + cols);
-        product(&mut room.wide, &to, left, right);
-        let wide = room.wide.chunks_exact(rows * width);
+        let right = right_factor(&buffers.large, &runs, (rows - 1) * width + cols);
+        product(&mut buffers.wide, &to, left, right);
+        let wide = buffers.wide.chunks_exact(rows * width);
         for (out, wide) in out
             .chunks_exact_mut(rows * cols)
             .zip(wide)
@@ -245,12 +251,12 @@ impl Conv {
         }
     }
 
-    /// Computes the given large channels from the given small channels in `room`, and adds them to `out`.
+    /// Computes the given large channels from the given small channels in `buffers`, and adds them to `out`.
     #[inline(always)]
     pub(crate) fn up(
         &self,
         weights: &[f32],
-        room: &mut Room,
+        buffers: &mut Buffers,
         [large, small]: [&[usize]; 2],
         out: &mut [f32],
     ) {
@@ -258,7 +264,7 @@ impl Conv {
         let [channels, rows, cols] = self.sizes.large;
         let (n, width) = (self.sizes.small[0], self.framed_cols);
         if self.small_area() == 1 && self.sizes.padding == 0 && self.sizes.dilation == 1 {
-            return self.up_of_one_cell(weights, room, [large, small], out);
+            return self.up_of_one_cell(weights, buffers, [large, small], out);
         }
         let rows_of: Vec<usize> = large.iter().map(|channel| channel * n).collect();
         for part in 0..stride * stride {
@@ -279,12 +285,12 @@ impl Conv {
             }
             let to = steps(large.len(), n_rows * width);
             let left = left_factor(weights, &rows_of, &factors);
-            let right = right_factor(&room.small, &runs, (n_rows - 1) * width + n_cols);
-            product(&mut room.wide, &to, left, right);
+            let right = right_factor(&buffers.small, &runs, (n_rows - 1) * width + n_cols);
+            product(&mut buffers.wide, &to, left, right);
             let corner = |first: usize, rest: usize| first * stride + rest - self.sizes.padding;
             let top = corner(first_row, part / stride);
             let left = corner(first_col, part % stride);
-            let wide = room.wide.chunks_exact(n_rows * width);
+            let wide = buffers.wide.chunks_exact(n_rows * width);
             for (out, wide) in out
                 .chunks_exact_mut(rows * cols)
                 .zip(wide)
@@ -298,18 +304,18 @@ impl Conv {
         }
     }
 
-    /// Computes [`Self::up`] where the small map is one cell: each tap writes a different cell of the large map.
+    /// Computes [`Self::up`] for a small map of one cell. Each tap writes a different cell of the large map.
     fn up_of_one_cell(
         &self,
         weights: &[f32],
-        room: &Room,
+        buffers: &Buffers,
         [large, small]: [&[usize]; 2],
         out: &mut [f32],
     ) {
         let ([channels, _, cols], n) = (self.sizes.large, self.sizes.small[0]);
         let first = self.margin[0] * self.framed_cols + self.margin[1];
         let cell: Vec<f32> = (0..small.len())
-            .map(|index| room.small[index * self.framed + first])
+            .map(|index| buffers.small[index * self.framed + first])
             .collect();
         for (tap, weights) in weights.chunks_exact(channels * n).enumerate() {
             let at = tap / self.sizes.kernel[1] * cols + tap % self.sizes.kernel[1];
@@ -324,7 +330,8 @@ impl Conv {
         }
     }
 
-    /// Returns the first row (or column) inside the large plane among the rows with a remainder, and their number.
+    /// Returns the first row (or column) inside the large plane among the rows with the given remainder. Also returns
+    /// the number of such rows inside.
     fn inside(&self, remainder: usize, side: usize) -> (usize, usize) {
         let Sizes {
             stride, padding, ..
@@ -334,9 +341,10 @@ impl Conv {
         (first, end.saturating_sub(first))
     }
 
-    /// Adds the gradient of the weights, from the given large channels and the transposed small map in `room`.
+    /// Adds the gradient of the weights to `to`. It reads the given large channels and the transposed small map in
+    /// `buffers`.
     #[inline(always)]
-    pub(crate) fn add_weight_gradient(&self, room: &Room, large: &[usize], to: &mut [f32]) {
+    pub(crate) fn add_weight_gradient(&self, buffers: &Buffers, large: &[usize], to: &mut [f32]) {
         let ([n, rows, cols], width) = (self.sizes.small, self.part[1]);
         let (mut from, mut into) = (Vec::new(), Vec::new());
         for (index, channel) in large.iter().enumerate() {
@@ -347,19 +355,24 @@ impl Conv {
         }
         let cells = 0..rows * cols;
         let cells: Vec<usize> = cells.map(|at| at / cols * width + at % cols).collect();
-        let turned = steps(rows * cols, n);
-        let left = left_factor(&room.large, &from, &cells);
-        add_product(to, &into, left, right_factor(&room.turned, &turned, n));
+        let cell_rows = steps(rows * cols, n);
+        let left = left_factor(&buffers.large, &from, &cells);
+        add_product(
+            to,
+            &into,
+            left,
+            right_factor(&buffers.channels_last, &cell_rows, n),
+        );
     }
 
-    /// Returns where the run of a tap begins in a split plane.
+    /// Returns the start of a tap's run in a split plane.
     fn run(&self, tap: usize) -> usize {
         let Tap { part, shift } = self.taps[tap];
         (part * self.part[0] + shift[0]) * self.part[1] + shift[1]
     }
 }
 
-/// Copies every `n`th number.
+/// Copies every `n`th number of `from` to consecutive numbers of `to`.
 #[inline(always)]
 fn every(n: usize, from: &[f32], to: &mut [f32]) {
     #[inline(always)]
@@ -376,7 +389,7 @@ fn every(n: usize, from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// Adds to every `n`th number.
+/// Adds consecutive numbers to every `n`th number of `to`.
 #[inline(always)]
 fn add_to_every(n: usize, numbers: &[f32], to: &mut [f32]) {
     match n {

@@ -1,4 +1,4 @@
-//! What the operators share: tensors as slices, frames in parallel, results with gradients of their own.
+//! Common code of the operators: tensors as slices, parallel loops over frames, and tensors with custom gradients.
 
 use candle_core::{CpuStorage, CustomOp1, Device, Layout, Result, Shape, Storage, Tensor};
 use emberwatch_model::vectors::vectorised;
@@ -6,11 +6,11 @@ use rayon::prelude::*;
 use std::ops::{AddAssign, Deref, Range};
 use std::sync::Mutex;
 
-/// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
-/// their order: the number of threads changes no bit of the result.
+/// Maximum number of chunks of a window that are processed in parallel. Each chunk has separate sums, which are added
+/// in a fixed order, so the result does not depend on the number of threads.
 const N_CHUNKS: usize = 32;
 
-/// The numbers of a contiguous tensor on the CPU, which is locked meanwhile.
+/// Returns the numbers of a contiguous tensor on the CPU. The tensor is locked until the result is dropped.
 pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
     let (storage, layout) = tensor.storage_and_layout();
     let range = match (&*storage, layout.contiguous_offsets()) {
@@ -20,7 +20,7 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_
     Ok(Numbers { storage, range })
 }
 
-/// As [`numbers`], of what an operator is given.
+/// Like [`numbers`], for the arguments of a candle operator.
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     match (storage, layout.contiguous_offsets()) {
         (CpuStorage::F32(numbers), Some((start, end))) => Ok(&numbers[start..end]),
@@ -39,13 +39,13 @@ impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
     fn deref(&self) -> &[f32] {
         match &*self.storage {
             Storage::Cpu(CpuStorage::F32(numbers)) => &numbers[self.range.clone()],
-            _ => unreachable!("invariant: `numbers` has looked"),
+            _ => unreachable!("invariant: `numbers` has checked the storage"),
         }
     }
 }
 
-/// A tensor of numbers that were computed from some others, whose gradients `backward` computes from its
-/// own, one after the other.
+/// Creates a tensor from numbers that were computed from the tensors `from`. `backward` converts the gradient of the
+/// result to the gradients of these tensors, concatenated in their order.
 pub(crate) fn derived(
     from: &[&Tensor],
     shape: impl Into<Shape>,
@@ -63,7 +63,7 @@ pub(crate) fn derived(
 
 struct Derived<F> {
     shape: Shape,
-    /// Until they are in the tensor.
+    /// The numbers, until the forward pass moves them into the tensor.
     numbers: Mutex<Vec<f32>>,
     backward: F,
 }
@@ -74,7 +74,10 @@ impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
     }
 
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
-        let mut numbers = self.numbers.lock().expect("invariant: nobody panics here");
+        let mut numbers = self
+            .numbers
+            .lock()
+            .expect("invariant: no thread panics with the lock");
         let numbers = std::mem::take(&mut *numbers);
         Ok((CpuStorage::F32(numbers), self.shape.clone()))
     }
@@ -86,21 +89,21 @@ impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
     }
 }
 
-/// Numbers of all frames, in chunks of frames.
+/// The numbers of all frames, in chunks of consecutive frames.
 pub(crate) struct Frames {
     chunks: Vec<Chunk>,
-    /// Frames of a chunk.
+    /// Number of frames per chunk.
     length: usize,
 }
 
 struct Chunk {
     numbers: Vec<f32>,
-    /// Where each frame's numbers end.
+    /// The end of each frame's numbers.
     ends: Vec<usize>,
 }
 
-/// Calls `f(sums, frame, its numbers)` for all frames, whose `n(frame)` numbers are zeros at first; returns the
-/// numbers, and the sums of each chunk of frames.
+/// Calls `f(sums, frame, numbers)` for all frames, with `n(frame)` numbers that are initially 0. Returns the numbers,
+/// and the sums of each chunk of frames.
 pub(super) fn frames<A: Send>(
     n_frames: usize,
     n: impl Fn(usize) -> usize + Sync,
@@ -133,7 +136,7 @@ pub(super) fn frames<A: Send>(
 }
 
 impl Frames {
-    /// Frames of as many numbers each.
+    /// Splits numbers into frames of equal length.
     pub(crate) fn of(n_frames: usize, numbers: &[f32]) -> Self {
         let n = numbers.len() / n_frames;
         let copy = |_: &mut (), frame: usize, to: &mut [f32]| {
@@ -142,7 +145,7 @@ impl Frames {
         frames(n_frames, |_| n, || (), copy).0
     }
 
-    /// A frame's numbers.
+    /// Returns the numbers of a frame.
     #[inline(always)]
     pub(super) fn frame(&self, frame: usize) -> &[f32] {
         let (chunk, at) = (&self.chunks[frame / self.length], frame % self.length);
@@ -150,7 +153,7 @@ impl Frames {
         &chunk.numbers[start..chunk.ends[at]]
     }
 
-    /// All numbers.
+    /// Returns the numbers of all frames.
     pub(crate) fn concat(mut self) -> Vec<f32> {
         match self.chunks.len() {
             1 => self.chunks.remove(0).numbers,
@@ -162,7 +165,7 @@ impl Frames {
     }
 }
 
-/// Adds the chunks' sums, in their order.
+/// Adds the sums of all chunks, in their order.
 pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>) -> Vec<T> {
     let mut sums = sums.into_iter();
     let mut total = sums.next().unwrap_or_default();
@@ -172,7 +175,7 @@ pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>)
     total
 }
 
-/// `to += numbers`.
+/// Computes `to += numbers`.
 #[inline(always)]
 pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
     for (to, number) in to.iter_mut().zip(numbers) {
@@ -180,7 +183,7 @@ pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
     }
 }
 
-/// `to += factor numbers`.
+/// Computes `to += factor numbers`.
 #[inline(always)]
 pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     for (to, number) in to.iter_mut().zip(numbers) {
@@ -188,7 +191,7 @@ pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     }
 }
 
-/// The sum in sixteen lanes.
+/// Returns the sum, computed in sixteen lanes.
 #[inline(always)]
 pub(super) fn sum(numbers: &[f32]) -> f32 {
     let (numbers, rest) = numbers.as_chunks::<16>();

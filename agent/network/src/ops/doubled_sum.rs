@@ -1,12 +1,12 @@
-//! An image that is doubled by repeating its cells, the sum with another, and ReLU as one operator, for 32-bit floats on
-//! the CPU.
+//! Upsampling of an image by a factor of 2, sum with another image, and ReLU as one operator, for 32-bit floats on the
+//! CPU. Upsampling repeats each cell.
 
 use super::cpu::{numbers, slice};
 use candle_core::{CpuStorage, CustomOp2, Device, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-/// Arguments: images `[batch, channels, rows, cols]` and `[batch, channels, 2 rows, 2 cols]`; the result is like the
-/// second.
+/// The operator. Its arguments are images `[batch, channels, rows, cols]` and `[batch, channels, 2 rows, 2 cols]`. The
+/// result has the shape of the second.
 pub(crate) struct DoubledSum;
 
 impl CustomOp2 for DoubledSum {
@@ -24,7 +24,7 @@ impl CustomOp2 for DoubledSum {
         let (batch, channels, rows, cols) = small_layout.shape().dims4()?;
         if large_layout.shape().dims() != [batch, channels, 2 * rows, 2 * cols] {
             let got = large_layout.shape();
-            bail!("expected an image of twice {rows} x {cols} cells, got {got:?}");
+            bail!("image: expected twice {rows} x {cols} cells, got {got:?}");
         }
         let (small, mut sum) = (
             slice(small, small_layout)?,

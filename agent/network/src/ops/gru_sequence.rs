@@ -1,4 +1,4 @@
-//! A GRU over a sequence as one operator, from what its inputs add to the gates.
+//! A GRU over a sequence as one operator. Its arguments are the inputs' contributions to the gates.
 
 use super::cpu::{add, add_scaled, derived, numbers};
 use candle_core::{Result, Tensor};
@@ -9,14 +9,15 @@ struct Gru {
     n: usize,
     /// `W_hh [3 n, n]`.
     w: Vec<f32>,
-    /// `h` before each step, and behind the last.
+    /// `h` before each step, and after the last.
     h: Vec<f32>,
-    /// What each step computes: r, z, the candidate and `W_hn h + b_hn`.
+    /// Intermediate results of each step: r, z, the candidate and `W_hn h + b_hn`.
     steps: Vec<f32>,
 }
 
-/// `h` of all steps, `[steps, n]`, from the one before the first. Arguments: `W_ih x + b_ih` of all steps
-/// `[steps, 3 n]`, `W_hh [3 n, n]` and `b_hh [3 n]`, gates in torch's order (r, z, n).
+/// Computes `h` after each step, `[steps, n]`. `first` is `h` before the first step. The other arguments are
+/// `W_ih x + b_ih` of all steps `[steps, 3 n]`, `W_hh [3 n, n]` and `b_hh [3 n]`, with the gates in PyTorch's order (r,
+/// z, n).
 pub(crate) fn gru_sequence(
     inputs: &Tensor,
     w: &Tensor,
@@ -75,7 +76,7 @@ impl Gru {
         }
     }
 
-    /// Gradients of the inputs, `W_hh` and `b_hh`.
+    /// Computes the gradients of the inputs, `W_hh` and `b_hh`, concatenated.
     #[inline(always)]
     fn backward(&self, d_out: &[f32]) -> Vec<f32> {
         let n = self.n;

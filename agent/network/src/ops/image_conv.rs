@@ -1,6 +1,6 @@
 //! A convolution of images with bias, ReLU and residual as one operator, for 32-bit floats on the CPU.
 
-use super::conv::{Conv, Room, Sizes};
+use super::conv::{Buffers, Conv, Sizes};
 use super::cpu::{add, numbers, slice, total};
 use candle_core::{CpuStorage, CustomOp3, Device, Layout, Result, Shape, Tensor, bail};
 use emberwatch_model::vectors::vectorised;
@@ -21,7 +21,7 @@ pub(crate) struct ImageConv {
     pub(crate) kernel: usize,
     pub(crate) stride: usize,
     pub(crate) dilation: usize,
-    /// Whether negative results become 0.
+    /// Whether ReLU follows, which replaces negative results by 0.
     pub(crate) relu: bool,
 }
 
@@ -31,12 +31,12 @@ impl ImageConv {
         x.apply_op3(weights, bias, Call::new(self, false))
     }
 
-    /// Applies the convolution, and adds the image after ReLU. The result must have the image's shape.
+    /// Applies the convolution with ReLU, and adds the image. The result must have the image's shape.
     pub(crate) fn residual(self, x: &Tensor, weights: &Tensor, bias: &Tensor) -> Result<Tensor> {
         x.apply_op3(weights, bias, Call::new(self, true))
     }
 
-    /// The batch, and the convolution.
+    /// Returns the batch size, and the convolution for the given shapes.
     fn conv(&self, x: &Shape, weights: &Shape) -> Result<(usize, Conv)> {
         let (batch, channels, rows, cols) = x.dims4()?;
         let (patch, n) = weights.dims2()?;
@@ -47,7 +47,7 @@ impl ImageConv {
             ..
         } = *self;
         if patch != kernel * kernel * channels || rows % stride + cols % stride > 0 {
-            bail!("weights {weights:?} or stride {stride} do not fit images {x:?}");
+            bail!("weights {weights:?} or stride {stride} do not fit images of shape {x:?}");
         }
         let sizes = Sizes {
             large: [channels, rows, cols],
@@ -61,11 +61,11 @@ impl ImageConv {
     }
 }
 
-/// One use of the operator.
+/// One call of the operator.
 struct Call {
     conv: ImageConv,
     adds_image: bool,
-    /// Whether ReLU passed each result. It cannot be derived from the output of a residual layer.
+    /// Whether each result passed ReLU. The output of a residual layer does not reveal it.
     kept: OnceLock<Vec<bool>>,
 }
 
@@ -78,7 +78,7 @@ impl Call {
         }
     }
 
-    /// ReLU, and the sum with the image.
+    /// Applies ReLU, and adds the image.
     #[inline(always)]
     fn finish(&self, x: &[f32], y: &mut [f32], kept: &mut [bool]) {
         if self.conv.relu {
@@ -120,7 +120,7 @@ impl CustomOp3 for Call {
         let [n, rows, cols] = conv.sizes.small;
         if self.adds_image && conv.sizes.large != conv.sizes.small {
             bail!(
-                "expected a result like the image, to which it is added, got {:?}",
+                "residual convolution: expected a result with the image's shape, got {:?}",
                 conv.sizes
             );
         }
@@ -129,29 +129,29 @@ impl CustomOp3 for Call {
         let [large, small] = conv.channels();
         let mut y = vec![0.0; batch * n * rows * cols];
         let mut kept = vec![false; y.len()];
-        let image = |room: &mut Room, ((x, y), kept): ((&[f32], &mut [f32]), &mut [bool])| {
+        let image = |buffers: &mut Buffers, ((x, y), kept): ((&[f32], &mut [f32]), &mut [bool])| {
             vectorised(
                 #[inline(always)]
                 || {
-                    conv.put_all_large(room, x);
+                    conv.put_all_large(buffers, x);
                     for (plane, bias) in y.chunks_exact_mut(rows * cols).zip(bias) {
                         plane.fill(*bias);
                     }
-                    conv.down(weights, room, [&large, &small], y);
+                    conv.down(weights, buffers, [&large, &small], y);
                     self.finish(x, y, kept);
                 },
             );
         };
         let (n_x, n_y) = (x.len() / batch, y.len() / batch);
         if batch == 1 {
-            // Handing it to another thread costs more than it gains.
-            image(&mut conv.room(), ((x, &mut y), &mut kept));
+            // For a single image, another thread costs more than it saves.
+            image(&mut conv.buffers(), ((x, &mut y), &mut kept));
         } else {
             let results = x.par_chunks(n_x).zip(y.par_chunks_mut(n_y));
             let results = results.zip(kept.par_chunks_mut(n_y));
-            results.for_each_init(|| conv.room(), image);
+            results.for_each_init(|| conv.buffers(), image);
         }
-        // A second use of the same call would be another forward pass, which candle does not make.
+        // Set once: candle runs the forward pass of a call only once.
         self.kept.get_or_init(|| kept);
         Ok((CpuStorage::F32(y), (batch, n, rows, cols).into()))
     }
@@ -170,10 +170,10 @@ impl CustomOp3 for Call {
         let kept = self.kept.get().expect("invariant: the result came first");
         let (n_x, n_y) = (x_numbers.len() / batch, dy.len() / batch);
         let mut dx = vec![0.0; x_numbers.len()];
-        let mut turned = vec![0.0; dy.len()];
+        let mut channels_last = vec![0.0; dy.len()];
         let images = x_numbers.par_chunks(n_x).zip(kept.par_chunks(n_y));
         let gradients = dy.par_chunks(n_y).zip(dx.par_chunks_mut(n_x));
-        let images = images.zip(gradients.zip(turned.par_chunks_mut(n_y)));
+        let images = images.zip(gradients.zip(channels_last.par_chunks_mut(n_y)));
         let back = Back {
             call: self,
             conv: &conv,
@@ -182,11 +182,11 @@ impl CustomOp3 for Call {
             of_image: x.track_op(),
         };
         let images = images.map_init(
-            || conv.room(),
-            |room, ((x, kept), ((dy, dx), turned))| {
+            || conv.buffers(),
+            |buffers, ((x, kept), ((dy, dx), channels_last))| {
                 vectorised(
                     #[inline(always)]
-                    || back.image(room, [x, dy], kept, dx, turned),
+                    || back.image(buffers, [x, dy], kept, dx, channels_last),
                 )
             },
         );
@@ -195,7 +195,7 @@ impl CustomOp3 for Call {
         let d_weights = d_weights
             .chunks(n)
             .map(|images| total(images.iter().cloned()));
-        let d_bias = turned.par_chunks(n_y * n).map(|images| {
+        let d_bias = channels_last.par_chunks(n_y * n).map(|images| {
             let mut sum = vec![0.0; conv.sizes.small[0]];
             images
                 .chunks(sum.len())
@@ -213,38 +213,39 @@ impl CustomOp3 for Call {
     }
 }
 
-/// What the gradients of an image need.
+/// The common inputs of the gradients of all images.
 struct Back<'a> {
     call: &'a Call,
     conv: &'a Conv,
     weights: &'a [f32],
+    /// Whether the gradient of the image is needed.
     of_image: bool,
 }
 
 impl Back<'_> {
-    /// Writes the gradient `dx` of an image, and the gradient before ReLU, `[cells, channels]`, to `turned`. Returns the
-    /// gradient of the weights.
+    /// Writes the gradient `dx` of an image, and the gradient before ReLU, `[cells, channels]`, to `channels_last`.
+    /// Returns the gradient of the weights.
     #[inline(always)]
     fn image(
         &self,
-        room: &mut Room,
+        buffers: &mut Buffers,
         [x, dy]: [&[f32]; 2],
         kept: &[bool],
         dx: &mut [f32],
-        turned: &mut [f32],
+        channels_last: &mut [f32],
     ) -> Vec<f32> {
         let (conv, [large, small]) = (self.conv, self.conv.channels());
         let dz = self.call.gradient_before_relu(kept, dy);
-        conv.put_all_large(room, x);
-        conv.turn_all_small(room, &dz);
-        turned.copy_from_slice(conv.turned(room));
+        conv.put_all_large(buffers, x);
+        conv.transpose_all_small(buffers, &dz);
+        channels_last.copy_from_slice(conv.channels_last(buffers));
         let mut d_weights = vec![0.0; conv.n_weights()];
-        conv.add_weight_gradient(room, &large, &mut d_weights);
+        conv.add_weight_gradient(buffers, &large, &mut d_weights);
         if self.of_image {
             for (index, plane) in dz.chunks_exact(conv.small_area()).enumerate() {
-                conv.put_small(room, index, plane);
+                conv.put_small(buffers, index, plane);
             }
-            conv.up(self.weights, room, [&large, &small], dx);
+            conv.up(self.weights, buffers, [&large, &small], dx);
             if self.call.adds_image {
                 add(dx, dy);
             }
@@ -269,14 +270,15 @@ mod tests {
             .expect("numbers")
     }
 
-    /// The largest difference, in parts of the largest number.
+    /// Returns the largest difference, relative to the largest number.
     fn off(got: &Tensor, expected: &Tensor) -> Result<f64> {
         let got = got.to_dtype(DType::F64)?;
         let largest = |tensor: &Tensor| tensor.abs()?.max_all()?.to_scalar::<f64>();
         Ok(largest(&(got - expected)?)? / largest(expected)?)
     }
 
-    /// The operator in 32 bits and candle's layers in 64: results, and gradients of their sum with random weights.
+    /// Compares the operator in 32 bits with candle's layers in 64 bits: the results, and the gradients of their sum
+    /// with random weights.
     fn check(conv: ImageConv, batch: usize, n: usize) -> Result<()> {
         let ImageConv {
             kernel,
@@ -286,7 +288,7 @@ mod tests {
         } = conv;
         let (x, bias) = (random(&[batch, 7, 8, 12], 1), random(&[n], 2));
         let weights = random(&[kernel * kernel * 7, n], 3);
-        // A result, so that its gradient is computed.
+        // An intermediate result, so that candle computes its gradient.
         let image = (x.as_tensor() * 1.0)?;
         let got = conv.apply(&image, &weights, &bias)?;
         let vars = [x, weights, bias];
@@ -340,7 +342,7 @@ mod tests {
             dilation: 1,
             relu: true,
         };
-        // Then an odd side, and other channels.
+        // The second image has an odd side, and the third has another number of channels.
         for (x, is_refused) in [
             ([1, 2, 4, 4], false),
             ([1, 2, 5, 4], true),

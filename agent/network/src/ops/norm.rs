@@ -2,21 +2,21 @@
 
 use super::cpu::total;
 
-/// Added to the variance, as PyTorch does.
+/// Added to the variance, as in PyTorch.
 pub(crate) const EPSILON: f64 = 1e-5;
 
 /// Mean and variance of each channel, over all frames and positions.
 #[derive(Debug, Clone)]
 pub(crate) struct Moments {
     pub(crate) mean: Vec<f64>,
-    /// Of the population: divided by the number of values.
+    /// The population variance, divided by the number of values.
     pub(crate) variance: Vec<f64>,
-    /// Values per channel.
+    /// Number of values per channel.
     pub(crate) count: f64,
 }
 
 impl Moments {
-    /// From sums of values and of their squares, both before they are multiplied with `scale`.
+    /// Computes moments from sums of values and of their squares, both before the multiplication by `scale`.
     pub(super) fn new(sums: &Sums, scale: f32, count: usize) -> Self {
         let (scale, count) = (f64::from(scale), count as f64);
         let mean: Vec<f64> = sums.first.iter().map(|sum| scale * sum / count).collect();
@@ -30,14 +30,14 @@ impl Moments {
     }
 }
 
-/// Sums over all positions, per channel: of `dy` and `dy z` in the backward pass, of `z` and `z^2` for moments.
+/// Sums over all positions, per channel. The backward pass sums `dy` and `dy z`, and moments sum `z` and `z^2` instead.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
-    /// Of `dy` at kept positions.
+    /// The sum of `dy` at kept positions.
     pub(super) first: Vec<f64>,
-    /// Of `dy z` at kept positions.
+    /// The sum of `dy z` at kept positions.
     pub(super) with_z: Vec<f64>,
-    /// Of `dy` at lost positions.
+    /// The sum of `dy` at dropped positions.
     pub(super) lost: Vec<f64>,
 }
 
@@ -60,7 +60,7 @@ impl Sums {
         f: impl Fn(f32, f32) -> [f32; 2],
     ) {
         const LANES: usize = 16;
-        // Sums in 32 bits are short: a variance is a difference of two, so longer ones lose digits.
+        // Keep 32-bit sums short: a variance is a difference of two sums, and long sums have large rounding errors.
         for (a, b) in a.chunks(16 * LANES).zip(b.chunks(16 * LANES)) {
             let (mut first, mut second) = ([0.0_f32; LANES], [0.0_f32; LANES]);
             let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
@@ -91,27 +91,27 @@ impl Sums {
     }
 }
 
-/// A normalisation whose moments are known. At kept positions `y = a z + b`; at lost ones `y = b`.
+/// A normalisation with known moments. `y = a z + b` at kept positions, and `y = b` at dropped positions.
 pub(super) struct Norm {
     pub(super) a: Vec<f32>,
     pub(super) b: Vec<f32>,
     gamma: Vec<f64>,
-    /// One by the deviation.
+    /// The inverse of the standard deviation.
     inverse: Vec<f64>,
     moments: Moments,
     scale: f64,
 }
 
-/// What the backward pass gives.
+/// The result of the backward pass.
 pub(super) struct NormGradient {
     pub(super) gamma: Vec<f32>,
     pub(super) beta: Vec<f32>,
-    /// Per channel `[p, q, r]` with `dz = p dy + q z + r` at kept positions.
+    /// For each channel, the coefficients `[p, q, r]` of `dz = p dy + q z + r` at kept positions.
     pub(super) terms: Vec<[f32; 3]>,
 }
 
 impl Norm {
-    /// From `[gamma, beta]`, and what dropout multiplies kept values with.
+    /// Creates a normalisation from `[gamma, beta]`, moments, and the factor by which dropout scales kept values.
     pub(super) fn new([gamma, beta]: [&[f32]; 2], moments: Moments, scale: f32) -> Self {
         let scale = f64::from(scale);
         let inverse = moments.variance.iter();

@@ -1,8 +1,9 @@
-//! Products of small matrices whose numbers lie anywhere, as those of kept channels do: nothing is copied.
+//! Products of small matrices whose rows lie at arbitrary offsets, such as the planes of kept channels. Nothing is
+//! copied.
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// The left factor: the number of a row and a term lies at `rows[row] + terms[term]`.
+/// The left factor of a product. The number in a row for a term is at index `rows[row] + terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Left<'a> {
     numbers: &'a [f32],
@@ -10,16 +11,16 @@ pub(super) struct Left<'a> {
     terms: &'a [usize],
 }
 
-/// The right factor: the row of a term begins at `terms[term]`.
+/// The right factor of a product. The row of a term starts at index `terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Right<'a> {
     numbers: &'a [f32],
     terms: &'a [usize],
-    /// Numbers of a row.
+    /// Length of a row.
     cols: usize,
 }
 
-/// A left factor of its numbers, rows and terms.
+/// Creates a left factor.
 pub(super) fn left_factor<'a>(
     numbers: &'a [f32],
     rows: &'a [usize],
@@ -32,7 +33,7 @@ pub(super) fn left_factor<'a>(
     }
 }
 
-/// A right factor of its numbers, terms and the numbers of a row.
+/// Creates a right factor with rows of length `cols`.
 pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usize) -> Right<'a> {
     Right {
         numbers,
@@ -41,36 +42,50 @@ pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usi
     }
 }
 
-/// Multiples of `step`: where the rows of a matrix begin.
+/// Returns the first `n` multiples of `step`, the offsets of a contiguous matrix's rows.
 pub(super) fn steps(n: usize, step: usize) -> Vec<usize> {
     (0..n).map(|at| at * step).collect()
 }
 
-/// `out = left right`; each row of `out` begins at one of `rows`.
+/// Computes `out = left right`. `rows` has the start of each row in `out`.
 ///
 /// # Panics
-/// If a number lies outside its slice.
+/// If an index is outside its slice.
 pub(super) fn product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
     compute(out, rows, left, right, false);
 }
 
-/// `out += left right`, as [`product`].
+/// Computes `out += left right`, like [`product`].
 pub(super) fn add_product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
     compute(out, rows, left, right, true);
 }
 
 fn compute(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>, adds: bool) {
-    // What lies behind the last number of some places.
+    // One more than the largest offset.
     let end = |places: &[usize]| places.iter().max().map_or(0, |last| last + 1);
     let (n_left, n_right) = (end(left.rows) + end(left.terms), end(right.terms));
-    assert_eq!(rows.len(), left.rows.len(), "rows of a product");
-    assert_eq!(left.terms.len(), right.terms.len(), "terms of a product");
-    assert!(n_left <= left.numbers.len() + 1, "left factor");
+    assert_eq!(
+        rows.len(),
+        left.rows.len(),
+        "product: rows of the result and of the left factor"
+    );
+    assert_eq!(
+        left.terms.len(),
+        right.terms.len(),
+        "product: terms of the two factors"
+    );
+    assert!(
+        n_left <= left.numbers.len() + 1,
+        "product: index outside the left factor"
+    );
     assert!(
         n_right + right.cols <= right.numbers.len() + 1,
-        "right factor"
+        "product: index outside the right factor"
     );
-    assert!(end(rows) + right.cols <= out.len() + 1, "product");
+    assert!(
+        end(rows) + right.cols <= out.len() + 1,
+        "product: index outside the result"
+    );
     Arch::new().dispatch(Call {
         out,
         rows,
@@ -80,13 +95,13 @@ fn compute(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>, ad
     });
 }
 
-/// A product whose places are checked.
+/// A product whose indices are checked.
 struct Call<'a> {
     out: &'a mut [f32],
     rows: &'a [usize],
     left: Left<'a>,
     right: Right<'a>,
-    /// Whether the product is added to what is there.
+    /// Whether the product is added to the previous numbers.
     adds: bool,
 }
 
@@ -98,9 +113,9 @@ impl WithSimd for Call<'_> {
         let (cols, wide) = (self.right.cols, 2 * S::F32_LANES);
         let whole = cols / wide * wide;
         for col in (0..whole).step_by(wide) {
-            // AVX2 has 16 registers, others of its kind 32.
-            let most = if S::F32_LANES == 8 { 6 } else { 8 };
-            self.columns::<S, 2, true>(simd, col, most);
+            // AVX2 has 16 vector registers, the other instruction sets have 32.
+            let max_rows = if S::F32_LANES == 8 { 6 } else { 8 };
+            self.columns::<S, 2, true>(simd, col, max_rows);
         }
         for col in (whole..cols).step_by(S::F32_LANES) {
             if col + S::F32_LANES <= cols {
@@ -113,16 +128,16 @@ impl WithSimd for Call<'_> {
 }
 
 impl Call<'_> {
-    /// `VECTORS` vectors of columns, in blocks of nearly as many rows, `most` or less.
+    /// Computes `VECTORS` vectors of columns, in blocks of at most `max_rows` rows and nearly equal size.
     #[inline(always)]
     fn columns<S: Simd, const VECTORS: usize, const WHOLE: bool>(
         &mut self,
         simd: S,
         col: usize,
-        most: usize,
+        max_rows: usize,
     ) {
         let n_rows = self.rows.len();
-        let n_blocks = n_rows.div_ceil(most).max(1);
+        let n_blocks = n_rows.div_ceil(max_rows).max(1);
         for block in 0..n_blocks {
             let first = n_rows * block / n_blocks;
             match n_rows * (block + 1) / n_blocks - first {
@@ -139,11 +154,11 @@ impl Call<'_> {
         }
     }
 
-    /// `ROWS` rows, whose sums stay in registers. The vectors are whole, or the row ends in the last.
+    /// Computes a block of `ROWS` rows, whose sums stay in registers. With `WHOLE`, all vectors are inside the row.
     #[inline(always)]
     #[expect(
         unsafe_code,
-        reason = "checks in the innermost loop take as long as it"
+        reason = "bounds checks would double the time of the innermost loop"
     )]
     fn block<S: Simd, const ROWS: usize, const VECTORS: usize, const WHOLE: bool>(
         &mut self,
@@ -155,7 +170,7 @@ impl Call<'_> {
         let vector = Vector::<WHOLE>(self.right.cols - col);
         let mut left = [self.left.numbers.as_ptr(); ROWS];
         for (left, row) in left.iter_mut().zip(&self.left.rows[first..]) {
-            // SAFETY: `compute` has checked all places.
+            // SAFETY: `compute` has checked all indices.
             *left = unsafe { left.add(*row) };
         }
         let mut sums = [[simd.splat_f32s(0.0); VECTORS]; ROWS];
@@ -187,13 +202,13 @@ impl Call<'_> {
     }
 }
 
-/// How vectors are read and written: whole, or only so many numbers.
+/// Access to a vector in memory. With `WHOLE`, reads and writes all lanes. Otherwise only the given number of lanes.
 #[derive(Clone, Copy)]
 struct Vector<const WHOLE: bool>(usize);
 
 #[expect(
     unsafe_code,
-    reason = "only `Call::block` uses it, where its places are checked"
+    reason = "only `Call::block` uses it, with checked indices"
 )]
 impl<const WHOLE: bool> Vector<WHOLE> {
     #[inline(always)]
@@ -232,7 +247,7 @@ mod tests {
             let numbers = |n: usize, step: usize| -> Vec<f32> {
                 (0..n).map(|i| (i * step % 11) as f32 - 5.0).collect()
             };
-            // Rows in reverse order, two numbers apart.
+            // Rows in reverse order, with gaps.
             let rows: Vec<usize> = steps(n_rows, 2 * n_terms).into_iter().rev().collect();
             let to: Vec<usize> = steps(n_rows, cols + 2).into_iter().rev().collect();
             let (left_terms, right_terms) = (steps(n_terms, 2), steps(n_terms, cols + 1));

@@ -1,11 +1,11 @@
 //! One convolution of a chain over all frames, with its gradients.
 //!
-//! Between the passes over the frames only the convolutions' results are kept; activations are computed again. As a convolution
-//! is linear, `conv(x) = conv(x - floors) + conv(floors)`: in the first term dropped channels are zero and are skipped, and
-//! the second is the same for all frames and computed once. Gradients follow the same split.
+//! Only the convolutions' results are stored between the passes over the frames. Activations are recomputed. A
+//! convolution is linear, so `conv(x) = conv(x - floors) + conv(floors)`. In the first term, dropped channels are zero
+//! and are skipped. The second term is the same for all frames and is computed once. Gradients follow the same split.
 
 use super::activation::{Activation, Order, ResultGradient};
-use super::conv::{Conv, Room};
+use super::conv::{Buffers, Conv};
 use super::cpu::{Frames, add, derived, frames, numbers, sum, total};
 use super::norm::{Norm, Sums};
 use crate::dropout::Mask;
@@ -14,14 +14,14 @@ use candle_core::{Result, Tensor};
 /// The arguments of one convolution and of the normalisation before it.
 pub(crate) struct Layer<'a> {
     pub(crate) conv: Conv,
-    /// Whether it is a transposed convolution, from small maps to large ones.
+    /// Whether the convolution is transposed, from small maps to large ones.
     pub(crate) transposed: bool,
     /// `[kernel rows * kernel cols * large channels, small channels]`.
     pub(crate) weights: Tensor,
     pub(crate) bias: Option<&'a Tensor>,
     /// Gamma and beta; `None` for the encoder's first layer.
     pub(crate) norm: Option<[&'a Tensor; 2]>,
-    /// Dropout of the result.
+    /// Dropout mask of the result.
     pub(crate) output: &'a Mask,
 }
 
@@ -39,7 +39,7 @@ pub(super) struct Stage {
 
 /// Gradients summed over frames, and buffers for one frame.
 pub(super) struct Gradients {
-    room: Room,
+    buffers: Buffers,
     plane: Vec<f32>,
     d_out: Vec<f32>,
     dx: Vec<f32>,
@@ -68,10 +68,10 @@ impl Stage {
             planes.for_each(|(plane, bias)| plane.fill(*bias));
         }
         if !stage.before.mask.keeps_all() {
-            let mut room = stage.conv.room();
-            stage.put_floors(&mut room);
+            let mut buffers = stage.conv.buffers();
+            stage.put_floors(&mut buffers);
             let (weights, [inputs, outputs]) = (numbers(&stage.weights)?, stage.all_channels());
-            stage.convolve(&weights, &mut room, &inputs, &outputs, &mut start);
+            stage.convolve(&weights, &mut buffers, &inputs, &outputs, &mut start);
         }
         stage.start = start;
         Ok(stage)
@@ -97,62 +97,63 @@ impl Stage {
         }
     }
 
-    /// Puts a plane where [`Self::convolve`] reads it.
+    /// Copies an input plane to the buffer that [`Self::convolve`] reads.
     #[inline(always)]
-    fn put(&self, room: &mut Room, index: usize, plane: &[f32]) {
+    fn put(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         if self.transposed {
-            self.conv.put_small(room, index, plane);
+            self.conv.put_small(buffers, index, plane);
         } else {
-            self.conv.put_large(room, index, plane);
+            self.conv.put_large(buffers, index, plane);
         }
     }
 
-    /// Puts the floors there, as one frame.
-    fn put_floors(&self, room: &mut Room) {
+    /// Copies the floors to the buffers, as if they were one frame.
+    fn put_floors(&self, buffers: &mut Buffers) {
         let mut plane = vec![0.0; self.areas()[0]];
         for (channel, floor) in self.before.floors.iter().enumerate() {
             plane.fill(*floor);
-            self.put(room, channel, &plane);
+            self.put(buffers, channel, &plane);
             if self.transposed {
-                self.conv.turn_small(room, channel, &plane);
+                self.conv.transpose_small(buffers, channel, &plane);
             }
         }
     }
 
-    /// Adds the convolution of the `inputs` in `room` to the `outputs`.
+    /// Adds the convolution of the `inputs` in `buffers` to the `outputs`.
     #[inline(always)]
     fn convolve(
         &self,
         weights: &[f32],
-        room: &mut Room,
+        buffers: &mut Buffers,
         inputs: &[usize],
         outputs: &[usize],
         out: &mut [f32],
     ) {
         if self.transposed {
-            self.conv.up(weights, room, [outputs, inputs], out);
+            self.conv.up(weights, buffers, [outputs, inputs], out);
         } else {
-            self.conv.down(weights, room, [inputs, outputs], out);
+            self.conv.down(weights, buffers, [inputs, outputs], out);
         }
     }
 
-    /// Computes a frame's activations, and calls `put(room, index, channel, plane)` with each plane.
+    /// Computes a frame's activations, and calls `put(buffers, index, channel, plane)` with each plane.
     #[inline(always)]
     fn read(
         &self,
         (z, frame): (&Frames, usize),
-        (plane, room): (&mut [f32], &mut Room),
-        put: impl Fn(&mut Room, usize, usize, &[f32]),
+        (plane, buffers): (&mut [f32], &mut Buffers),
+        put: impl Fn(&mut Buffers, usize, usize, &[f32]),
     ) {
         let planes = z.frame(frame).chunks_exact(plane.len());
         let kept = self.before.mask.kept(frame).iter();
         for (index, (channel, z)) in kept.zip(planes).enumerate() {
             self.before.apply(*channel, z, plane);
-            put(room, index, *channel, plane);
+            put(buffers, index, *channel, plane);
         }
     }
 
-    /// Returns the results of all frames, and their sums for a next normalisation of this order.
+    /// Computes the results of all frames, and their sums for the next normalisation. `order` is the order of ReLU and
+    /// that normalisation.
     pub(super) fn forward(&self, z: &Frames, order: Order) -> Result<(Frames, Sums)> {
         let (weights, [in_area, area]) = (numbers(&self.weights)?, self.areas());
         let weights = &weights[..];
@@ -161,21 +162,21 @@ impl Stage {
             |frame| self.output.kept(frame).len() * area,
             || {
                 let sums = Sums::new(self.output.channels());
-                (self.conv.room(), vec![0.0; in_area], sums)
+                (self.conv.buffers(), vec![0.0; in_area], sums)
             },
             #[inline(always)]
-            |(room, plane, sums), frame, out| {
+            |(buffers, plane, sums), frame, out| {
                 self.read(
                     (z, frame),
-                    (plane, room),
+                    (plane, buffers),
                     #[inline(always)]
-                    |room, index, _, plane| self.put(room, index, plane),
+                    |buffers, index, _, plane| self.put(buffers, index, plane),
                 );
                 let (inputs, outputs) = (self.before.mask.kept(frame), self.output.kept(frame));
                 for (channel, out) in outputs.iter().zip(out.chunks_exact_mut(area)) {
                     out.copy_from_slice(&self.start[channel * area..][..area]);
                 }
-                self.convolve(weights, room, inputs, outputs, out);
+                self.convolve(weights, buffers, inputs, outputs, out);
                 for (channel, out) in outputs.iter().zip(out.chunks_exact(area)) {
                     order.add_moments(sums, *channel, out);
                 }
@@ -185,7 +186,8 @@ impl Stage {
         Ok((out, Sums::total(&sums)))
     }
 
-    /// Returns the gradients `dy` of all frames' normalisations, and each chunk's sums, from the gradient of the result.
+    /// Computes the gradient `dy` of the normalisation's output for all frames, and the sums of each chunk of frames,
+    /// from the gradient of the result.
     pub(super) fn backward(
         &self,
         z: &Frames,
@@ -197,7 +199,7 @@ impl Stage {
         Ok(frames(
             self.output.n_frames(),
             n,
-            || self.room_for_gradients(),
+            || self.gradient_buffers(),
             #[inline(always)]
             |to, frame, dy| {
                 let (inputs, outputs) = (before.mask.kept(frame), self.output.kept(frame));
@@ -207,14 +209,14 @@ impl Stage {
                     add(&mut to.start[output * area..][..area], d);
                 }
                 if self.transposed && inputs.len() < before.mask.channels() {
-                    self.conv.forget_turned(&mut to.room);
+                    self.conv.clear_transposed(&mut to.buffers);
                 }
                 self.read(
                     (z, frame),
-                    (&mut to.plane, &mut to.room),
+                    (&mut to.plane, &mut to.buffers),
                     #[inline(always)]
-                    |room, index, channel, plane| {
-                        self.put_for_gradient(room, [index, channel], plane);
+                    |buffers, index, channel, plane| {
+                        self.put_for_gradient(buffers, [index, channel], plane);
                     },
                 );
                 self.add_gradients(weights, to, inputs, outputs);
@@ -231,10 +233,10 @@ impl Stage {
         ))
     }
 
-    fn room_for_gradients(&self) -> Gradients {
+    fn gradient_buffers(&self) -> Gradients {
         let ([in_area, area], [inputs, outputs]) = (self.areas(), self.all_channels());
         Gradients {
-            room: self.conv.room(),
+            buffers: self.conv.buffers(),
             plane: vec![0.0; in_area],
             d_out: vec![0.0; outputs.len() * area],
             dx: vec![0.0; inputs.len() * in_area],
@@ -244,18 +246,18 @@ impl Stage {
         }
     }
 
-    /// Puts an input plane where [`Conv::add_weight_gradient`] reads it.
+    /// Copies an input plane to the buffer that [`Conv::add_weight_gradient`] reads.
     #[inline(always)]
-    fn put_for_gradient(&self, room: &mut Room, [index, channel]: [usize; 2], plane: &[f32]) {
+    fn put_for_gradient(&self, buffers: &mut Buffers, [index, channel]: [usize; 2], plane: &[f32]) {
         if self.transposed {
-            self.conv.turn_small(room, channel, plane);
+            self.conv.transpose_small(buffers, channel, plane);
         } else {
-            self.conv.put_large(room, index, plane);
+            self.conv.put_large(buffers, index, plane);
         }
     }
 
-    /// Adds the gradient of the weights from the inputs in `to.room` and the gradient `to.d_out` of the outputs, and writes the
-    /// gradient `to.dx` of the inputs if it is needed.
+    /// Adds the gradient of the weights from the inputs in `to.buffers` and the gradient `to.d_out` of the outputs, and
+    /// writes the gradient `to.dx` of the inputs if it is needed.
     #[inline(always)]
     fn add_gradients(
         &self,
@@ -264,33 +266,33 @@ impl Stage {
         inputs: &[usize],
         outputs: &[usize],
     ) {
-        let (conv, room, [in_area, area]) = (&self.conv, &mut to.room, self.areas());
+        let (conv, buffers, [in_area, area]) = (&self.conv, &mut to.buffers, self.areas());
         let dx = &mut to.dx[..inputs.len() * in_area];
         dx.fill(0.0);
         let planes = to.d_out.chunks_exact(area).take(outputs.len());
         if self.transposed {
             for (index, plane) in planes.enumerate() {
-                conv.put_large(room, index, plane);
+                conv.put_large(buffers, index, plane);
             }
-            conv.add_weight_gradient(room, outputs, &mut to.weights);
-            conv.down(weights, room, [outputs, inputs], dx);
+            conv.add_weight_gradient(buffers, outputs, &mut to.weights);
+            conv.down(weights, buffers, [outputs, inputs], dx);
             return;
         }
         if outputs.len() < self.output.channels() {
-            conv.forget_turned(room);
+            conv.clear_transposed(buffers);
         }
         for (index, (channel, plane)) in outputs.iter().zip(planes).enumerate() {
-            conv.put_small(room, index, plane);
-            conv.turn_small(room, *channel, plane);
+            conv.put_small(buffers, index, plane);
+            conv.transpose_small(buffers, *channel, plane);
         }
-        conv.add_weight_gradient(room, inputs, &mut to.weights);
+        conv.add_weight_gradient(buffers, inputs, &mut to.weights);
         if self.before.norm.is_some() {
-            conv.up(weights, room, [inputs, outputs], dx);
+            conv.up(weights, buffers, [inputs, outputs], dx);
         }
     }
 
-    /// Returns the layer's gradients (gamma, beta, weights, bias), and for each input channel `[p, q, r]`, with which
-    /// `dz = p dy + q z + r`.
+    /// Returns the layer's gradients (gamma, beta, weights, bias), and for each input channel the coefficients
+    /// `[p, q, r]` of `dz = p dy + q z + r`.
     pub(super) fn finish(&self, chunks: Vec<Gradients>) -> Result<(Vec<f32>, Vec<[f32; 3]>)> {
         let (mut weights, mut starts, mut sums) = (vec![], vec![], vec![]);
         for chunk in chunks {
@@ -324,8 +326,8 @@ impl Stage {
         weights: &mut Vec<f32>,
         sums: &mut Sums,
     ) -> Result<()> {
-        let (mut to, [inputs, outputs]) = (self.room_for_gradients(), self.all_channels());
-        self.put_floors(&mut to.room);
+        let (mut to, [inputs, outputs]) = (self.gradient_buffers(), self.all_channels());
+        self.put_floors(&mut to.buffers);
         to.d_out.copy_from_slice(start);
         std::mem::swap(&mut to.weights, weights);
         self.add_gradients(&numbers(&self.weights)?, &mut to, &inputs, &outputs);
@@ -350,7 +352,7 @@ impl Layer<'_> {
         })
     }
 
-    /// Returns gamma, beta, weights and bias, as far as the layer has them: the order of [`Stage::finish`].
+    /// Returns gamma, beta, weights and bias, if the layer has them, in the order of [`Stage::finish`].
     pub(crate) fn tensors(&self) -> Vec<&Tensor> {
         let norm = self.norm.into_iter().flatten();
         norm.chain([&self.weights]).chain(self.bias).collect()
@@ -368,7 +370,7 @@ impl Layer<'_> {
 
 /// Transposes `[a, b, c]` to `[c, b, a]`.
 fn permuted(numbers: &[f32], [a, b, c]: [usize; 3]) -> Vec<f32> {
-    // Rows of `to` are often a power of two apart and would evict each other from the cache: copy through a tile.
+    // Rows of `to` are often a power of two apart and would evict each other from the cache, so copy through a tile.
     let (mut to, mut tile) = (vec![0.0; numbers.len()], vec![0.0; a * c]);
     for at_b in 0..b {
         for at_a in 0..a {

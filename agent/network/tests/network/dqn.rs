@@ -1,4 +1,4 @@
-//! The DQN beside candle's stock linear layers and AdamW, whose weight decay of zero makes it Adam.
+//! Tests of the DQN. The reference uses candle's linear layers and AdamW, which is Adam without weight decay.
 
 use candle_core::{Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
@@ -38,7 +38,7 @@ fn batch(update: u64) -> Vec<Transition> {
     (0..64).map(row).collect()
 }
 
-/// The network's weights and biases, layer by layer.
+/// Returns the network's weights and biases, layer by layer.
 fn layers(dqn: &Dqn) -> impl Iterator<Item = NamedTensor> {
     let tensors = dqn.named_tensors();
     let layer = move |name: &str| {
@@ -126,7 +126,7 @@ fn check_updates(double: bool) -> Result<()> {
     for ((name, _, got), var) in layers(&dqn).zip(&vars) {
         let expected: Vec<f32> = var.flatten_all()?.to_vec1()?;
         let off = got.iter().zip(&expected).map(|(a, b)| (a - b).abs());
-        // Adam's step is .01 whatever the gradient, so rounding near zero gradients shows.
+        // Adam's step is .01 whatever the gradient, so rounding errors of gradients near zero are visible.
         assert!(off.fold(0.0, f32::max) < 1e-3, "{name}");
     }
     Ok(())
@@ -144,12 +144,12 @@ fn one_action_in_ten_is_random() {
     let dqn = Dqn::new(DqnSettings::paper(), ACTIONS, 1);
     let best = dqn.best(&[0.5; N_INPUTS]);
     let others = (0..1000).filter(|&step| dqn.act(&[0.5; N_INPUTS], step) != best);
-    // Three quarters of them are another action: 75 in 1000, standard deviation 8.
+    // Three quarters of the random actions differ from the best: 75 in 1000, with standard deviation 8.
     let n_others = others.count();
     assert!((45..105).contains(&n_others), "{n_others}");
 }
 
-/// With a full replay, and one update made.
+/// Creates a DQN with a full replay buffer and one update.
 fn learner(settings: DqnSettings, seed: u64) -> Dqn {
     let mut dqn = Dqn::new(settings, ACTIONS, seed);
     for transition in (0..3).flat_map(batch) {
@@ -172,7 +172,7 @@ fn saved(dqn: &Dqn) -> Saved {
     (dqn.named_tensors(), dqn.saved())
 }
 
-/// Finds tensors by name, and says what is wrong with them.
+/// Loads a saved state. The error names a missing tensor.
 fn load(dqn: &mut Dqn, (tensors, saved): &Saved) -> std::result::Result<(), NetworkError> {
     let find = |name: &str, dims: &[usize]| {
         let found = tensors.iter().find(|tensor| tensor.0 == name);
@@ -216,17 +216,30 @@ fn the_latest_transitions_are_kept_oldest_first() {
 
 #[test]
 fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
-    let row = "dqn.transitions: 7: expected 6 finite inputs, an action below 4 and a discount from 0 to 1, got";
+    let row = "dqn.transitions: 7: expected 6 inputs, 6 next inputs, an action below 4, a discount from 0 to 1 and \
+               finite numbers, got";
     type Change = fn(&mut Saved);
     let changes: [(Change, &str); 5] = [
         (
             |it| it.0.retain(|tensor| tensor.0 != "dqn.target.2.bias"),
             "dqn.target.2.bias: missing",
         ),
-        (|it| it.1.transitions[7].action = 4, "6, 4 and 0.5"),
-        (|it| it.1.transitions[7].input.truncate(5), "5, 0 and 0.5"),
-        (|it| it.1.transitions[7].next[0] = f32::NAN, "6, 0 and 0.5"),
-        (|it| it.1.transitions[7].discount = 1.5, "6, 0 and 1.5"),
+        (
+            |it| it.1.transitions[7].action = 4,
+            "6 inputs, 6 next inputs, action 4, discount 0.5",
+        ),
+        (
+            |it| it.1.transitions[7].input.truncate(5),
+            "5 inputs, 6 next inputs, action 0, discount 0.5",
+        ),
+        (
+            |it| it.1.transitions[7].next[0] = f32::NAN,
+            "action 0, discount 0.5 and a number that is not finite",
+        ),
+        (
+            |it| it.1.transitions[7].discount = 1.5,
+            "6 inputs, 6 next inputs, action 0, discount 1.5",
+        ),
     ];
     for (change, words) in changes {
         let mut other = saved(&learner(small(), 2));
@@ -257,7 +270,7 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
             |_, rows| rows[0].reward = f32::NEG_INFINITY,
             "dqn.replay.reward",
         ),
-        // Squared, it is no longer finite.
+        // Its square is not finite.
         (|_, rows| rows[3].reward = 1e30, "loss"),
         (
             |dqn, _| dqn.set_learning_rate(f32::INFINITY),
@@ -283,7 +296,7 @@ fn it_learns_which_candidate_pays() {
         width: 16,
         ..DqnSettings::paper()
     };
-    // A candidate pays its first number; the second means nothing.
+    // A candidate's reward is its first number. Its second number is irrelevant.
     let candidates = |row: u64| -> Vec<f32> { (0..6).map(|at| number(row * 6 + at)).collect() };
     let mut dqn = Dqn::new(settings, DqnShape::of_candidates(2, 3), 1);
     for row in 0..300 {
@@ -305,7 +318,7 @@ fn it_learns_which_candidate_pays() {
         Some(dqn.best(&now)) == (0..3).max_by(pays)
     });
     assert!(right.count() > 90);
-    // The same numbers have the same value wherever they stand.
+    // Equal candidates have equal values, whatever their index.
     let (one, other) = ([0.5, 0.1], [-0.3, 0.2]);
     let values = dqn.values(&[one, other, one].concat());
     assert_eq!(values[0], values[2]);

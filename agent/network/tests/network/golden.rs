@@ -1,6 +1,6 @@
-//! Numbers from the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
+//! Comparison with results of the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
 //!
-//! Stored uncompressed; of the masked steps the first and the last:
+//! The files are uncompressed, and contain only the first and the last of the masked steps:
 //!
 //! ```python
 //! for name in "a4_net_weights", "a4_update_nodropout", "a4_masked_step":
@@ -29,7 +29,7 @@ fn names(golden: &mut Golden) -> Vec<String> {
     stems.map(str::to_owned).collect()
 }
 
-/// The authors' network with their weights.
+/// Returns the authors' network with their weights.
 fn authors_network() -> Autoencoder {
     let settings = AutoencoderSettings {
         adam: AdamSettings::paper(1e-4),
@@ -61,7 +61,7 @@ fn frames(golden: &mut Golden) -> Vec<Frame> {
         .collect()
 }
 
-/// The largest difference, relative to the largest number.
+/// Returns the largest difference, relative to the largest number.
 fn relative<'a>(
     got: impl IntoIterator<Item = &'a f32>,
     expected: impl IntoIterator<Item = impl Borrow<f32>>,
@@ -75,7 +75,7 @@ fn relative<'a>(
     worst / largest
 }
 
-/// Bayes' rule (eq. 10) at visited cells, in place of a predictor `[S, H, W]`.
+/// Applies Bayes' rule (eq. 10) at visited cells to a predictor `[S, H, W]`, in place.
 fn correct(prediction: &mut Array3<f32>, frame: &Frame, matrix: &[f32]) {
     for ((row, col), &value) in frame.values().indexed_iter() {
         if value != UNOBSERVED {

@@ -1,4 +1,4 @@
-//! Arrays of the authors' runs, in this crate's `tests/data`.
+//! Access to arrays of the authors' runs in this crate's `tests/data`.
 
 use emberwatch_model::frame::{Frame, UNOBSERVED};
 use emberwatch_model::grid::Shape;

@@ -1,4 +1,4 @@
-//! The autoencoder against the authors' network and against candle's stock layers.
+//! Tests of the networks, against the authors' network and candle's stock layers.
 
 mod dqn;
 mod golden;

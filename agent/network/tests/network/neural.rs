@@ -1,4 +1,4 @@
-//! The neural belief: against candle's layers in 64 bits, on threads, through a checkpoint, and that it learns.
+//! Tests of the neural belief: comparison with candle's layers in 64 bits, threads, checkpoints and learning.
 
 use crate::synthetic::rayon_pool;
 use candle_core::{DType, Device, IndexOp, Tensor, Var};
@@ -17,7 +17,7 @@ fn numbers(tensor: &Tensor) -> Vec<f64> {
     numbers.expect("numbers")
 }
 
-/// The largest difference, relative to the largest number.
+/// Returns the largest difference, relative to the largest number.
 fn off(got: &Tensor, expected: &Tensor) -> f64 {
     let (got, expected) = (numbers(got), numbers(expected));
     assert_eq!(got.len(), expected.len());
@@ -26,7 +26,7 @@ fn off(got: &Tensor, expected: &Tensor) -> f64 {
     worst.fold(0.0, f64::max) / largest.fold(1e-30, f64::max)
 }
 
-/// A network in whose head no weight is zero.
+/// Creates a network whose head has nonzero weights.
 fn unet(dtype: DType, operators: Operators) -> (UNet, Variables) {
     let model = |vb| UNet::new(&vb, 12, 3, operators);
     let (model, variables) = build(3, dtype, &Device::Cpu, model).expect("a network");
@@ -45,7 +45,7 @@ fn images(dtype: DType) -> Var {
     images.expect("images")
 }
 
-/// Corners, edges, the middle.
+/// Cells at corners, at edges and in the middle.
 const CELLS: [[usize; 3]; 5] = [[0, 0, 0], [0, 15, 11], [1, 7, 0], [1, 8, 6], [1, 0, 11]];
 
 #[test]
@@ -72,7 +72,7 @@ fn network_and_gradients_equal_candles_layers_in_64_bits() {
     }
 }
 
-/// What a rectangular grid shows along paths: value 1 left of a column, else 0 or 2 in turn of the steps.
+/// Creates lessons on a rectangular grid. Cells left of a column show 1, the others show 0 and 2 in alternate steps.
 fn lessons(n: u64) -> Vec<Lesson> {
     let shape = Shape::new(21, 18).expect("test shape");
     let (mut before, mut lessons) = (Sightings::new(shape), Vec::new());
@@ -133,13 +133,14 @@ fn one_and_more_threads_give_the_same_bits_and_so_does_a_resume() {
     assert!(learn(&mut resumed) == learn(&mut network));
 }
 
-/// A network of candle's operators, as a GPU uses them.
+/// Creates a network with candle's operators, which a GPU would use.
 fn on_a_device() -> NeuralBelief {
     let network = NeuralBelief::with_operators(3, 5, &Device::Cpu, Operators::Stock);
     network.expect("a network")
 }
 
-/// Another belief, which knows all but which of two values a cell shows: that the steps tell.
+/// Returns a base distribution. It does not know which of the two values a cell on the right shows, which depends on
+/// the step.
 fn base_of(cell: usize) -> [f32; 3] {
     if cell % 18 < 9 {
         [0.1, 0.8, 0.1]
@@ -152,7 +153,7 @@ fn base() -> Array3<f32> {
     Array3::from_shape_fn((3, 21, 18), |(y, row, col)| base_of(row * 18 + col)[y])
 }
 
-/// Lessons that correct this other belief.
+/// Adds the base distribution to lessons.
 fn with_bases(mut lessons: Vec<Lesson>) -> Vec<Lesson> {
     for lesson in &mut lessons {
         lesson.base = lesson.frame.iter().flat_map(|it| base_of(it.0)).collect();
@@ -225,7 +226,8 @@ fn it_learns_alone_and_corrects_the_distributions_of_another() {
             let batch = &lessons[update % 40..][..10];
             network.update(5e-3, batch).expect("finite");
         }
-        // Half of the cells always show 1, the others one of two values: ln 2 / 2 if nothing else is known.
+        // Half of the cells always show 1, the others one of two values. Without the step, the best loss is
+        // `ln(2) / 2`.
         assert!(loss(&network) < 0.4, "{}", loss(&network));
         let belief = belief(&network);
         assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));

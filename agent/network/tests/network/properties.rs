@@ -1,4 +1,4 @@
-//! What holds of every network: threads, saved state, numbers that are not finite.
+//! Properties of every network: results on several threads, saved state, and numbers that are not finite.
 
 use crate::synthetic::{frames, rayon_pool};
 use candle_core::Tensor;
@@ -67,7 +67,7 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
     assert_eq!(error, NotFinite { update, tensor }.into());
     let after = network.variables()["decoder.2.running_mean"].to_vec1::<f32>();
     assert_eq!(before.expect("numbers"), after.expect("numbers"));
-    // A finite parameter whose gradient is not.
+    // The parameter is finite, but its gradient is not.
     overwrite(&network, "decoder.8.weight", &[0.0]);
     overwrite(&network, "encoder.13.bias", &[f32::MAX; 16]);
     let before = tensors(&network);
@@ -75,7 +75,7 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
         assert!(matches!(error, NetworkError::NotFinite(_)), "{error}");
         assert_eq!(tensors(&network), before);
     }
-    // A step that overflows is not made.
+    // A step that overflows is not applied.
     overwrite(&network, "encoder.13.bias", &[0.0; 16]);
     let before = tensors(&network);
     network.set_learning_rate(f32::INFINITY);
@@ -87,10 +87,10 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
 #[test]
 fn a_loss_at_certainty_is_finite() {
     let mut network = network([32, 32], 1);
-    // Every state looks like observation 0, to the last bit.
+    // Every state shows observation 0 with a probability of exactly 1.
     overwrite(&network, "W_obs_param", &[200.0; 3]);
     let window = window(&network, 8, 20);
-    // Two thirds of the cells cost twice the logarithm of 1e-10.
+    // The loss of two thirds of the cells is twice the logarithm of 1e-10, negated.
     let loss = network.update(&window).expect("finite");
     assert!((20.0..46.0).contains(&loss), "{loss}");
 }

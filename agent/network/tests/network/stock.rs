@@ -1,8 +1,8 @@
-//! Our operators in 32 bits beside candle's stock operators in 64 bits.
+//! Comparison of our operators in 32 bits with candle's stock operators in 64 bits.
 //!
-//! Windows of frames with fixed masks, on several grids and numbers of states and observations. Each
-//! tensor's gradient passes through every operator behind it, so a wrong operator shows in its own
-//! tensors and in those before it.
+//! The tests use windows of frames with fixed masks, on several grids, with several numbers of states and observations.
+//! The gradient of a tensor passes through all later operators. So a wrong operator affects its own tensors and all
+//! earlier ones.
 
 use crate::synthetic::{coin, dropout, frames};
 use candle_core::backprop::GradStore;
@@ -13,7 +13,7 @@ use emberwatch_network::{Network, NetworkShape, Operators, Pass, Window};
 
 const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
 
-/// The largest difference of two tensors, relative to the largest number.
+/// Returns the largest difference between two tensors, relative to the largest number.
 fn relative(got: &[f64], expected: &[f64]) -> f64 {
     assert_eq!(got.len(), expected.len());
     let pairs = got.iter().zip(expected);
@@ -27,7 +27,7 @@ struct Case {
     n_states: usize,
     n_observations: usize,
     n_frames: u64,
-    /// One cell in so many is seen.
+    /// Each cell is seen with probability `1 / one_in`.
     one_in: u64,
     drops: bool,
 }
@@ -50,7 +50,7 @@ impl Model {
     fn new(shape: &NetworkShape, dtype: DType, operators: Operators) -> Self {
         let network = |vb| Network::new(&vb, shape, operators);
         let (network, variables) = build(3, dtype, &Device::Cpu, network).expect("a network");
-        // Weights and biases of normalisations that are not all alike; the numbers of 32 bits.
+        // Make the weights and biases of normalisations differ. Round all numbers to 32 bits.
         for (index, (name, var)) in variables.iter().enumerate() {
             let mut numbers = numbers(var);
             if var.rank() == 1 && !name.contains("running") {
@@ -114,7 +114,7 @@ fn check(case: Case, all: &[Operators]) {
     }
 }
 
-/// With running statistics, which are those of the start.
+/// Compares predictions, which use the initial running statistics.
 fn predictions_agree(exact: &Model, model: &Model, window: &Window) {
     let predictions = [exact, model].map(|model| {
         let pass = Pass::inference(window);
@@ -161,7 +161,7 @@ fn on_grids_of_any_sides_with_other_states_and_observations() {
     for (grid, n_states, n_observations, one_in) in [
         ([32, 32], 2, 4, 100),
         ([48, 80], 4, 2, 2),
-        // Padded.
+        // These grids are padded.
         ([20, 33], 3, 3, 10),
         ([6, 6], 3, 3, 2),
     ] {

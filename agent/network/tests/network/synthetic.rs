@@ -1,11 +1,11 @@
-//! Frames to learn from, and masks.
+//! Synthetic frames and masks.
 
 use emberwatch_model::frame::Frame;
 use emberwatch_model::grid::Shape;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_network::{Dropout, Mask};
 
-/// Frames in which each cell is seen with a probability of one in `one_in`.
+/// Creates frames that show each cell with probability `1 / one_in`.
 pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> Vec<Frame> {
     let frame = |index: u64| {
         let mut frame = Frame::empty(shape);
@@ -20,7 +20,7 @@ pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> 
     (0..n_frames).map(frame).collect()
 }
 
-/// Coins for every frame and channel, kept if `keeps` of the layer, frame and channel.
+/// Creates masks that keep a channel if `keeps(layer, frame, channel)`.
 pub fn dropout(
     n_frames: usize,
     scale: f32,
@@ -37,12 +37,12 @@ pub fn dropout(
     }
 }
 
-/// A fixed coin.
+/// Returns a fixed pseudo-random bit.
 pub fn coin(layer: usize, frame: usize, channel: usize) -> bool {
     split_mix(layer as u64 * 1000 + frame as u64, channel as u64) & 1 == 1
 }
 
-/// Threads for a computation whose bits must not depend on their number.
+/// Creates a pool with a number of threads, on which no result may depend.
 pub fn rayon_pool(n_threads: usize) -> rayon::ThreadPool {
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(n_threads)

@@ -1,4 +1,4 @@
-//! Tables of a comparison: a row for each group, with a cell in each column.
+//! Tables of a comparison, with one row per group.
 
 use crate::benchmark::report::number::{NOTHING, number, signed, with_error};
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
@@ -12,7 +12,7 @@ type Cell<'a> = Box<dyn Fn(&Group<'_>) -> String + 'a>;
 pub(super) struct Columns<'a>(Vec<(String, Cell<'a>)>);
 
 impl<'a> Columns<'a> {
-    /// What groups are called, with their teams where there are any.
+    /// Returns the columns that name a group, including its team and number of robots if any group is a team.
     pub(super) fn of_names(groups: &[Group<'_>]) -> Self {
         let mut columns = Self::default();
         columns.add("policy", |group| group.policy.into());
@@ -28,7 +28,7 @@ impl<'a> Columns<'a> {
         self.0.push((heading.into(), Box::new(cell)));
     }
 
-    /// Means over worlds.
+    /// Adds a column of means over worlds.
     pub(super) fn add_mean(
         &mut self,
         heading: &str,
@@ -41,7 +41,7 @@ impl<'a> Columns<'a> {
         });
     }
 
-    /// The same with standard errors.
+    /// Adds a column of means over worlds with standard errors.
     pub(super) fn add_estimate(
         &mut self,
         heading: &str,
@@ -52,7 +52,7 @@ impl<'a> Columns<'a> {
         self.add(heading, cell);
     }
 
-    /// Differences, paired by world, to a policy alone with as many robots.
+    /// Adds a column of differences, paired by world, to the baseline in team `alone` with as many robots.
     pub(super) fn add_difference(
         &mut self,
         groups: &'a [Group<'a>],
@@ -81,7 +81,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// A Markdown table; all but the columns of names are right-aligned.
+/// Builds a Markdown table. All columns but names are right-aligned.
 pub(super) fn markdown<H: AsRef<str>>(
     headings: &[H],
     rows: impl Iterator<Item = Vec<String>>,

@@ -1,4 +1,4 @@
-//! Which runs can be compared: those that were measured on the same worlds, over the same steps.
+//! Checks that runs can be compared: that they were measured on the same worlds, over the same steps.
 
 use crate::benchmark::report::policy_run::{PolicyRun, groups};
 use anyhow::{Context, Result, ensure};
@@ -10,7 +10,7 @@ use std::fmt::Display;
 pub struct CommonWorlds {
     /// The server's `worlds_fingerprint`; `None`: it is not compared.
     pub fingerprint: Option<String>,
-    /// Sorted.
+    /// In ascending order.
     pub seeds: Vec<u64>,
     pub steps: u64,
     /// Moves of a path, robots of a world and recent steps; `None`: they are not compared.
@@ -20,7 +20,7 @@ pub struct CommonWorlds {
 }
 
 impl CommonWorlds {
-    /// Checks that a policy's runs are of these worlds, one for each, and all of one policy.
+    /// Checks that a policy has one run for each of these worlds, all with the same policy fingerprint.
     pub fn check(&self, policy: &str, runs: &[&PolicyRun]) -> Result<()> {
         for run in runs {
             same(run, "steps", self.steps, run.steps)?;
@@ -57,7 +57,7 @@ pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds
         let policy = group.policy;
         ensure!(
             !policies.contains(&policy),
-            "policy {policy:?}: expected a name that no policy compared has"
+            "policy {policy:?}: expected a name that no compared policy has"
         );
         let is_old = group
             .runs
@@ -77,8 +77,8 @@ pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds
     Ok(())
 }
 
-/// Checks that the same cells burned in runs of other files: a world's fire depends on its seed, model, grid and
-/// burn-in, and on no policy.
+/// Checks that runs of other files had the same number of burning cells. A world's fire depends on its seed, model,
+/// grid and burn-in, but not on the policy.
 pub fn check_fire(added: &[PolicyRun], runs: &[PolicyRun]) -> Result<()> {
     let fire = runs.iter().map(|run| (run.world_seed, run.mean_fire_cells));
     let fire: BTreeMap<u64, f64> = fire.collect();
@@ -90,7 +90,7 @@ pub fn check_fire(added: &[PolicyRun], runs: &[PolicyRun]) -> Result<()> {
     Ok(())
 }
 
-/// How many worlds there are, with the first and the last seed.
+/// Returns the number of worlds in words, with the first and the last seed.
 fn counted(seeds: &[u64]) -> String {
     match seeds {
         [] => "none".into(),

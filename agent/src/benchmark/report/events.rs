@@ -1,4 +1,4 @@
-//! Rewards over time for TensorBoard: a run of each policy.
+//! Rewards over time for TensorBoard, with one run per policy.
 
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
@@ -6,8 +6,7 @@ use crate::training::tensorboard::{EventFile, Value};
 use anyhow::Result;
 use std::path::Path;
 
-/// Writes the reward of each step, mean and standard error over worlds, into a folder of each policy's
-/// own; steps are counted from 1.
+/// Writes each step's reward, as mean and standard error over worlds, into one folder per policy. Steps start at 1.
 pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<()> {
     let groups = groups(runs);
     for group in &groups {
@@ -25,7 +24,7 @@ pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<()> {
     Ok(())
 }
 
-/// Over the worlds that made each step.
+/// Estimates the reward of each step, over the worlds whose run has that step.
 fn rewards(group: &Group<'_>) -> Vec<Estimate> {
     let rewards = group.runs.iter().map(|run| &run.rewards);
     let n_steps = rewards.clone().map(Vec::len).max().unwrap_or(0);
@@ -37,7 +36,7 @@ fn rewards(group: &Group<'_>) -> Vec<Estimate> {
     (0..n_steps).filter_map(of_step).collect()
 }
 
-/// A name as one of a folder.
+/// Makes a policy name safe as a folder name.
 fn plain(name: &str) -> String {
     let plain = |letter: char| match letter {
         'a'..='z' | 'A'..='Z' | '0'..='9' | '-' | '_' => letter,

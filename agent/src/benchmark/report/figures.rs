@@ -1,4 +1,4 @@
-//! The figures of a comparison: results in, files out. The crate `figures` draws them.
+//! The figures of a comparison, drawn by the crate `emberwatch-figures` and written to files.
 
 use crate::benchmark::report::number::{decimals, readable, with_error};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
@@ -16,13 +16,13 @@ use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// What the reward of the wildfire model counts: the label of a reward axis.
+/// Label of a reward axis: what the wildfire model's reward counts.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
-/// The legend and the colour of policies that sample paths on the known model, apart from those that search.
+/// Legend and colour of policies that sample paths on the known model. Policies that search have another colour.
 const SHOOTING: (&str, Color) = ("known model, shooting", Color(0x56, 0xb4, 0xe9));
 
-/// Those of rows that others measured.
+/// Legend and colour of rows from `--add`.
 const ADDED: (&str, Color) = ("added", Color(0xcc, 0x79, 0xa7));
 
 /// One step of one world, as a policy saw it.
@@ -34,16 +34,16 @@ pub struct Snapshot {
     /// Hidden states, shape `[H, W]`.
     pub truth: Grid<u8>,
     pub frame: Frame,
-    /// The robot's cells, the start first.
+    /// The cells of the robot's path, including its start.
     pub path_cells: Vec<Cell>,
-    /// The posterior after the frame, if the policy has a belief of its own.
+    /// The posterior after the frame, if frames update the policy's belief.
     pub belief: Option<Belief>,
-    /// The state that pays most in a belief whose states were learned; `None`: they are the model's.
+    /// The state that pays most, in a belief with learned states; `None` if the states are the model's.
     pub learned_target: Option<usize>,
 }
 
 impl Snapshot {
-    /// How much it tells: more with a belief, most if its states are the model's.
+    /// Returns how informative the snapshot is: 0 without a belief, 1 with learned states, 2 with the model's states.
     pub fn rank(&self) -> u8 {
         match (&self.belief, self.learned_target) {
             (None, _) => 0,
@@ -52,22 +52,22 @@ impl Snapshot {
         }
     }
 
-    /// What the belief's panel calls a state.
+    /// Returns a state's name for the title of its panel.
     fn state_name(&self, model: &Model, state: usize) -> String {
         match self.learned_target {
             None => model.file().states[state].name.clone(),
-            Some(target) if target == state => "what pays most".into(),
+            Some(target) if target == state => "state that pays most".into(),
             Some(_) => format!("learned state {state}"),
         }
     }
 }
 
-/// Puts a page at `path`.
+/// Writes an SVG page to `path`.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
     replace_file(path, svg.as_bytes(), Readers::Any)
 }
 
-/// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
+/// Draws the mean reward per policy, the best at the top. `axis_label` names what the reward counts, such as
 /// [`FIRE_CELLS_PER_STEP`].
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     let title = "Reward of each policy on the same worlds";
@@ -87,15 +87,15 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
     draw_bars(path, runs, [title, &ladder_note(runs), axis_label], &height)
 }
 
-/// How long a bar is, and what is said of it.
+/// The length and the label of a bar.
 pub(super) struct Height {
-    /// NaN: there is no bar.
+    /// NaN: no bar is drawn.
     pub(super) value: f64,
     pub(super) ends: Option<[f64; 2]>,
     pub(super) label: String,
 }
 
-/// Draws a bar a policy, the best at the top, with a mark for each of its runs; words are title, note and axis.
+/// Draws one bar per policy, the best at the top, with a mark for each of its runs.
 pub(super) fn draw_bars(
     path: &Path,
     runs: &[PolicyRun],
@@ -142,7 +142,7 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
     let remark: Vec<&str> = team.into_iter().chain(estimator).collect();
     let remark = match remark.as_slice() {
         [] => String::new(),
-        // Programs that draw SVG drop a usual space at the end of a part.
+        // SVG renderers drop an ordinary space between two parts of a text.
         remark => format!("\u{a0}({})", readable(&remark.join(", "))),
     };
     let pair = |run: &&PolicyRun| (run.world_seed, run.mean_reward);
@@ -157,7 +157,7 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
     }
 }
 
-/// All entries of a legend, from the least to the most informed.
+/// Returns all entries of a legend, from the least to the most informed policies.
 fn legend() -> Vec<(&'static str, Color)> {
     let mut all: Vec<_> = BELIEFS.iter().copied().map(chart_of).collect();
     let at = all.iter().position(|entry| *entry == chart_of(&KNOWN));
@@ -172,7 +172,7 @@ fn chart_of(belief: &BeliefKind) -> (&'static str, Color) {
     (legend, Color(red, green, blue))
 }
 
-/// The legend and the colour of a group: of its belief.
+/// Returns the legend and colour of a group, which depend on its belief.
 fn chart(group: &Group<'_>) -> (&'static str, Color) {
     if group.runs.iter().any(|run| run.is_added) {
         return ADDED;
@@ -185,8 +185,8 @@ fn chart(group: &Group<'_>) -> (&'static str, Color) {
     chart_of(belief)
 }
 
-/// Draws the reward of all robots of a world over their number, a curve for each kind of team; nothing of runs that all
-/// have as many robots.
+/// Draws the reward of all robots of a world over their number, with one curve per kind of team. Draws nothing if all
+/// runs have the same number of robots.
 pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     if runs.iter().all(|run| run.robots == runs[0].robots) {
         return Ok(());
@@ -211,7 +211,7 @@ fn ladder_note(runs: &[PolicyRun]) -> String {
     }
 }
 
-/// Draws the rewards over time of up to eight policies (those with the highest mean), means over worlds;
+/// Draws rewards over time, averaged over worlds, for the eight policies with the highest means.
 /// `fire_cells` is the number of burning cells per step, shaded in the background.
 pub fn draw_rewards(
     path: &Path,
@@ -233,8 +233,7 @@ pub fn draw_rewards(
     save(path, &svg)
 }
 
-/// Draws a step; the picture grows in height with the states of the belief. `observation`: what the sensor would
-/// have shown of each cell.
+/// Draws one step, with a panel for each state of the belief. `observation` is the sensor's view of the whole grid.
 pub fn draw_snapshot(
     path: &Path,
     model: &Model,
@@ -247,7 +246,7 @@ pub fn draw_snapshot(
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
-    // Those of rings further out have the colours of the path's.
+    // Observations of outer rings have the colours of the observations on the path.
     let n_named = file.observations.len() as u8;
     let of_path = |value: u8| {
         if value == UNOBSERVED {

@@ -1,4 +1,4 @@
-//! Entries of the leaderboard, a CSV file each, and the page that they make together.
+//! Entries of the leaderboard, one CSV file each, and the page of all entries.
 
 use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::common_worlds::CommonWorlds;
@@ -7,7 +7,8 @@ use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::suite::{
-    Aggregate, CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, told,
+    Aggregate, CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite,
+    score_text,
 };
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::file::{Readers, replace_file};
@@ -16,29 +17,29 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// Characters of plain words besides letters and digits.
+/// Characters allowed in plain text besides letters and digits.
 const PUNCTUATION: &str = " .,'-_&()@+/#?=%~";
 
-/// One policy: who made it, how, and its reward of each world of each task.
+/// One policy: its origin, and its mean reward in each world of each task.
 #[derive(Debug, Clone)]
 pub struct Entry {
     pub about: About,
     pub tasks: Vec<TaskRuns>,
 }
 
-/// What an entry says of itself.
+/// The origin of an entry's policy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct About {
     pub policy: String,
     pub by: String,
-    /// Where its code is.
+    /// Where to find the code.
     pub code: String,
     pub commit: String,
-    /// Processor seconds of training, of all tasks together.
+    /// Processor seconds of training, summed over all tasks.
     pub training_seconds: f64,
 }
 
-/// A line of an entry's file.
+/// A row of an entry's file.
 #[derive(Serialize, Deserialize)]
 struct Row {
     policy: String,
@@ -50,7 +51,7 @@ struct Row {
     task: String,
     world_seed: u64,
     steps: u64,
-    /// Robots of the world, and their kind of team.
+    /// Number of robots in the world.
     robots: u32,
     team: String,
     mean_reward: f64,
@@ -61,7 +62,7 @@ struct Row {
 }
 
 impl Entry {
-    /// Reads the file that [`Self::write`] wrote.
+    /// Reads a file written by [`Self::write`].
     pub fn read(path: &Path) -> Result<Self> {
         let rows = csv::Reader::from_path(path)?.into_deserialize();
         let rows = rows.collect::<Result<Vec<Row>, _>>()?;
@@ -69,7 +70,7 @@ impl Entry {
         let about = abouts.first().context("expected rows, got none")?;
         ensure!(
             abouts.iter().all(|other| other == about),
-            "expected one policy, maker, code, commit and time of training in all rows"
+            "expected the same policy, by, code, commit and training_seconds in all rows, got different ones"
         );
         let mut tasks: Vec<TaskRuns> = Vec::new();
         for row in rows {
@@ -87,7 +88,7 @@ impl Entry {
         Ok(entry)
     }
 
-    /// Checks what flags and files say before it reaches a page.
+    /// Checks all texts and numbers, which come from flags or files, before they reach a page.
     pub fn check(&self) -> Result<()> {
         let About {
             policy,
@@ -100,7 +101,7 @@ impl Entry {
         for (what, name) in [("policy", &*file_stem(policy))].into_iter().chain(tasks) {
             ensure!(
                 is_file_name(name),
-                "{what}: expected 1 to 64 letters, digits, '-', '_' and '.', and in a policy '/' and '+', got {name:?}"
+                "{what}: expected 1 to 64 letters, digits, '-', '_' and '.', for a policy also '/' and '+', got {name:?}"
             );
         }
         let runs = || self.tasks.iter().flat_map(|task| &task.runs);
@@ -204,7 +205,7 @@ impl Row {
     }
 }
 
-/// All entries of a folder, by the names of their files.
+/// Reads all entries of a folder, in the order of their file names.
 pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
     let files = std::fs::read_dir(folder)
         .with_context(|| format!("expected a folder of entries at {}", folder.display()))?;
@@ -218,23 +219,23 @@ pub fn read_entries(folder: &Path) -> Result<Vec<Entry>> {
     files.map(|path| read(path)).collect()
 }
 
-/// The name of a policy's file, without its end: `/` and `+` of a name by parts become `_`.
+/// Returns the name of a policy's file without extension. The `/` and `+` of BELIEF/PLANNER/GOAL become `_`.
 pub fn file_stem(policy: &str) -> String {
     policy.replace(['/', '+'], "_")
 }
 
-/// Checks that each entry has the random walk's worlds of its tasks, and that no policy has two entries.
+/// Checks that each entry has the same worlds as the random walk's entry, and that no policy has two entries.
 pub fn check_entries(entries: &[Entry]) -> Result<()> {
     let mut all = entries.iter();
     let floor = all.find(|entry| entry.about.policy == FLOOR);
-    let floor = floor.with_context(|| format!("expected an entry of {FLOOR}"))?;
+    let floor = floor.with_context(|| format!("expected an entry of {FLOOR}, got none"))?;
     let mut known = BTreeSet::new();
     check_scale(entries)?;
     for entry in entries {
         let policy = &entry.about.policy;
         ensure!(
             known.insert(policy),
-            "entry {policy}: expected one file of it, got more"
+            "entry {policy}: expected one file, got several"
         );
         for TaskRuns { task, runs } in &entry.tasks {
             let runs: Vec<&PolicyRun> = runs.iter().collect();
@@ -268,10 +269,11 @@ fn check_scale(entries: &[Entry]) -> Result<()> {
     Ok(())
 }
 
-/// The worlds of the random walk's entry.
+/// Returns a task's worlds in the random walk's entry.
 fn worlds(floor: &Entry, task: &str) -> Result<CommonWorlds> {
     let runs = floor.of_task(task).map(|task| &task.runs);
-    let runs = runs.with_context(|| format!("expected an entry of {FLOOR}"))?;
+    let runs =
+        runs.with_context(|| format!("expected this task in the entry of {FLOOR}, got none"))?;
     let mut seeds: Vec<u64> = runs.iter().map(|run| run.world_seed).collect();
     seeds.sort_unstable();
     seeds.dedup();
@@ -290,7 +292,7 @@ fn worlds(floor: &Entry, task: &str) -> Result<CommonWorlds> {
     })
 }
 
-/// Whether words can stand in a Markdown table as they are: no HTML, no code, no links but the web's.
+/// Returns whether a text is safe in a Markdown table: without HTML, code, or links except web addresses.
 fn is_plain(text: &str) -> bool {
     let address = ["https://", "http://"];
     let rest = address.iter().find_map(|scheme| text.strip_prefix(scheme));
@@ -301,7 +303,7 @@ fn is_plain(text: &str) -> bool {
             .all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
 }
 
-/// The page: a row an entry, the best first, then entries that lack a task, then each task's scores.
+/// Renders the page: one row per entry, the best first; then entries that lack a task; then each task's scores.
 pub fn render_page(entries: &[Entry]) -> String {
     let tasks = merged(entries);
     let rows = by_score(&tasks).into_iter().map(|(policy, score)| {
@@ -310,7 +312,7 @@ pub fn render_page(entries: &[Entry]) -> String {
         let about = &entry.about;
         let row = vec![
             policy.into(),
-            score.map_or_else(|| n_tasks(entry.tasks.len(), &tasks), told),
+            score.map_or_else(|| n_tasks(entry.tasks.len(), &tasks), score_text),
             teams(entry),
             number(about.training_seconds, 0),
             about.by.clone(),
@@ -341,7 +343,7 @@ pub fn render_page(entries: &[Entry]) -> String {
     parts.join("\n\n")
 }
 
-/// The kinds of team that an entry's robots flew in.
+/// Returns the kinds of team in which an entry's robots flew.
 fn teams(entry: &Entry) -> String {
     let runs = entry.tasks.iter().flat_map(|task| &task.runs);
     let teams = runs.filter(|run| run.robots > 1).map(|run| &*run.team);
@@ -362,7 +364,7 @@ fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
     format!("{n} of {}", tasks.len())
 }
 
-/// Draws each entry's score over tasks, with a mark for its mean of each task; of entries that lack tasks the marks alone.
+/// Draws each entry's score over tasks, with a mark for its mean in each task. Without all tasks, draws marks only.
 pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let tasks = merged(entries);
     let runs = entries.iter().flat_map(|entry| {
@@ -386,14 +388,14 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     });
     let runs: Vec<PolicyRun> = runs.collect();
     if runs.is_empty() {
-        return Ok(()); // of one end of the scale alone there are no scores
+        return Ok(()); // Without both ends of the scale there are no scores.
     }
     let scores: BTreeMap<&str, Option<Aggregate>> = by_score(&tasks).into_iter().collect();
     let height = |group: &Group<'_>| match scores.get(group.policy).copied().flatten() {
         Some(score) => Height {
             value: score.mean,
             ends: score.interval,
-            label: told(score),
+            label: score_text(score),
         },
         None => Height {
             value: f64::NAN,
@@ -409,7 +411,7 @@ pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     draw_bars(path, &runs, words, &height)
 }
 
-/// The tasks of the first entry and then those of others, each with the runs of all entries.
+/// Merges the tasks of all entries, in order of first appearance, each with the runs of all entries.
 fn merged(entries: &[Entry]) -> Vec<TaskRuns> {
     let mut tasks: Vec<TaskRuns> = Vec::new();
     for own in entries.iter().flat_map(|entry| &entry.tasks) {

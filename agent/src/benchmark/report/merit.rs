@@ -1,12 +1,12 @@
-//! The figures of merit as a table below that of the rewards.
+//! The table of the figures of merit, below the table of rewards.
 
 use crate::benchmark::report::columns::Columns;
 use crate::benchmark::report::number::NOTHING;
 use crate::benchmark::report::policy_run::{Group, PolicyRun};
 
-/// The table with its heading; `None` of runs that lack the figures, as those of old files do.
+/// Returns the table with its heading, or `None` if the runs lack the figures, as in old files.
 ///
-/// Differences are of the burning cells seen, paired by world, to `baseline`.
+/// Differences are in the share of burning cells seen, paired by world, to `baseline`.
 pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String> {
     let mut runs = groups.iter().flat_map(|group| &group.runs);
     let recent_steps = runs.find_map(|run| run.recent_steps)?;
@@ -19,7 +19,7 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
         .iter()
         .all(|group| group.by_seed(burning_seen).is_empty())
     {
-        heading += "No burning cells seen, and no front: no hidden states were published, or \
+        heading += "No values for burning seen and front: no hidden states were published, or \
                     nothing burnt.\n";
     }
     let mut columns = Columns::default();
@@ -38,7 +38,7 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
     Some(format!("{heading}\n{}", columns.table(groups)))
 }
 
-/// In how many worlds fire was detected.
+/// Renders the number of worlds in which fire was detected.
 fn detected(group: &Group<'_>) -> String {
     let n_worlds = group.by_seed(|run| run.grid_seen_share).len();
     let detection = |run: &PolicyRun| run.steps_to_detection.map(|_| 1.0);

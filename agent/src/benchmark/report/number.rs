@@ -1,11 +1,11 @@
-//! Numbers as a table and a figure both print them.
+//! Number formats of tables and figures.
 
 use crate::benchmark::report::statistics::Estimate;
 
-/// What stands where there is no number.
+/// Placeholder for a missing number.
 pub const NOTHING: &str = "-";
 
-/// Decimals that show about three digits of the largest value, at least two.
+/// Returns the number of decimals that show about three digits of the largest value, at least two.
 pub fn decimals(values: impl Iterator<Item = f64>) -> usize {
     let largest = values.fold(0.0_f64, |largest, value| largest.max(value.abs()));
     match largest {
@@ -15,7 +15,7 @@ pub fn decimals(values: impl Iterator<Item = f64>) -> usize {
     }
 }
 
-/// `mean ± error`, or `mean (n = 1)` of a single world.
+/// Formats `mean ± error`, or `mean (n = 1)` for a single world.
 pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
     let Some(estimate) = estimate else {
         return NOTHING.into();
@@ -27,7 +27,7 @@ pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
     }
 }
 
-/// As [`with_error`], with the sign of what is not negative.
+/// Like [`with_error`], with a plus sign unless the mean is negative.
 pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
     let text = with_error(estimate, decimals);
     let sign = if estimate.is_some() && !text.starts_with('-') {
@@ -38,7 +38,7 @@ pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
     format!("{sign}{text}")
 }
 
-/// Fixed decimals, without the sign of a negative zero.
+/// Formats a number with fixed decimals, without the sign of a negative zero.
 pub fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
     let is_zero = text
@@ -47,7 +47,7 @@ pub fn number(value: f64, decimals: usize) -> String {
     if is_zero { text[1..].into() } else { text }
 }
 
-/// A policy's name as a person would write it.
+/// Replaces the underscores of a policy's name with spaces.
 pub(super) fn readable(name: &str) -> String {
     name.replace('_', " ")
 }

@@ -1,64 +1,64 @@
-//! What a comparison measured, and its groups.
+//! The results of a comparison, and their groups.
 
 use crate::benchmark::report::statistics::Estimate;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The team of robots that know nothing of each other, and of one robot.
+/// Label of a team whose robots ignore each other, and of a single robot.
 pub const ALONE: &str = "alone";
 
-/// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
+/// The results of one policy on one world: a row of the CSV file of `emberwatch-agent compare`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
     pub policy: String,
-    /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
+    /// Label of the estimator: `none`, `known_model`, `truth`, `next_truth` or a learned estimator.
     pub estimator: String,
     pub world_seed: u64,
     pub steps: u64,
     pub mean_reward: f64,
     /// Mean number of distinct cells visited in a step.
     pub mean_distinct_cells: f64,
-    /// Distinct visited cells on target, as a fraction of the distinct visited cells, in `0..=1`.
+    /// Share of the distinct visited cells that are in the state that pays most, in `0..=1`.
     pub hit_rate: f64,
     /// Mean number of burning cells of the world.
     pub mean_fire_cells: f64,
     /// Mean time of one plan in milliseconds.
     pub mean_plan_millis: f64,
-    /// Mean Brier score of the belief, where there is a belief.
+    /// Mean Brier score of the belief; `None` without a belief.
     pub brier: Option<f64>,
     pub moves: usize,
-    /// Robots of the world. Rewards, cells and plans are those of all together.
+    /// Number of robots in the world. Rewards, cells and planning times are sums over all robots.
     #[serde(default = "one")]
     pub robots: u32,
     #[serde(default = "alone")]
     pub team: String,
-    /// Share of the visits to distinct cells that a teammate made in the same step, in `0..1`.
+    /// Share of the robots' visits to distinct cells that repeat a teammate's visit in the same step, in `0..1`.
     #[serde(default)]
     pub mean_repeated: f64,
-    /// Steps until a robot first visited a burning cell; `None`: never. This and what follows is
-    /// defined in `docs/figures-of-merit.md`, and missing in old files.
+    /// Steps until a robot first visited a burning cell; `None`: never. This and the next five fields are defined in
+    /// `docs/figures-of-merit.md`, and missing in old files.
     pub steps_to_detection: Option<u64>,
     /// Burning cells of the world in that step.
     pub burning_cells_at_detection: Option<u32>,
     /// Steps for which a cell counts as seen after a visit.
     pub recent_steps: Option<u32>,
-    /// Share of the burning cells that were seen in the last steps.
+    /// Share of the burning cells that were seen in the last `recent_steps` steps.
     pub burning_seen_share: Option<f64>,
-    /// Moves from the nearest robot to the nearest burning cell that was not.
+    /// Moves from the nearest robot to the nearest burning cell that was not seen in these steps.
     pub front_distance: Option<f64>,
-    /// Share of the grid that was ever seen.
+    /// Share of the grid's cells that were ever seen.
     pub grid_seen_share: Option<f64>,
-    /// Mean `ln P(y)` of a visited cell under the prediction before the frame, where the estimator predicts frames.
+    /// Mean `ln P(y)` of a visited cell under the prediction before the frame; `None` if nothing is predicted.
     pub log_likelihood: Option<f64>,
     /// The server's `worlds_fingerprint`; empty in files of earlier releases.
     #[serde(default)]
     pub worlds_fingerprint: String,
-    /// Identifies all that the policy's actions depend on besides the worlds; empty in files of earlier releases.
+    /// Identifies everything the policy's actions depend on, except the worlds; empty in files of earlier releases.
     #[serde(default)]
     pub policy_fingerprint: String,
-    /// Processor seconds of training for the world's task, where `suite` knows them.
+    /// Processor seconds of training for the world's task, if `suite` recorded them.
     pub training_seconds: Option<f64>,
-    /// Whether it comes from a file.
+    /// Whether it comes from a file of `--add`.
     #[serde(skip)]
     pub is_added: bool,
     /// Reward of each step, in order.
@@ -84,24 +84,24 @@ pub(super) struct Group<'a> {
 }
 
 impl Group<'_> {
-    /// The mean over the runs that have a value.
+    /// Estimates the mean over the runs that have a value.
     pub(super) fn estimate(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> Option<Estimate> {
         let values: Vec<f64> = self.runs.iter().filter_map(|run| value(run)).collect();
         Estimate::of(&values)
     }
 
-    /// The values of the runs that have one, by seed.
+    /// Returns the values of the runs that have one, by seed.
     pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
         let pair = |run: &&PolicyRun| Some((run.world_seed, value(run)?));
         self.runs.iter().filter_map(pair).collect()
     }
 
-    /// Whether there is more than a robot alone in its world.
+    /// Returns false only for one robot alone in its world.
     pub(super) fn is_team(&self) -> bool {
         (self.robots, self.team) != (1, ALONE)
     }
 
-    /// The policy, with what tells it from others of that policy.
+    /// Returns the policy's name, with marks that distinguish the group from other groups of the policy.
     pub(super) fn name(&self, groups: &[Self]) -> String {
         match self.marks(groups).as_slice() {
             [] => self.policy.into(),
@@ -109,7 +109,7 @@ impl Group<'_> {
         }
     }
 
-    /// What tells it from the other groups of its policy: estimator and team, where these differ.
+    /// Returns the marks that distinguish the group from others of its policy: estimator and team, if they differ.
     pub(super) fn marks(&self, groups: &[Self]) -> Vec<String> {
         let twins = || groups.iter().filter(|other| other.policy == self.policy);
         let mut marks = Vec::new();

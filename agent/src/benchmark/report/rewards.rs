@@ -1,18 +1,17 @@
-//! Rewards over time: a moving average per policy, with its standard error over worlds, over the worlds'
-//! fire.
+//! Rewards over time: a moving average per policy, with standard errors over worlds, before shaded burning cells.
 
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use emberwatch_figures::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
+use emberwatch_figures::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
 use std::collections::BTreeSet;
 
-/// More points are hardly seen, but fill files.
+/// Maximum number of points of a curve. More would be hardly visible, and enlarge the file.
 const MAX_POINTS: usize = 500;
-/// The moving average spans about this part of the steps.
+/// The moving average spans about 1 / `WINDOWS` of the steps.
 const WINDOWS: usize = 40;
 
-/// The page of these runs, each with a reward at least. `fire_cells`: burning cells per step, or none.
+/// Returns the page of these runs, each with at least one reward. `fire_cells`: burning cells per step, may be empty.
 pub fn rewards(runs: &[PolicyRun], axis_label: &str, fire_cells: &[f32]) -> Lines {
     let groups = groups(runs);
     let n_steps = runs.iter().map(|run| run.rewards.len()).max();
@@ -69,7 +68,7 @@ fn shade(fire_cells: &[f32], window: usize) -> Shade {
     }
 }
 
-/// The best policies' curves, from the highest mean down.
+/// Returns the curves of the best policies, the highest mean first.
 fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
     let mean = |group: &Group<'_>| {
         let rewards = || group.runs.iter().flat_map(|run| &run.rewards);
@@ -77,12 +76,12 @@ fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
     };
     let mut ranked: Vec<&Group<'_>> = groups.iter().collect();
     ranked.sort_by(|a, b| mean(b).total_cmp(&mean(a)));
-    let best = ranked.into_iter().take(MOST_CURVES);
+    let best = ranked.into_iter().take(MAX_CURVES);
     best.map(|group| curve(group, readable(&group.name(groups)), window))
         .collect()
 }
 
-/// Over the steps that all worlds made.
+/// Returns a group's curve, over the steps that all its worlds have.
 fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
     let lengths = group.runs.iter().map(|run| run.rewards.len());
     let n_steps = lengths.min().unwrap_or(0);
@@ -103,7 +102,7 @@ fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
     }
 }
 
-/// A round number of steps, about a fortieth of all.
+/// Returns the length of the moving average: a round number of steps, about a fortieth of all.
 fn window(n_steps: usize) -> usize {
     let target = (n_steps / WINDOWS).max(1);
     let round = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000];
@@ -114,7 +113,7 @@ fn window(n_steps: usize) -> usize {
         .unwrap_or(1)
 }
 
-/// `(step, mean of the `window` values up to and including that step)`, steps counted from 1.
+/// Returns pairs of a step, counted from 1, and the mean of the `window` values up to and including that step.
 fn moving_average(values: &[f32], window: usize) -> Vec<(f64, f64)> {
     let window = window.min(values.len()).max(1);
     let mut sums = vec![0.0_f64];

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// A CSV file of runs, locked until it is dropped. If no run was written, a file that was created is removed again.
+/// A CSV file of runs, locked until it is dropped. A new file without runs is removed again.
 #[derive(Debug)]
 pub struct RunsFile {
     path: PathBuf,
@@ -20,10 +20,10 @@ pub struct RunsFile {
 }
 
 impl RunsFile {
-    /// Creates the file if it is missing, and locks it; waits for another process's lock for `patience`.
+    /// Creates the file if it is missing, and locks it. Waits for another process's lock, for `patience` at most.
     ///
     /// # Errors
-    /// If the file cannot be replaced, now or because another process holds it.
+    /// If the file cannot be replaced, or another process holds its lock for longer.
     pub fn lock(path: &Path, patience: Duration) -> Result<Self> {
         let locked = || {
             ensure!(
@@ -40,14 +40,14 @@ impl RunsFile {
         Ok(locked)
     }
 
-    /// Reads the file's runs, none of a new file.
+    /// Reads the file's runs. A new file has none.
     pub fn read(&self) -> Result<Vec<PolicyRun>> {
         read_runs(&self.path)
     }
 
-    /// Replaces the file: a row for each run, ordered by policy, then seed; a missing Brier score is an empty field.
+    /// Replaces the file with one row per run, ordered by policy, then seed. A missing value is an empty field.
     ///
-    /// Numbers are the shortest that read back as the same `f64`.
+    /// Numbers have the shortest text that parses to the same `f64`.
     pub fn replace(self, runs: &[PolicyRun]) -> Result<()> {
         let mut sorted: Vec<&PolicyRun> = runs.iter().collect();
         sorted.sort_by_key(|run| {
@@ -64,7 +64,7 @@ impl Drop for RunsFile {
     fn drop(&mut self) {
         let is_empty = self.file.metadata().is_ok_and(|found| found.len() == 0);
         if is_empty && is_at(&self.path, &self.file) {
-            // Nothing is lost if it stays.
+            // An empty file that stays does no harm.
             let _ = std::fs::remove_file(&self.path);
         }
     }
@@ -108,7 +108,7 @@ fn lock(path: &Path, deadline: Instant) -> Result<File> {
     }
 }
 
-/// Whether a path names an open file.
+/// Returns whether a path still names this open file.
 fn is_at(path: &Path, file: &File) -> bool {
     let both = path.metadata().and_then(|at| Ok((at, file.metadata()?)));
     both.is_ok_and(|(at, file)| (at.dev(), at.ino()) == (file.dev(), file.ino()))

@@ -1,7 +1,7 @@
 //! Means and standard errors over worlds, and paired differences between policies.
 //!
-//! A world is one draw: its steps are far too correlated to count as draws of their own (the fire
-//! fraction forgets itself over thousands of steps), so every error here is over worlds.
+//! A world is one sample. Its steps are too correlated to count as samples: the share of burning cells decorrelates
+//! over thousands of steps. So every standard error here is over worlds.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Mean and standard error (with `n - 1`) of one value per world; `None` without a world.
+    /// Computes mean and standard error (with `n - 1`) of one value per world; `None` without a world.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n_worlds = values.len();
         if n_worlds == 0 {
@@ -32,7 +32,7 @@ impl Estimate {
         })
     }
 
-    /// Mean of `values - baseline` over the worlds that both have; `None` if they share none.
+    /// Estimates the mean of `values - baseline` over the worlds that both have; `None` if they share none.
     pub fn of_difference(
         values: &BTreeMap<u64, f64>,
         baseline: &BTreeMap<u64, f64>,
@@ -43,8 +43,8 @@ impl Estimate {
     }
 }
 
-/// Ratio of the means over the worlds that both have; `None` if they share none or the reference
-/// is not positive, where a ratio says nothing.
+/// Returns the ratio of the means over the worlds that both have. Returns `None` if they share none, or if the
+/// reference's mean is not positive, where a ratio is meaningless.
 pub fn ratio_of_means(values: &BTreeMap<u64, f64>, reference: &BTreeMap<u64, f64>) -> Option<f64> {
     let (above, below) = shared(values, reference)
         .fold((0.0, 0.0), |(above, below), (value, base)| {

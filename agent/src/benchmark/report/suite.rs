@@ -1,7 +1,8 @@
-//! One score over tasks: rewards between the random walk's and an oracle's, their interquartile mean, and its interval.
+//! One score over all tasks: the interquartile mean of rewards, scaled between a random walk's and an oracle's, with
+//! its confidence interval.
 //!
-//! As Agarwal et al. (2021), *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, define it and
-//! `rliable` computes it.
+//! Defined by Agarwal et al. (2021), *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, and
+//! computed as in `rliable`.
 
 use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::number::{NOTHING, number};
@@ -12,29 +13,29 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The policy whose mean reward of a task is 0.
+/// The policy whose mean reward in a task defines score 0.
 pub const FLOOR: &str = "random_walk";
 
-/// The policy whose mean reward of a task is 1.
+/// The policy whose mean reward in a task defines score 1.
 pub const CEILING: &str = "oracle_ahead";
 
-const SCORES: &str = "Scores: 0 is random_walk's mean reward of a task, 1 is oracle_ahead's; over all the interquartile \
-     mean over the worlds of all tasks.";
+const SCORES: &str = "Scores: 0 is random_walk's mean reward in a task, 1 is oracle_ahead's. The last column is the \
+     interquartile mean over the worlds of all tasks.";
 
-/// Above the rows of policies that lack a task.
-pub(super) const PARTIAL: &str = "Policies that lack a task have no score over all:";
+/// Heading of the table of policies that lack a task.
+pub(super) const PARTIAL: &str = "Policies that lack a task have no score over all tasks:";
 
-/// How often worlds are drawn again for an interval.
+/// Number of bootstrap draws for an interval.
 const N_DRAWS: usize = 10_000;
 
-/// What was measured of one task.
+/// The runs of all policies on one task.
 #[derive(Debug, Clone)]
 pub struct TaskRuns {
     pub task: String,
     pub runs: Vec<PolicyRun>,
 }
 
-/// The mean rewards of one world: the ends of the scale, and a policy's.
+/// The mean rewards in one world, of both ends of the scale and of a policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldRewards {
     pub floor: f64,
@@ -51,11 +52,11 @@ pub struct Aggregate {
 }
 
 impl Aggregate {
-    /// Of the rewards of each task's worlds; `None` if a task has no scores.
+    /// Computes the score from the rewards in each task's worlds; `None` if a task has no scores.
     ///
-    /// The interval is that of a stratified bootstrap: in each draw the worlds of each task are drawn again, with
-    /// replacement, and give the policy's rewards and both ends of the scale. Policies on the same worlds meet the same
-    /// draws. Draws in which a task's ceiling is not above its floor have no scale and are left out.
+    /// The interval comes from a stratified bootstrap. Each draw resamples the worlds of each task with replacement,
+    /// both for the policy's rewards and for the ends of the scale. Policies on the same worlds have the same draws.
+    /// Draws in which a task's ceiling is not above its floor have no scale and are left out.
     pub fn of(tasks: &[Vec<WorldRewards>]) -> Option<Self> {
         let mean = score(tasks.iter().map(|worlds| worlds.iter().copied()))?;
         if tasks.iter().any(|worlds| worlds.len() == 1) {
@@ -81,13 +82,13 @@ impl Aggregate {
 }
 
 impl TaskRuns {
-    /// A policy's score of each world, scaled so that the random walk's mean is 0 and the oracle's 1; none if these
-    /// are missing, or the oracle's is no higher.
+    /// Returns a policy's score in each world, on a scale from the random walk's mean (0) to the oracle's (1). Returns
+    /// no scores if either is missing, or if the oracle's mean is not the higher one.
     pub fn scores(&self, policy: &str) -> Vec<f64> {
         scaled(&self.rewards(policy)).unwrap_or_default()
     }
 
-    /// The rewards of the worlds of a policy, of the random walk and of the oracle.
+    /// Returns the rewards of a policy, the random walk and the oracle, for each world that all three have.
     fn rewards(&self, policy: &str) -> Vec<WorldRewards> {
         let by_seed = |policy| -> BTreeMap<u64, f64> {
             let runs = self.of(policy);
@@ -108,15 +109,15 @@ impl TaskRuns {
         self.runs.iter().filter(move |run| run.policy == policy)
     }
 
-    /// The mean over the worlds that have a value.
+    /// Returns the mean over the worlds that have a value.
     fn mean(&self, policy: &str, value: fn(&PolicyRun) -> Option<f64>) -> Option<f64> {
         let values: Vec<f64> = self.of(policy).filter_map(value).collect();
         Estimate::of(&values).map(|estimate| estimate.mean)
     }
 }
 
-/// Renders the scores of all policies, a column per task, and the likelihood and Brier score of their beliefs. Policies
-/// that lack a task have a table of their own.
+/// Renders the scores of all policies, with one column per task, and the likelihood and Brier score of their beliefs.
+/// Policies that lack a task have a separate table.
 pub fn render_suite(tasks: &[TaskRuns]) -> String {
     let policies = by_score(tasks);
     let scores = policies.iter().map(|(policy, score)| {
@@ -124,7 +125,7 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
             let mean = Estimate::of(&task.scores(policy));
             mean.map_or(NOTHING.into(), |it| number(it.mean, 3))
         };
-        let cells = tasks.iter().map(mean).chain(score.map(told));
+        let cells = tasks.iter().map(mean).chain(score.map(score_text));
         (score.is_some(), row(policy, cells))
     });
     let (complete, partial) = by_completeness(scores);
@@ -149,7 +150,7 @@ pub fn render_suite(tasks: &[TaskRuns]) -> String {
     parts.collect::<Vec<_>>().join("\n")
 }
 
-/// A policy's mean of each task; `None` if it has none.
+/// Returns the row of a policy's means in each task; `None` if it has no value in any task.
 fn belief_row(
     tasks: &[TaskRuns],
     policy: &str,
@@ -161,7 +162,7 @@ fn belief_row(
     is_any.then(|| row(policy, means.iter().map(cell)))
 }
 
-/// A table with a column for each task; `None` without rows.
+/// Returns a table with one column per task; `None` without rows.
 fn table(tasks: &[TaskRuns], last: Option<&str>, rows: Vec<Vec<String>>) -> Option<Table> {
     let names = tasks.iter().map(|task| &*task.task);
     let headings: Vec<&str> = ["policy"].into_iter().chain(names).chain(last).collect();
@@ -172,7 +173,7 @@ fn row(policy: &str, cells: impl Iterator<Item = String>) -> Vec<String> {
     [policy.to_owned()].into_iter().chain(cells).collect()
 }
 
-/// Rows of policies that have all tasks, and the other rows.
+/// Separates the rows of policies that have all tasks from the other rows.
 pub(super) fn by_completeness(
     rows: impl Iterator<Item = (bool, Vec<String>)>,
 ) -> (Vec<Vec<String>>, Vec<Vec<String>>) {
@@ -181,7 +182,7 @@ pub(super) fn by_completeness(
     (rows(complete), rows(partial))
 }
 
-/// All policies with their scores over tasks, the highest first; then those that lack a task, by name.
+/// Returns all policies with their scores over tasks, the highest first. Policies that lack a task come last, by name.
 pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
     let names = tasks
         .iter()
@@ -197,8 +198,8 @@ pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
     all
 }
 
-/// A score with its interval, as tables and figures show it.
-pub fn told(Aggregate { mean, interval }: Aggregate) -> String {
+/// Formats a score with its interval, for tables and figures.
+pub fn score_text(Aggregate { mean, interval }: Aggregate) -> String {
     let mean = number(mean, 3);
     match interval.map(|ends| ends.map(|it| number(it, 3))) {
         Some([low, high]) => format!("{mean} [{low}, {high}]"),
@@ -206,14 +207,14 @@ pub fn told(Aggregate { mean, interval }: Aggregate) -> String {
     }
 }
 
-/// The interquartile mean of all worlds' scores; `None` without tasks, or if one has no scores.
+/// Returns the interquartile mean of all worlds' scores; `None` without tasks, or if a task has no scores.
 fn score(tasks: impl Iterator<Item = impl Iterator<Item = WorldRewards>>) -> Option<f64> {
     let scores = tasks.map(|worlds| scaled(&worlds.collect::<Vec<_>>()));
     let scores = scores.collect::<Option<Vec<_>>>()?.concat();
     (!scores.is_empty()).then(|| interquartile_mean(scores))
 }
 
-/// Each world's score on the scale of their means; `None` if the ceiling is not above the floor.
+/// Returns each world's score, scaled from the mean floor to the mean ceiling; `None` if the ceiling is not higher.
 fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
     let n = worlds.len() as f64;
     let floor = worlds.iter().map(|it| it.floor).sum::<f64>() / n;
@@ -222,7 +223,7 @@ fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
     (ceiling > floor).then(|| worlds.iter().map(score).collect())
 }
 
-/// The mean of what is left when a quarter of the numbers, rounded down, goes at each end.
+/// Returns the mean without the lowest and the highest quarter of the numbers, each rounded down.
 fn interquartile_mean(mut numbers: Vec<f64>) -> f64 {
     numbers.sort_by(f64::total_cmp);
     let n_cut = numbers.len() / 4;
@@ -230,7 +231,7 @@ fn interquartile_mean(mut numbers: Vec<f64>) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// Between the two numbers around a share of sorted ones, in proportion.
+/// Returns a quantile of sorted numbers, by linear interpolation.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     let at = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
@@ -241,7 +242,7 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Worlds whose rewards are scores.
+    /// Returns worlds in which the policy's rewards equal its scores.
     fn worlds(scores: &[f64]) -> Vec<WorldRewards> {
         let world = |&policy: &f64| WorldRewards {
             floor: 0.0,
@@ -276,7 +277,7 @@ mod tests {
             ceiling: 2.0 * policy,
             policy,
         };
-        // The ratio of a world is the same in all, so that only the mixture of worlds varies.
+        // All worlds have the same ratios, so that only the drawn mixture of worlds varies.
         let equal = [vec![world(1.0), world(1.0), world(1.0), world(1.0)]];
         let point = Aggregate::of(&equal).expect("scores");
         assert_eq!(point.interval, Some([point.mean; 2]));
@@ -318,10 +319,10 @@ mod tests {
                 interval: None,
             };
             assert_eq!(score, expected, "{tasks:?}");
-            assert_eq!(told(score), "0.500 (no interval)");
+            assert_eq!(score_text(score), "0.500 (no interval)");
         }
-        // Worlds of equal scores are an observation: their interval is a point.
+        // Several worlds with equal scores have an interval: a single point.
         let equal = Aggregate::of(&[worlds(&[0.5, 0.5])]).expect("scores");
-        assert_eq!(told(equal), "0.500 [0.500, 0.500]");
+        assert_eq!(score_text(equal), "0.500 [0.500, 0.500]");
     }
 }

@@ -8,12 +8,12 @@ use crate::benchmark::report::statistics::ratio_of_means;
 use comfy_table::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What oracles are fed with: others are given as a percentage of the best of them.
+/// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's.
 const TRUTH: &str = "truth";
 
-/// Every policy over all worlds, its figures of merit, then the worlds with less and with more fire.
+/// Renders every policy over all worlds, its figures of merit, then the worlds with less and with more fire.
 ///
-/// Policies stand in the order given; `baseline` names the one that paired differences are to.
+/// Policies keep their order. `baseline` names the policy to which paired differences are computed.
 pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
     let groups = groups(runs);
     if groups.is_empty() {
@@ -83,7 +83,7 @@ fn rewards(group: &Group<'_>) -> impl Iterator<Item = f64> {
     group.by_seed(reward).into_values()
 }
 
-/// Of the best oracle's with as many robots.
+/// Renders a group's reward as a percentage of the best oracle's with the same number of robots.
 fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     let wanted = (TRUTH, group.robots);
     let oracles = groups.iter();
@@ -95,8 +95,8 @@ fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
 }
 
-/// Mean rewards over the half of the worlds with less fire and the half with more; the middle one
-/// of an odd number of worlds goes to the latter.
+/// Renders mean rewards over the half of the worlds with less fire, and over the half with more. The middle one of an
+/// odd number of worlds belongs to the half with more.
 fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
     let mut fire_of: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for run in runs {

@@ -6,7 +6,7 @@ use crate::benchmark::report::statistics::Estimate;
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use std::collections::BTreeSet;
 
-/// The page of these runs: a curve for each team of each policy, in the order given.
+/// Returns the page: one curve per policy and kind of team, in the given order.
 pub fn teams(runs: &[PolicyRun], axis_label: &str) -> Lines {
     let groups = groups(runs);
     let mut kinds: Vec<(&str, &str)> = Vec::new();
@@ -34,7 +34,7 @@ pub fn teams(runs: &[PolicyRun], axis_label: &str) -> Lines {
     }
 }
 
-/// A team's name, with its policy where several have such a team.
+/// Returns a team's curve. Its name includes the policy if several policies have such a team.
 fn curve((policy, team): (&str, &str), kinds: &[(&str, &str)], groups: &[Group<'_>]) -> Curve {
     let n_twins = kinds.iter().filter(|kind| kind.1 == team).count();
     let name = match n_twins {

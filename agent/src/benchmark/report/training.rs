@@ -10,7 +10,7 @@ use std::path::Path;
 /// The figure's name in the folder of a training.
 pub const FIGURE: &str = "training.svg";
 
-/// Points of a curve: each is the mean over a part of the rows.
+/// Maximum number of points of a curve. Each point is the mean over a part of the rows.
 const POINTS: usize = 200;
 
 pub fn draw_training(folder: &Path) -> Result<()> {
@@ -22,7 +22,7 @@ pub fn draw_training(folder: &Path) -> Result<()> {
             1 => "each row of metrics.csv".into(),
             n => format!(
                 "means over {n} rows of metrics.csv each; bands: ±1 standard error over those rows, as if \
-                 each were a draw of its own"
+                 rows were independent"
             ),
         },
         axis: "world steps, of all worlds together".into(),
@@ -69,8 +69,8 @@ fn panels(rows: &Rows) -> Vec<Panel> {
     panels.map(panel).into()
 }
 
-/// A column's means over equal parts of the rows, at the last world step of each, with their standard
-/// errors where a part has several rows.
+/// Returns a column's means over equal parts of the rows, each at the part's last world step. They have standard errors
+/// if a part has several rows.
 fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     let (steps, values) = (rows.column("world_steps"), rows.column(column));
     let part = rows.len().div_ceil(POINTS).max(1);
@@ -90,7 +90,7 @@ fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     }
 }
 
-/// The model's step size as a share of the DQN's, where both are there (paper eq. 20).
+/// Returns the model's step size divided by the DQN's, where both exist (paper eq. 20).
 fn quotient([model, dqn]: &[Curve; 2]) -> Curve {
     let of_dqn = |x: f64| dqn.points.iter().find(|point| point.0 == x);
     let share = |&(x, rate): &(f64, f64)| Some((x, rate / of_dqn(x)?.1));

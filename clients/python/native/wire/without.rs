@@ -1,4 +1,4 @@
-//! Systems other than Linux: servers cannot be attached to, and nothing is shown to observers.
+//! Stand-ins for systems other than Linux, which cannot connect to servers or publish beliefs.
 
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::backend::{Backend, StepAnswer};
@@ -15,7 +15,7 @@ use std::marker::PhantomData;
 use std::ops::Range;
 use std::time::Duration;
 
-/// There is none.
+/// A connection, which cannot exist here.
 pub struct Connection(Infallible);
 
 impl Connection {
@@ -44,7 +44,7 @@ impl Backend for Connection {
     }
 }
 
-/// There is none.
+/// An observer, which cannot exist here.
 pub struct Observer<H>(Infallible, PhantomData<H>);
 
 impl Observer<FrameHeader> {
@@ -74,7 +74,7 @@ impl<H> Observer<H> {
     }
 }
 
-/// A channel without observers.
+/// A channel that nobody observes.
 pub struct Feed;
 
 /// A belief for observers.
@@ -92,7 +92,7 @@ impl Feed {
         Self
     }
 
-    /// No world is to be shown.
+    /// Returns no worlds: none is due for publishing.
     pub fn due(&self, _: usize) -> Vec<usize> {
         Vec::new()
     }

@@ -1,12 +1,12 @@
-"""Emberwatch: explore a wildfire that a robot only partly sees.
+"""Emberwatch: explore a wildfire that a robot can only partly observe.
 
 Importing this package registers its environments with Gymnasium:
 
     import gymnasium, emberwatch
     env = gymnasium.make("emberwatch/Wildfire-v0")
 
-Worlds are simulated in this process, or with `instance="lab"` by a running `emberwatch-server`.
-Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
+Worlds are simulated in this process. With `instance="lab"`, a running `emberwatch-server` simulates
+them. To work without Gymnasium, `connect` to a running server, or `observe` what it publishes.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ __version__ = VERSION
 
 
 def _register(task: Task, /, **keywords: Any) -> None:
-    """Registers the three environments of a task, with these keywords."""
+    """Registers the three environments of a task, with `keywords` as defaults."""
     for module, kind, version, steps in (
         ("path_env", "", 0, task.max_steps),
         ("moves_env", "Moves", 0, task.n_moves * task.max_steps),
@@ -96,13 +96,13 @@ def _register(task: Task, /, **keywords: Any) -> None:
 
 
 _TASKS = built_in_tasks()
-# Without `task`, as the worlds are the default ones, of which keywords may change anything.
+# Registered without `task`: these are the default worlds, and keywords may change any setting.
 _register(_TASKS.pop("wildfire"))
 for _name, _task in _TASKS.items():
     _register(_task, task=_name)
 
 
-#: Modules that are imported when they are first used.
+#: Modules that are imported on first use.
 _LATER = frozenset(("benchmark", "planning", "sb3", "wrappers"))
 
 
@@ -113,9 +113,10 @@ def __getattr__(name: str) -> Any:
 
 
 def parallel_env(**keywords: Any) -> WildfireParallelEnv:
-    """All robots of one world as a PettingZoo environment; see `WildfireParallelEnv`.
+    """Makes a PettingZoo environment of all robots of one world; see `WildfireParallelEnv`.
 
-    Raises `ModuleNotFoundError` without PettingZoo, which ``pip install emberwatch[teams]`` brings.
+    Raises:
+        ModuleNotFoundError: If PettingZoo is missing: ``pip install emberwatch[teams]``.
     """
     try:
         from emberwatch.envs.parallel import WildfireParallelEnv

@@ -7,18 +7,18 @@ from emberwatch._native import VERSION
 
 _COMMANDS: Final = """
 commands, each with --help:
-  python -m emberwatch.render.film   films of recordings
-  python -m emberwatch.landscape     recorded worlds from rasters of fires
+  python -m emberwatch.render.film   makes films of recordings
+  python -m emberwatch.landscape     makes recorded worlds from rasters of fires
 
-programs, which are packages of their own (pip install "emberwatch[programs]"):
+programs in separate packages (pip install "emberwatch[programs]"):
   emberwatch-server                  simulates worlds that several processes share
-  emberwatch-agent                   explores, learns, compares
+  emberwatch-agent                   explores worlds, trains policies, compares them
   emberwatch-dashboard               shows an instance or a recording in a browser
 """
 
 
 def main() -> None:
-    """Prints the version, or what else can be run."""
+    """Prints the version, or a list of the commands and programs."""
     parser = argparse.ArgumentParser(
         prog="python -m emberwatch",
         epilog=_COMMANDS,

@@ -1,7 +1,7 @@
-"""The part of the package that is written in Rust.
+"""The Rust part of the package.
 
-Waits leave the interpreter to other threads; Ctrl-C ends them. What is open belongs to the process
-that made it: in a forked child, using it is an error with code `"forked"`.
+Calls that wait release the interpreter lock, and Ctrl-C interrupts them. Open objects belong to the
+process that made them: using one in a forked child raises an error with code `"forked"`.
 """
 
 from os import PathLike
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 _Doubles = NDArray[np.float64]
 
 class _Airspace(Protocol):
-    """What counts of an `Airspace`."""
+    """The attributes of an `Airspace` that the native module reads."""
 
     @property
     def radius(self) -> int: ...
@@ -25,13 +25,13 @@ class _Airspace(Protocol):
     def no_fly(self) -> NDArray[np.bool_] | None: ...
 
 class _Text(Protocol):
-    """A model or a description."""
+    """A model or a description of recorded states."""
 
     @property
     def toml(self) -> str: ...
 
 class _Spec(Protocol):
-    """What counts of a `WorldSpec`."""
+    """The attributes of a `WorldSpec` that the native module reads."""
 
     @property
     def height(self) -> int: ...
@@ -52,7 +52,7 @@ class _Spec(Protocol):
 
 VERSION: str
 
-#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+#: Smallest training seed. Worlds with smaller seeds are for tests: do not train or tune on them.
 FIRST_TRAINING_SEED: int
 
 #: Maximum number of moves in a path.
@@ -68,16 +68,16 @@ MAX_SIDE: int
 MAX_VALUES: int
 
 def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
-    """Texts of the built-in files by name; `states`: descriptions of recorded states."""
+    """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
 
 def explain(status: int, detail: int) -> tuple[str, str] | None:
-    """The name of a status code, and its sentence for people; None if no refusal has the code."""
+    """Returns the name of a status code and its message; None if no refusal has the code."""
 
 def check_settings(settings: str) -> str:
-    """All settings that a server with these would have; JSON from JSON."""
+    """Checks settings in JSON, and returns them with all defaults, as JSON."""
 
 def worlds_fingerprint(settings: str) -> str:
-    """The `worlds_fingerprint` of a server with these settings, as JSON; simulates nothing."""
+    """Returns the `worlds_fingerprint` of a server with these settings in JSON, without worlds."""
 
 _Numbers = tuple[float, bool, bool, int, int, NDArray[np.int64]]
 _Columns = tuple[
@@ -92,9 +92,9 @@ _Columns = tuple[
 
 @final
 class Answer:
-    """The answer to a step or an observation, of consecutive robots.
+    """The answer to a step or an observation, for consecutive robots.
 
-    No other object shares its memory. Results are bytes as PROTOCOL.md lays them out.
+    It shares its memory with no other answer. Results are bytes in the layout of PROTOCOL.md.
     """
 
     def __new__(
@@ -108,9 +108,9 @@ class Answer:
         simulation_nanos: int,
         payload: NDArray[np.uint8],
     ) -> Answer:
-        """Presents a payload: results of the worlds, results of the robots, frames.
+        """Wraps a payload: results of the worlds, results of the robots, frames.
 
-        `team`: robots of each world.
+        `team`: number of robots of each world.
         """
 
     @property
@@ -119,66 +119,69 @@ class Answer:
     def simulation_nanos(self) -> int: ...
     @property
     def frames(self) -> NDArray[np.uint8]:
-        """A frame of each robot, or of each world's team, `(n, H, W)`; a view."""
+        """One frame for each robot, or for each world's team, `(n, H, W)`; a view."""
 
     @property
     def worlds(self) -> NDArray[np.uint8]:
-        """Results of the worlds, bytes; a view."""
+        """Results of the worlds as bytes; a view."""
 
     @property
     def robots(self) -> NDArray[np.uint8]:
-        """Results of the robots, bytes; a view."""
+        """Results of the robots as bytes; a view."""
 
     @property
     def results(self) -> NDArray[np.uint8]:
-        """Bytes of `wire.RESULT_DTYPE`, one for each robot; a new array."""
+        """One `wire.RESULT_DTYPE` for each robot, as bytes; a new array."""
 
     @property
     def world_of_robots(self) -> NDArray[np.int64]:
-        """The position of each robot's world, `(n_robots,)`."""
+        """The index in `worlds` of each robot's world, `(n_robots,)`."""
 
     def result(self, index: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """The fields of one robot's `WorldResult` and `RobotResult`."""
+        """Returns the fields of one robot's `WorldResult` and `RobotResult`."""
 
     def numbers(self, pays: int) -> _Numbers:
-        """Reward, terminated, truncated, step, distinct cells visited and cell of the first robot.
+        """Returns the results of the first robot.
 
-        The cell is a new array, `(1, 2)`. `pays`: which reward, 0 the share, 1 the team's, 2 the
-        marginal one.
+        They are reward, terminated, truncated, step, number of distinct visited cells, and cell (a
+        new array, `(1, 2)`). `pays` chooses the reward: 0 share, 1 team, 2 marginal.
         """
 
 def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
-    """The numbers of many robots, from bytes of `wire.RESULT_DTYPE`; new arrays.
+    """Returns the results of many robots as new arrays, from bytes of `wire.RESULT_DTYPE`.
 
-    Rewards, terminated, truncated, steps, distinct cells visited, `(n,)` each; cells, `(n, 2)`; and
-    whether any episode is over. `pays`: as of `Answer.numbers`.
+    They are rewards, terminated, truncated, steps and numbers of distinct visited cells, `(n,)`
+    each; cells, `(n, 2)`; and whether any episode is over. `pays` is as in `Answer.numbers`.
     """
 
 def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
-    """Paths as bytes, `(n_robots, n_moves)`, checked; None as of `Lease.step`."""
+    """Checks paths, and returns them as bytes, `(n_robots, n_moves)`; None as in `Lease.step`."""
 
 class Server:
-    """A connection to a server, or worlds in this process. Threads may share it, in turns."""
+    """A connection to a server, or worlds in this process. Threads may share it, and take turns."""
 
     def __init__(self, instance: str, client: str, seconds: float) -> None:
-        """Opens it; `client` names this program in the server's log."""
+        """Connects to a server; `client` names this program in the server's log."""
 
     @staticmethod
     def embedded(settings: str, warns: bool) -> Server:
-        """Worlds in this process, of these settings of `config/server.toml`, as JSON.
+        """Creates worlds in this process with settings of `config/server.toml`, as JSON.
 
-        `warns`: of starts that no-fly cells close in.
+        `warns`: whether to warn about start cells that no-fly cells enclose.
         """
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
-        """Hidden states of worlds in this process, as `Truth`; refused of a server's."""
+        """Returns hidden states of worlds in this process, as fields of `Truth`.
+
+        Refused on a connection to a server.
+        """
 
     @property
     def info(self) -> str:
-        """What the server said of itself, as JSON."""
+        """The server's reply to `hello`, as JSON."""
 
     def control(self, text: bytes, what: str, seconds: float) -> str:
-        """Sends JSON, `what` in errors; returns the JSON of the answer."""
+        """Sends a JSON request, and returns the JSON answer; `what` names it in errors."""
 
     def step(
         self,
@@ -191,13 +194,13 @@ class Server:
         body: bytes,
         seconds: float,
     ) -> Answer:
-        """Sends a request on `step` as it is."""
+        """Sends a raw request on the channel `step`."""
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Closes the connection. May be called again."""
 
 class Options:
-    """Beliefs and plans of worlds with one robot each; worlds are numbered from 0."""
+    """Beliefs about worlds with one robot each, and plans in them; worlds count from 0."""
 
     def __init__(
         self,
@@ -210,7 +213,7 @@ class Options:
     ) -> None:
         """Checks all arguments.
 
-        `watched`: the instance in which beliefs are published, and the number there of world 0.
+        `watched`: the instance on which beliefs are published, and the number of world 0 there.
         """
 
     @property
@@ -218,16 +221,16 @@ class Options:
         """Name of the estimator that keeps the beliefs."""
 
     def begin(self, worlds: list[int], seeds: list[int]) -> None:
-        """Starts episodes: the first belief in each of `worlds`, and a seed."""
+        """Starts episodes in `worlds` with their seeds, from the first belief."""
 
     def take_over(self, world: int, kind: str, data: bytes) -> bool:
-        """Continues with a belief of another client about the present step; False: no fit."""
+        """Loads another client's belief about the current step; False if it does not fit."""
 
     def left(self, world: int) -> tuple[str, bytes] | None:
         """Returns the kind and the bytes of a belief, for the next client."""
 
     def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Updates beliefs with an earlier step: bytes as of `plan`, frames `(n, H, W)`."""
+        """Updates beliefs with an earlier step; `results` as in `plan`, frames `(n, H, W)`."""
 
     def plan(
         self,
@@ -236,22 +239,22 @@ class Options:
         frames: NDArray[np.uint8] | None,
         flown: list[int] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Updates beliefs with the present step, unless `frames` is None, then plans.
+        """Updates beliefs with the current step, unless `frames` is None, then plans.
 
-        `results`: bytes of `wire.RESULT_DTYPE`.
+        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the flown option of each world.
 
         Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
-        worlds, new arrays.
+        worlds, as new arrays.
         """
 
     def close(self) -> None:
         """Drops all beliefs. May be called again."""
 
 class Flights:
-    """The present path of each robot, as far as it is flown. Rows are robots.
+    """The incomplete path of each robot, one row for each robot.
 
-    With `reward`, each cell pays when it is first visited, or seen where that pays, what its hidden
-    state pays. A copy or pickle is as new.
+    With `reward`, the rewards by state, each cell pays by its hidden state when the path first
+    visits it, or first sees it if the airspace pays seen cells. A copy or pickle has no moves.
     """
 
     def __init__(
@@ -265,7 +268,7 @@ class Flights:
     ) -> None: ...
     @property
     def robots(self) -> NDArray[np.int64]:
-        """Row and column of each robot; a new array, as the others."""
+        """Row and column of each robot. All properties are new arrays."""
 
     @property
     def n_made(self) -> NDArray[np.int64]:
@@ -273,17 +276,17 @@ class Flights:
 
     @property
     def visited(self) -> NDArray[np.uint8]:
-        """255 in the cells visited, else 0."""
+        """255 in the visited cells, otherwise 0."""
 
     @property
     def paid(self) -> NDArray[np.float64]:
-        """What the moves have been paid."""
+        """Sum of the rewards of the moves made."""
 
     @property
     def masks(self) -> NDArray[np.int8]:
-        """1 for each move that takes a robot to another cell, else 0, `(n_rows, 4)`.
+        """1 for each move that takes a robot to another cell, otherwise 0, `(n_rows, 4)`.
 
-        All 1 where no move does.
+        All 1 in a row in which no move does.
         """
 
     def begin(
@@ -292,19 +295,19 @@ class Flights:
         robots: NDArray[np.int64],
         states: NDArray[np.uint8] | None,
     ) -> None:
-        """Begins some paths; `robots` and hidden `states` are those of all rows."""
+        """Begins paths in the rows `begun`; `robots` and `states` have an entry for every row."""
 
     def completes(self) -> NDArray[np.bool_]:
-        """Of which rows the next move is the last of its path."""
+        """Returns the mask of the rows whose next move completes their path."""
 
     def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The paths that these actions would complete, `(n_rows, T)`."""
+        """Returns each row's path with one more move, `(n_rows, T)`; does not make the move."""
 
     def made(self, row: int) -> NDArray[np.uint8]:
-        """The moves made by one robot."""
+        """Returns the moves made by one robot."""
 
     def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One move of some robots; returns what it pays each row."""
+        """Makes a move in the rows `moved`; returns the reward of each row."""
 
 class Lease:
     """The right to fly consecutive robots, and the step k of each of their worlds."""
@@ -315,7 +318,8 @@ class Lease:
     ) -> Answer | None:
         """Flies a path with each robot, for the next step of its world.
 
-        None if the paths are no plain array of int64 or uint8, or wrong: `as_moves` converts them.
+        Returns None if the paths are not a plain array of int64 or uint8, or are invalid: then
+        `as_moves` converts or refuses them.
         """
 
     def fly(
@@ -326,13 +330,13 @@ class Lease:
         accepts_late: bool,
         seconds: float,
     ) -> tuple[Answer, int] | None:
-        """As `step`, sent again until the worlds have moved; see `lease.Lease.fly`."""
+        """Like `step`, but repeats the request until the worlds have moved; see `client.Lease`."""
 
     def observe(self, first_robot: int, n_robots: int, flags: int, seconds: float) -> Answer:
-        """The last results and frames again; steps go on from there."""
+        """Returns the last results and frames again; steps continue from the observed step."""
 
     def note(self, world: int, step: int) -> None:
-        """From here on a world is at this step."""
+        """Sets the step that a world is at."""
 
     @property
     def steps(self) -> list[int]:
@@ -340,10 +344,10 @@ class Lease:
 
 @final
 class Windows:
-    """A square of cells around each robot, in rows: the observation parts `local` and `recent`.
+    """A square of cells around each robot, one row for each: the parts `local` and `recent`.
 
-    The channels about the world come first, then 255 where this path has been, 255 off the grid and
-    in no-fly cells, and 255 times the share of the path's moves that are left.
+    The channels about the world come first. Then follow 255 in the cells that this path has
+    visited, 255 off the grid and in no-fly cells, and 255 times the share of remaining moves.
     """
 
     def __new__(
@@ -355,55 +359,56 @@ class Windows:
         n_of_world: int,
         airspace: _Airspace,
     ) -> Windows:
-        """`side`: cells along a side, odd; `n_of_world`: channels about the world."""
+        """`side`: side in cells, odd; `n_of_world`: number of channels about the world."""
 
     def begin(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
-        """Shows the world, `(n_begun, H, W, n_of_world)`, to robots that have visited nothing."""
+        """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
 
     def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
-        """Marks the cells of some robots as visited, and what their visit pays as found."""
+        """Marks the visited cells of some robots, and clears world channels of cells that paid."""
 
     def around(self, flights: Flights) -> NDArray[np.uint8]:
-        """The windows of all robots, `(n_rows, side, side, channels)`; a new array."""
+        """Returns the windows of all robots, `(n_rows, side, side, channels)`; a new array."""
 
 class Frames:
-    """Reads `Frame`s, of one world or of all."""
+    """A reader of `Frame`s, of one world or of all worlds."""
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """The fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none comes in time."""
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Closes the reader. May be called again."""
 
 class Truths:
-    """Reads `Truth`s, of one world or of all."""
+    """A reader of `Truth`s, of one world or of all worlds."""
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """The fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none comes in time."""
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Closes the reader. May be called again."""
 
 class Outlooks:
-    """Reads `Outlook`s, of one world or of all."""
+    """A reader of `Outlook`s, of one world or of all worlds."""
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """The fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none comes in time."""
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Closes the reader. May be called again."""
 
 class Recording:
-    """Reads a recording."""
+    """A reader of a recording.
 
-    def __init__(self, path: str | bytes | PathLike[str]) -> None:
-        """Raises an error with code "cut" or "damaged" where all before is whole."""
+    Errors have the code "cut" or "damaged" if all records before are complete.
+    """
 
+    def __init__(self, path: str | bytes | PathLike[str]) -> None: ...
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
-        """Nanoseconds, and the server's JSON or the fields of a sample; None at the end."""
+        """Returns nanoseconds, kind, and a server's JSON or a sample's fields; None at the end."""
 
 def estimator_names() -> list[tuple[str, str]]:
     """Returns the name and a description of each estimator on which options can be planned."""
@@ -412,30 +417,30 @@ def option_names() -> tuple[list[str], list[str]]:
     """Returns the names of the options, and of the features that describe each plan."""
 
 def read_model(text: str) -> dict[str, Any]:
-    """The fields of `Model` but `toml`; raises `ValueError` for what is no model file."""
+    """Returns the fields of `Model` except `toml`; `ValueError` if the text is not a model file."""
 
 def grid_of_maps(path: str) -> tuple[int, int] | None:
-    """Height and width of the maps of a model file; None if it has none, or is wrong."""
+    """Returns height and width of the maps of a model file; None without maps or if invalid."""
 
 def model_text(path: str) -> str:
-    """The text of a model file, with the maps that are in files beside it."""
+    """Returns the text of a model file, including maps that are in separate files."""
 
 def model_with_radius(text: str, radius: int) -> str:
-    """The text of a model file with another sensor radius."""
+    """Returns the text of a model file with another sensor radius."""
 
 def description_with_radius(text: str, radius: int) -> str:
-    """The same of a description."""
+    """Returns the text of a description with another sensor radius."""
 
 def read_description(text: str) -> dict[str, Any]:
-    """The same of `Description`."""
+    """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
 
 @final
 class Transition:
-    """``Phi`` for a model file's text on one grid; it keeps work space."""
+    """``Phi`` for a model file's text on one grid, with its work space."""
 
     def __new__(cls, model: str, height: int, width: int) -> Transition: ...
     def apply(self, beliefs: _Doubles) -> _Doubles:
-        """Of `(S, n, H, W)`, a new array."""
+        """Returns ``Phi`` of beliefs `(S, n, H, W)` as a new array."""
 
     def __getnewargs__(self) -> tuple[str, int, int]: ...
 
@@ -505,11 +510,14 @@ def beam_search(
     width: int,
     airspace: _Airspace | None = None,
 ) -> NDArray[np.uint8]:
-    """A path for each world: `(n, H, W)`, `(n, 2)` and `(n,)` give `(n, n_moves)`."""
+    """Returns a path for each world, `(n, n_moves)`.
+
+    `values`: `(n, H, W)`; `robots`: `(n, 2)`; `keys`: `(n,)`, seeds that break ties.
+    """
 
 @final
 class MeritTally:
-    """The figures of merit of some worlds while they go on."""
+    """Running figures of merit of several worlds."""
 
     def __new__(
         cls, n_worlds: int, height: int, width: int, target: int, recent_steps: int
@@ -522,10 +530,13 @@ class MeritTally:
         n_burning: NDArray[np.uint32],
         states: NDArray[np.uint8] | None,
     ) -> None:
-        """One step: `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
+        """Adds a step; shapes `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
 
     def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
-        """The fields of `Merit`."""
+        """Returns the fields of `Merit`."""
 
 def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
-    """Integers below `n_choices`, as bytes; None if it is no plain array of one for each row."""
+    """Checks one integer below `n_choices` for each row, and returns them as bytes.
+
+    None if the argument is not a plain array of such integers.
+    """

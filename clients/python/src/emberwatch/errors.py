@@ -1,6 +1,6 @@
-"""What can go wrong. `EmberwatchError` covers all of it; `code` names the cause.
+"""The errors of this package. All are an `EmberwatchError`, whose `code` names the cause.
 
-Subclasses exist only where a caller acts differently.
+A cause has a subclass only where callers handle it differently.
 """
 
 from typing import Final, Self
@@ -12,21 +12,23 @@ class EmberwatchError(Exception):
     """Base of all errors of this package.
 
     Attributes:
-        code: The cause. A refusal has the name of its status (PROTOCOL.md section 5), such as
-            `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
-            earlier step or reset did not finish: reset or resume), `"forked"` (neither channels
-            nor worlds in a process survive `fork`), `"embedded"` (worlds in this process could
-            not be made), `"threads"` (the system starts no more), `"channel"` (iceoryx2, or a
-            system call that it needs, failed), `"bad_answer"` (client and server
-            are not of one release), `"program"` (a prior or a network failed),
-            `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
-        detail: The number that comes with a refusal; its meaning depends on the status.
+        code: The cause. If the server refused a request, the name of the status (PROTOCOL.md
+            section 5), such as `"busy"`; the refused request changed nothing in the world. Other
+            codes are `"closed"`, `"interrupted"` (an earlier step or reset did not finish: reset
+            or resume), `"forked"` (channels and worlds in this process do not survive `fork`),
+            `"embedded"` (the worlds in this process could not be created), `"threads"` (the
+            system cannot start more threads), `"channel"` (iceoryx2, or a system call that it
+            needs, failed), `"bad_answer"` (client and server are of different releases),
+            `"program"` (a prior or a network failed), `"pid_namespace"` (the server runs in a
+            different PID namespace), `"impossible_frame"` and `"recording"`.
+        detail: A number that comes with a refusal. Its meaning depends on the status; 0 if it has
+            none.
     """
 
     code: str = "unknown"
 
     def __init__(self, message: str | Self, code: str | None = None, detail: int = 0) -> None:
-        if isinstance(message, EmberwatchError):  # made again, as `AsyncVectorEnv` does
+        if isinstance(message, EmberwatchError):  # `AsyncVectorEnv` wraps an error in its own type
             message, code, detail = str(message), code or message.code, detail or message.detail
         super().__init__(message)
         self.code = code or self.code
@@ -34,65 +36,68 @@ class EmberwatchError(Exception):
 
 
 class InvalidArgumentError(EmberwatchError, ValueError):
-    """An action or a keyword is impossible, or contradicts the server. Nothing was sent."""
+    """An action or a keyword is invalid, or does not match the server. Nothing was sent."""
 
     code = "invalid_argument"
 
 
 def invalid(subject: object, expected: object, got: object) -> InvalidArgumentError:
-    """The error of a value that is not what was expected."""
+    """Returns the error for an invalid value: ``subject: expected ..., got ...``."""
     return InvalidArgumentError(f"{subject}: expected {expected}, got {got}")
 
 
 def bad_answer(subject: object, expected: object, got: object) -> EmberwatchError:
-    """The error of an answer, or of something published, that makes no sense."""
+    """Returns the error for a malformed answer or published sample."""
     return EmberwatchError(f"{subject}: expected {expected}, got {got}", "bad_answer")
 
 
 class LeaseLostError(EmberwatchError):
-    """The lease ended, or another client took robots over; `detail` is its pid, or 0."""
+    """The lease ended, or another client took over robots of it.
+
+    `detail` is the process ID of the other client, or 0.
+    """
 
     code = "lease_lost"
 
 
 class NoServerError(EmberwatchError):
-    """Nobody serves the instance."""
+    """No server runs under this instance name."""
 
     code = "no_server"
 
 
 class NotEnoughMemoryError(EmberwatchError, MemoryError):
-    """More memory was asked for than the machine, a cgroup or a `ulimit` has."""
+    """A request needs more memory than the machine, a cgroup or a `ulimit` allows."""
 
     code = "no_memory"
 
 
 class RequestTimeoutError(EmberwatchError, TimeoutError):
-    """No answer in time. A step may have been made all the same: observe before stepping again."""
+    """The answer did not come in time. The step may still have run: observe before the next one."""
 
     code = "timeout"
 
 
 class ServerGoneError(EmberwatchError, ConnectionError):
-    """The server ended while or before it was asked."""
+    """The server ended before it answered."""
 
     code = "server_gone"
 
 
 class TrainingOnTestWorldsWarning(UserWarning):
-    """A reset has begun an episode on a test seed of the task, outside of an evaluation."""
+    """A reset began an episode on a test seed of the task, outside an evaluation."""
 
 
 _CLASSES: Final = {"lease_lost": LeaseLostError, "no_memory": NotEnoughMemoryError}
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
-    """The error of a status code other than 0, in the words of its status if none are given."""
+    """Returns the error for a nonzero status code; its text is `message`, or the status's own."""
     known = explain(status, detail)
     if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"
         return EmberwatchError(message, detail=detail)
     code, sentence = known
-    if message is None or code == "busy":  # the server's words name a flag, not a keyword
+    if message is None or code == "busy":  # the server's text names a JSON key, not our keyword
         message = sentence.replace('"takeover": true', "takeover=True")
     return _CLASSES.get(code, EmberwatchError)(message, code, detail)

@@ -1,4 +1,4 @@
-"""Beam search: paths to the most valuable cells, in many worlds at once."""
+"""Beam search for paths over the most valuable cells, in many worlds at once."""
 
 from __future__ import annotations
 
@@ -21,21 +21,26 @@ def beam_search(
     width: int = 50,
     airspace: Airspace | None = None,
 ) -> NDArray[np.uint8]:
-    """Paths whose distinct cells are worth most together, as far as a beam of this width finds.
+    """Finds a path for each of n worlds that maximises the summed values of its distinct cells.
+
+    Beam search is approximate: a larger `width` finds better paths and takes longer.
 
     Args:
-        values: What a visit to each cell is worth, `(n, H, W)`; counts in single precision.
-        robots: Row and column of each robot, `(n, 2)`; its cell counts only if it is flown over.
-        n_moves: Moves of a path.
-        rng: Breaks ties: one number of it for each world.
-        visited: Cells that are worth nothing any more, where not 0, `(n, H, W)`.
-        width: Paths kept after each move, 1 to 65,536, fewer where they need over 4 GiB; of those
-            that end in one cell and have visited the same cells, one.
-        airspace: Where the robots may fly, such as `env.world_spec.airspace`; None: everywhere. If
-            it pays what is seen, each cell counts that is in sight of the path.
+        values: Value of visiting each cell, shape (n, H, W); converted to single precision.
+        robots: Row and column of each robot, shape (n, 2). The robot's own cell counts only if the
+            path returns to it.
+        n_moves: Number of moves in a path.
+        rng: Generator that breaks ties; one number is drawn for each world.
+        visited: Cells that have no value, because they were visited before: those where this array
+            is not 0. Shape (n, H, W).
+        width: Number of paths kept after each move, 1 to 65,536; fewer if they would need more
+            than 4 GiB. Of the paths that visited the same cells and end in the same one, only one
+            is kept.
+        airspace: Where the robots may fly, such as `env.world_spec.airspace`. None: everywhere. If
+            its `pays` is `"seen"`, all cells within the sensor's view of the path count.
 
     Returns:
-        The moves, `(n, n_moves)`: 0 up, 1 down, 2 left, 3 right.
+        The moves, shape (n, n_moves): 0 up, 1 down, 2 left, 3 right.
     """
     given, cells = np.asarray(values), np.asarray(robots)
     n_moves = as_count(n_moves, "n_moves", 1, _native.MAX_MOVES)
@@ -46,7 +51,7 @@ def beam_search(
     with np.errstate(over="ignore"):
         worth = given.astype(np.float32)
     if not np.isfinite(worth).all():
-        raise invalid("values", "finite numbers in single precision", "others")
+        raise invalid("values", "numbers that are finite in single precision", "larger ones")
     if visited is not None:
         worth[np.asarray(visited) != 0] = 0.0
     keys = rng.integers(2**64, size=len(worth), dtype=np.uint64)
@@ -59,12 +64,14 @@ def _check(
     visited: NDArray[np.generic] | None,
 ) -> None:
     if values.ndim != 3 or values.size == 0 or not np.isfinite(values).all():
-        raise invalid("values", "finite numbers (n, H, W), some of each", f"shape {values.shape}")
+        got = f"shape {values.shape}" if values.ndim != 3 or values.size == 0 else "NaN or infinity"
+        raise invalid("values", "finite numbers of shape (n, H, W), at least one", got)
     if robots.shape != (len(values), 2) or robots.dtype.kind not in "iu":
         got = f"{robots.dtype} of shape {robots.shape}"
         raise invalid("robots", f"integers of shape ({len(values)}, 2)", got)
     if ((robots < 0) | (robots >= values.shape[1:])).any():
-        raise invalid("robots", f"cells of a {values.shape[1]} x {values.shape[2]} grid", "others")
+        grid = f"{values.shape[1]} x {values.shape[2]}"
+        raise invalid("robots", f"cells of a {grid} grid", "cells outside it")
     if visited is not None and np.shape(visited) != values.shape:
         raise invalid("visited", f"shape {values.shape}", np.shape(visited))
 
@@ -75,4 +82,4 @@ def _check_free(
     if no_fly.shape != shape:
         raise invalid("airspace: no_fly", f"shape {shape}", no_fly.shape)
     if no_fly[robots[:, 0], robots[:, 1]].any():
-        raise invalid("robots", "cells where they may fly", "others")
+        raise invalid("robots", "cells where they may fly", "a no-fly cell")

@@ -1,4 +1,4 @@
-"""The native vector environments for Stable-Baselines3, which is imported only here.
+"""The native vector environments as a `VecEnv`. Importing this needs Stable-Baselines3.
 
 from emberwatch.sb3 import make_vec_env
 model = PPO("MultiInputPolicy", make_vec_env("emberwatch/WildfireMoves-v0", 64, reward="move"))
@@ -25,7 +25,15 @@ from emberwatch.errors import InvalidArgumentError, invalid
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
-    """`gymnasium.make_vec` for Stable-Baselines3; wrap it in its `VecMonitor` for statistics."""
+    """Makes a vector environment for Stable-Baselines3, like `gymnasium.make_vec`.
+
+    For episode statistics, wrap it in Stable-Baselines3's `VecMonitor`.
+
+    Args:
+        name: The environment's name, such as ``"emberwatch/WildfireMoves-v0"``.
+        n_envs: Number of robots, `num_envs` of the vector environment.
+        keywords: The environment's keywords.
+    """
     made = gymnasium.make_vec(
         name, num_envs=n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **keywords
     )
@@ -35,8 +43,8 @@ def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
 class WildfireVecEnv(VecEnv):
     """A native vector environment in autoreset mode `SAME_STEP`.
 
-    The info of a world is empty, except at the end of its episode: then it has
-    `terminal_observation`, `TimeLimit.truncated` and what the last complete path's info had.
+    The info of a world is empty, except at the end of its episode. Then it has
+    `terminal_observation`, `TimeLimit.truncated` and the info of the last complete path.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
@@ -44,7 +52,7 @@ class WildfireVecEnv(VecEnv):
         mode = env.metadata.get("autoreset_mode")
         if not isinstance(worlds, WorldVectorEnv) or mode is not AutoresetMode.SAME_STEP:
             raise InvalidArgumentError(
-                "env: expected gymnasium.make_vec of an environment of emberwatch with "
+                "env: expected an environment of emberwatch from gymnasium.make_vec with "
                 f"autoreset_mode='SameStep', got {env} with {mode}"
             )
         self._env: Any = env
@@ -62,7 +70,7 @@ class WildfireVecEnv(VecEnv):
 
     def set_options(self, options: Any = None) -> None:
         if any([options] if options is None or isinstance(options, dict) else options):
-            raise invalid("set_options", "none", repr(options))
+            raise invalid("set_options", "no options, as resets have none here", repr(options))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = actions
@@ -87,7 +95,9 @@ class WildfireVecEnv(VecEnv):
         return [getattr(self._worlds, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise invalid("set_attr", "none, as the worlds share one environment", repr(attr_name))
+        raise InvalidArgumentError(
+            f"set_attr: {attr_name!r} cannot be set, as all worlds share one environment"
+        )
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
         if method_name == "render":
@@ -95,7 +105,7 @@ class WildfireVecEnv(VecEnv):
             return [pictures[index] for index in self._get_indices(indices)]
         if method_name == "action_masks":
             return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
-        expected = "'render' or 'action_masks', as the worlds share one environment"
+        expected = "'render' or 'action_masks', as all worlds share one environment"
         raise invalid("env_method", expected, repr(method_name))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

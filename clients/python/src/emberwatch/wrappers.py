@@ -1,4 +1,4 @@
-"""`BeliefObservation`: replaces the observed frame by a belief about all cells.
+"""`BeliefObservation`: replaces the observed frame with a belief about all cells.
 
 A frame shows only the cells of one path. A belief sums up all frames so far, so that a policy
 without memory can act on it.
@@ -24,45 +24,50 @@ from emberwatch.model import Model
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
-    """Keeps a belief about an environment's world and observes it: by default the Bayes filter.
+    """Observes a belief about an environment's world instead of its frames.
 
-    Wraps single environments; wrap the environments of a vector one by one. `terminated` and
-    `truncated` pass through; only `reset` resets the belief.
+    By default the belief is the Bayes filter of the environment's model. The wrapper is for single
+    environments; wrap the environments of a vector one by one. `terminated` and `truncated` pass
+    through, and only `reset` resets the belief.
 
     Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
-    it. After a step that only makes one move of a path, the belief stays. After a step that flies
-    several paths, it predicts once per path and corrects with the last frame. In environments that
-    do not report k, each step of the environment is one step of the world.
+    it. After a step that makes only one move of a path, the belief stays as it is. After a step
+    that flies several paths, it predicts once per path and corrects with the last frame. In
+    environments that do not report k, each step of the environment counts as one step of the world.
 
     ## Observations
-    After `reset`, the prior about ``X_0``, the world after its burn-in. A step moves the world from
-    ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter predicts, then corrects. The
-    observation is the posterior about ``X_{k+1}``, given all frames (eqs. 5 and 6), with the same
-    numbers as the Rust agent's. The agent plans on the predictor of the state that the next path
-    meets; compute it from this observation with `emberwatch.belief.Transition`.
+    After `reset`, the observation is the prior about ``X_0``, the world after its burn-in. A step
+    moves the world from ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter
+    predicts, then corrects. The observation is the posterior about ``X_{k+1}``, given all frames
+    (eqs. 5 and 6), with the same numbers as the Rust agent's. The agent plans on the predictor, the
+    belief about the state that the next path meets. To compute it from this observation, use
+    `emberwatch.belief.Transition`.
 
-    - ``dtype="float32"``: `Box` of 0 to 1, shape (S, H, W), each cell's sum one.
-    - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S): an image for convolutional
-      policies, such as those in Stable-Baselines3.
+    - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
+    - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S). This is an image for
+      convolutional policies, such as those of Stable-Baselines3.
     - ``keep=True``: a `Dict` of the original observations (a single frame as ``"frame"``) and
       ``"belief"``.
 
     ## Priors
     - ``"simulated"``: how often each cell of 64 simulated worlds is in each state after the
-      burn-in. Takes some seconds the first time, then comes from ``~/.cache/emberwatch``.
-    - ``"initial"``: the model's initial distribution, right for worlds without burn-in.
+      burn-in. The first simulation takes some seconds; later ones are read from
+      ``~/.cache/emberwatch``.
+    - ``"initial"``: the model's initial distribution, which is exact for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
-    - An array of shape (S, H, W), each cell's sum one.
+    - An array of shape (S, H, W), in which the numbers of each cell sum to 1.
     - ``None``: ``"simulated"`` if the environment has a burn-in, otherwise ``"initial"``.
 
     ## Arguments
-    - `env`: observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-      ``"frame"``.
-    - `model`: a `Model`, its name, or the path or the text of its file. Only for servers that do
-      not reveal their model; the default is ``env.unwrapped.model``.
-    - `kind`: a key of `emberwatch.belief.kinds`.
-    - `checkpoint`: a file of `emberwatch-agent train`. The belief is then the one that
-      `emberwatch.belief.load` makes, with its own prior and S; it needs no model.
+    - `env`: an environment that observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a
+      `Dict` with ``"frame"``.
+    - `keep`, `dtype`: what is observed, as above.
+    - `prior`: one of the priors above.
+    - `model`: a `Model`, its name, or the path or the text of its file. The default is
+      ``env.unwrapped.model``. Needed only for servers that do not reveal their model.
+    - `kind`: the kind of belief, a key of `emberwatch.belief.kinds`.
+    - `checkpoint`: a file written by `emberwatch-agent train`. The belief is then the one that
+      `emberwatch.belief.load` returns, with its own prior and S. It needs no model.
     """
 
     def __init__(
@@ -99,22 +104,26 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             first = prior_of(prior, known_model, **grid, burn_in=burn_in)
             self._belief = known(known_model, prior=first, kind="known" if kind is None else kind)
         elif prior is not None:
-            raise invalid("prior", "None with a checkpoint, which has a prior", prior)
+            raise invalid("prior", "None with a checkpoint, which has its own prior", prior)
         else:
             is_hidden = model is None and getattr(env.unwrapped, "model", None) is None
             found = None if is_hidden else _model_of(env, model)
             self._belief = load(checkpoint, **grid, kind=kind, model=found)
-        #: Whether an episode has begun and no step was interrupted.
+        #: Whether an episode has begun and no step since then was interrupted.
         self._is_begun = False
         self._step = 0
         self.observation_space = self._space(original, height, width)
 
     @property
     def filter(self) -> Belief:
-        """The belief of the current episode, such as for its entropy or its state names."""
+        """The belief of the current episode, for example to read its entropy or state names.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first reset, or after an interrupted step.
+        """
         if not self._is_begun:
             raise gymnasium.error.ResetNeeded(
-                "BeliefObservation: call reset first; after an interrupted step, too"
+                "BeliefObservation: no episode, or an interrupted step: call reset first"
             )
         return self._belief
 
@@ -125,7 +134,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
         self._belief.reset()
-        self._belief.correct(_frame_of(observation))  # shows nothing, unless resumed
+        self._belief.correct(_frame_of(observation))  # the frame is empty, unless resumed
         self._is_begun = True
         return self._observe(observation), info
 
@@ -143,7 +152,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     @contextmanager
     def _between(self) -> Generator[None]:
-        """Marks the belief as outdated during a call; a refused call has changed nothing."""
+        """Marks the belief as outdated during a call; if the call is refused, nothing changed."""
         was_begun, self._is_begun = self._is_begun, False
         try:
             yield
@@ -179,7 +188,7 @@ def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) ->
     revealed = getattr(env.unwrapped, "model", None)
     if not isinstance(revealed, Model):
         raise InvalidArgumentError(
-            "BeliefObservation: expected the world's model, got none, as the server hides it "
+            "BeliefObservation: the server does not reveal the model of its worlds "
             "(--reveal-model false). Pass model=: a Model, its name or the path of its file"
         )
     return revealed

@@ -1,4 +1,4 @@
-//! Moves worlds: at once for the request that completes them, or when a deadline passes or a holder leaves.
+//! Moves worlds by one step: when a request brings the last missing path, a deadline passes or a robot's holder leaves.
 
 use super::answer::Part;
 use super::barrier::{Barrier, Ticket, Waiter};
@@ -11,11 +11,11 @@ use std::ops::Range;
 use std::time::Instant;
 
 /// Minimum number of cells in a batch that several threads step. For smaller batches, waking a thread (tens of
-/// microseconds) costs more than it saves at about 2 ns a cell.
+/// microseconds) costs more than it saves (about 2 ns per cell).
 const PARALLEL_CELLS: usize = 1 << 15;
 
 impl Simulator {
-    /// The next deadline of a world that waits for paths.
+    /// Returns the earliest deadline of the worlds that wait for paths.
     pub fn next_deadline(&self) -> Option<Instant> {
         let waiting = self.waiting_worlds.iter();
         let deadlines = waiting.filter_map(|&world| self.places[world].barrier.deadline);
@@ -33,8 +33,8 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// The next answer to a request that waited; its results and frames go to `payload`. Take all of them before the
-    /// next request, so that each shows its own step.
+    /// Returns the next answer to a request that waited, and writes its results and frames to `payload`. Call it until
+    /// `None` before the next request, because answers show the current step of their worlds.
     pub fn next_answer(&mut self, payload: &mut Vec<u8>) -> Option<(Ticket, StepReply)> {
         let (waiter, outcome) = self.settled.pop_front()?;
         payload.clear();
@@ -48,12 +48,12 @@ impl Simulator {
         Some((waiter.ticket, reply))
     }
 
-    /// The worlds that moved without a request of their own since the last call.
+    /// Returns the worlds that moved since the last call without a request that completed them.
     pub fn take_moved(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.moved)
     }
 
-    /// Withdraws the paths of those who have lost their robots, and moves the worlds that wait for nobody any more.
+    /// Refuses waiting requests whose lease has lost a robot, and moves the worlds that no longer wait for a path.
     pub(super) fn settle(&mut self, now: Instant) {
         for world in self.waiting_worlds.clone() {
             let robots = self.robots_of(world);
@@ -79,7 +79,7 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Refuses all requests that wait for a world which is reset or replaced.
+    /// Refuses all requests that wait for a world that is about to be reset or replaced.
     pub(super) fn refuse_waiting(&mut self, now: Instant, world: usize) {
         for waiter in self.places[world].barrier.withdraw(|_| true) {
             let refusal = Refusal::new(Status::Resetting, world as u64);
@@ -88,14 +88,14 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Whether a world moves now.
+    /// Returns whether a world can move now.
     pub(super) fn is_complete(&self, now: Instant, world: usize) -> bool {
         let held = self.leases.held(self.robots_of(world));
         self.places[world].barrier.is_complete(held, now)
     }
 
-    /// Moves worlds once, with the paths that they have. `parts`: where each world's answer is written, by the thread
-    /// that stepped it.
+    /// Moves worlds by one step with the paths that have arrived. If given, `parts` are the worlds' parts of an answer;
+    /// the thread that steps a world also writes its part.
     pub(super) fn advance(
         &mut self,
         now: Instant,

@@ -1,4 +1,4 @@
-//! Writes the answers to step requests: results of the worlds, results of the robots, frames.
+//! Writes the answers to step requests: results of worlds, then results of robots, then frames.
 
 use super::lease::Refusal;
 use super::state::{Simulator, within};
@@ -11,19 +11,19 @@ use emberwatch_model::UNOBSERVED;
 use std::hint::black_box;
 use std::ops::Range;
 
-/// Where a payload has the results and frames of one world's robots.
+/// The slices of an answer's payload for one world: its result, and the results and frames of its robots.
 pub(super) struct Part<'a> {
-    /// The robots, by their place in the world.
+    /// The robots in the answer, by their index in the world.
     robots: Range<usize>,
     world: &'a mut [u8],
     results: &'a mut [u8],
-    /// A frame of each robot, or one that all robots of the world share.
+    /// One frame per robot, or one shared frame with the observations of all robots of the world.
     frames: &'a mut [u8],
     is_shared: bool,
 }
 
 impl Part<'_> {
-    /// Writes the present results and frames.
+    /// Writes the current results and frames of an episode.
     pub(super) fn write(self, episode: &Episode) {
         let world = world_result(episode.outcome());
         self.world.copy_from_slice(bytemuck::bytes_of(&world));
@@ -42,7 +42,7 @@ impl Part<'_> {
         self.frames.fill(UNOBSERVED);
         for robot in episode.robots() {
             let seen = robot.frame().as_bytes();
-            // Two readings of one cell in one step are the same.
+            // Equal rings give equal readings. Otherwise the inner ring's reading, which is smaller, stays.
             (self.frames.iter_mut().zip(seen)).for_each(|(to, &value)| *to = value.min(*to));
         }
     }
@@ -70,7 +70,7 @@ impl Simulator {
         }
     }
 
-    /// The header of a good answer, and the robots that it is about.
+    /// Returns the header of a successful answer and the robots that it covers.
     pub(super) fn answer(&self, request: &StepRequest) -> (StepReply, Range<usize>) {
         let first = request.first_robot as usize;
         let robots = first..first + request.n_robots as usize;
@@ -83,7 +83,7 @@ impl Simulator {
         (reply, robots)
     }
 
-    /// Number of bytes in the payload of a good answer.
+    /// Returns the number of bytes in the payload of a successful answer.
     fn n_bytes(&self, request: &StepRequest) -> usize {
         let (reply, _) = self.answer(request);
         let (n_worlds, n_robots) = (reply.n_worlds as usize, reply.n_robots as usize);
@@ -95,14 +95,14 @@ impl Simulator {
         n_worlds * WORLD_BYTES + n_robots * ROBOT_BYTES + n_frames * n_cells
     }
 
-    /// Gives a payload the length of the answer, before anything changes.
+    /// Resizes a payload to the length of the answer, before any state changes, so that a refusal has no effect.
     pub(super) fn reserve(
         &self,
         request: &StepRequest,
         payload: &mut Vec<u8>,
     ) -> Result<(), Refusal> {
         let n_bytes = self.n_bytes(request);
-        // Asks for the memory first, since `fit` could only abort.
+        // Tries to allocate the memory first: where `fit` fails to allocate, the process aborts.
         let mut probe = Vec::<u8>::new();
         let n_more = n_bytes.saturating_sub(payload.capacity());
         let reserved = probe.try_reserve_exact(if n_more == 0 { 0 } else { n_bytes });
@@ -113,18 +113,18 @@ impl Simulator {
         Ok(())
     }
 
-    /// Gives a payload the length of the answer; its content is arbitrary.
+    /// Resizes a payload to the length of the answer, with arbitrary content.
     pub(super) fn fit(&self, request: &StepRequest, payload: &mut Vec<u8>) {
         let n_bytes = self.n_bytes(request);
         if payload.capacity() < n_bytes {
-            // Pages that the system has zeroed are first touched by the threads that write them.
+            // New zeroed memory, not a resize: the threads that write its pages are then the first to touch them.
             *payload = vec![0; n_bytes];
         } else {
             payload.resize(n_bytes, 0);
         }
     }
 
-    /// The parts of a payload that [`Self::fit`] has sized, one for each world of the request.
+    /// Splits a payload of the length set by [`Self::fit`] into one part for each world of the request.
     pub(super) fn parts<'a>(&self, request: &StepRequest, payload: &'a mut [u8]) -> Vec<Part<'a>> {
         let (reply, robots) = self.answer(request);
         let n_cells = self.spec.rules.shape.n_cells();
@@ -145,7 +145,7 @@ impl Simulator {
         self.worlds_of(&robots).map(part).collect()
     }
 
-    /// Writes robots as they are now.
+    /// Writes the current results and frames of the requested robots, and returns the header.
     pub(super) fn write_present(&self, request: &StepRequest, payload: &mut [u8]) -> StepReply {
         let (reply, robots) = self.answer(request);
         let parts = self.parts(request, payload);
@@ -157,7 +157,7 @@ impl Simulator {
         reply
     }
 
-    /// Writes robots as they were at steps that are kept.
+    /// Writes the requested robots at past steps and returns the header. `steps` holds one kept step per world.
     pub(super) fn write_past(
         &self,
         request: &StepRequest,
@@ -196,14 +196,14 @@ impl Simulator {
     }
 }
 
-/// Splits the first bytes off.
+/// Splits the first `n` bytes off.
 fn take<'a>(bytes: &mut &'a mut [u8], n: usize) -> &'a mut [u8] {
     let (first, rest) = std::mem::take(bytes).split_at_mut(n);
     *bytes = rest;
     first
 }
 
-/// Appends a frame in which nothing was observed.
+/// Appends a frame without observations and returns it.
 fn blank(payload: &mut Vec<u8>, n_cells: usize) -> &mut [u8] {
     let start = payload.len();
     payload.resize(start + n_cells, UNOBSERVED);

@@ -1,36 +1,36 @@
-//! The barrier of a world: the paths for its next step, and who waits for it. It knows no leases and no clock.
+//! The barrier of a world: the paths and waiting requests for its next step, without leases or a clock.
 
 use super::lease::ClientId;
 use emberwatch_messages::message::StepRequest;
 use emberwatch_model::Move;
 use std::time::Instant;
 
-/// A step request that waits for its world to move.
+/// Identifies a step request that waits for its world to move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Ticket(pub(super) u64);
 
-/// A step request that waits, and the robots whose paths it brought.
+/// A waiting step request, and the robots whose paths it sent.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Waiter {
     pub ticket: Ticket,
     pub client: ClientId,
     pub request: StepRequest,
-    /// Bit r is robot r of the world.
+    /// Bit r stands for robot r of the world.
     pub robots: u64,
 }
 
-/// The paths for a world's next step. Of each mask, bit r is robot r of the world.
+/// The paths for a world's next step. In each mask, bit r stands for robot r of the world.
 #[derive(Debug)]
 pub(super) struct Barrier {
-    /// One path for each robot, in order; only those of `ready` count.
+    /// One path per robot, in order. Only paths of robots in `ready` are valid.
     pub moves: Vec<Move>,
     /// Robots that have a path.
     pub ready: u64,
-    /// Those that observe every cell.
+    /// Robots that observe every cell.
     pub full: u64,
-    /// When the world moves without the others.
+    /// When the world moves even if paths are missing.
     pub deadline: Option<Instant>,
-    /// In the order of arrival; no robot is in two of them.
+    /// Waiting requests in the order of arrival. No robot belongs to two of them.
     pub waiters: Vec<Waiter>,
 }
 
@@ -45,7 +45,7 @@ impl Barrier {
         }
     }
 
-    /// Puts the paths of some robots, the first of them `first`; the bytes are moves.
+    /// Stores the paths of consecutive robots from `first` on. Each byte of `paths` is a move.
     pub fn put(&mut self, first: usize, n_moves: usize, paths: &[u8], is_full: bool) {
         let n_robots = paths.len() / n_moves;
         let places = self.moves[first * n_moves..][..paths.len()].iter_mut();
@@ -60,7 +60,7 @@ impl Barrier {
         }
     }
 
-    /// Takes requests out, with all their paths; returns them.
+    /// Removes and returns the requests for which `is_over` holds, together with their paths.
     pub fn withdraw(&mut self, is_over: impl Fn(&Waiter) -> bool) -> Vec<Waiter> {
         let over: Vec<Waiter> = self
             .waiters
@@ -75,20 +75,20 @@ impl Barrier {
         over
     }
 
-    /// Whether the world moves now: someone flies, and nobody else who holds a robot may still send a path.
+    /// Returns whether the world can move: a path has arrived, and none is missing or the deadline has passed.
     pub fn is_complete(&self, held: u64, now: Instant) -> bool {
         let is_due = self.deadline.is_some_and(|deadline| deadline <= now);
         self.ready != 0 && (held & !self.ready == 0 || is_due)
     }
 
-    /// Begins the next step; returns who waited for this one.
+    /// Starts to collect paths for the next step. Returns the requests that waited for this one.
     pub fn clear(&mut self) -> Vec<Waiter> {
         (self.ready, self.full, self.deadline) = (0, 0, None);
         std::mem::take(&mut self.waiters)
     }
 }
 
-/// Bits of `n` robots from `first` on, of at most 64.
+/// Returns a mask of the `n` robots from `first` on, of at most 64.
 pub(super) fn mask(first: usize, n: usize) -> u64 {
     u64::MAX.unbounded_shr(64 - n as u32) << first
 }

@@ -1,4 +1,4 @@
-//! What a world waits for: paths in any order, deadlines, and holders that leave. Time is made up.
+//! Tests of the barrier: paths in any order, deadlines, and holders that leave. Time is simulated.
 
 use super::barrier::Ticket;
 use super::lease::ClientId;
@@ -22,19 +22,19 @@ const N_MOVES: usize = 2;
 const LEASE: Duration = Duration::from_secs(20);
 const DEADLINE: Duration = Duration::from_millis(50);
 
-/// A server of two worlds with three robots each, and what its clients know.
+/// A simulator of two worlds with three robots each, and the simulated time.
 struct Lab {
     simulator: Simulator,
     now: Instant,
 }
 
-/// One of the clients; its process has this id.
+/// Returns the client whose process has this id.
 fn client(pid: u32) -> ClientId {
     let node = u128::from(pid);
     ClientId { node, pid }
 }
 
-/// The path of a robot.
+/// Returns a path that differs between robots.
 fn path(robot: u32) -> [u8; N_MOVES] {
     [(robot % 4) as u8, (robot / 2 % 4) as u8]
 }
@@ -89,7 +89,7 @@ impl Lab {
         }
     }
 
-    /// Three clients, 1 to 3, each with a lease on one robot of world 0: robot r is client r + 1's.
+    /// Starts three clients, 1 to 3. Client r + 1 holds robot r of world 0.
     fn of_three(deadline: Duration) -> (Self, [u64; 3]) {
         let mut lab = Self::new(deadline);
         let leases = [0, 1, 2].map(|robot| lab.acquire(robot + 1, robot, 1, false));
@@ -122,24 +122,25 @@ impl Lab {
     fn waits(&mut self, pid: u32, lease: u64, robots: (u32, u32), k: u64) -> Ticket {
         match self.send(pid, lease, robots, k) {
             Stepped::Waits(ticket) => ticket,
-            Stepped::Reply(reply) => panic!("expected to wait, got {reply:?}"),
+            Stepped::Reply(reply) => panic!("expected a ticket, got {reply:?}"),
         }
     }
 
     fn replies(&mut self, pid: u32, lease: u64, robots: (u32, u32), k: u64) -> (Status, u64) {
         match self.send(pid, lease, robots, k) {
-            Stepped::Reply(reply) => told(&reply),
-            Stepped::Waits(_) => panic!("expected an answer, got to wait"),
+            Stepped::Reply(reply) => status_and_detail(&reply),
+            Stepped::Waits(_) => panic!("expected an answer, got a ticket"),
         }
     }
 
-    /// Who is answered, and how.
+    /// Returns the answers to waiting requests: ticket, status, and the new step or the refusal's detail.
     fn answers(&mut self) -> Vec<(Ticket, Status, u64)> {
         let mut payload = Vec::new();
         let mut answers = Vec::new();
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut payload) {
-            let parts = split_step_payload(&reply, &payload).expect("as long as it says");
-            let (status, detail) = told(&reply);
+            let parts =
+                split_step_payload(&reply, &payload).expect("a length that fits the header");
+            let (status, detail) = status_and_detail(&reply);
             let step = parts.worlds.first().map_or(detail, |world| world.step);
             answers.push((ticket, status, step));
         }
@@ -154,7 +155,7 @@ impl Lab {
         self.simulator.episode(0).expect("ready")
     }
 
-    /// What the same paths give undisturbed: masks of those that fly, hover and are late, step by step.
+    /// Checks that world 0 equals one stepped directly with these masks of robots that fly, hover and are late.
     fn assert_is_as_after(&self, steps: &[(u64, u64, u64)]) {
         let spec = self.simulator.spec();
         let mut expected = Episode::new(&spec.rules, 0);
@@ -183,7 +184,7 @@ impl Lab {
     }
 }
 
-fn told(reply: &StepReply) -> (Status, u64) {
+fn status_and_detail(reply: &StepReply) -> (Status, u64) {
     let status = Status::try_from(reply.status).expect("a known status");
     (status, reply.detail)
 }
@@ -228,7 +229,7 @@ fn one_client_with_all_robots_gives_the_same_as_three() {
 }
 
 #[test]
-fn who_nobody_holds_hovers() {
+fn a_robot_without_a_holder_hovers() {
     let mut lab = Lab::new(Duration::ZERO);
     let lease = lab.acquire(1, 1, 1, false);
     assert_eq!(lab.replies(1, lease, (1, 1), 0).0, Status::Ok);
@@ -308,7 +309,7 @@ fn a_process_that_ends_delays_nobody_and_its_path_is_not_flown() {
     assert_eq!(lab.answers(), [(waiting, Status::Ok, 1)]);
     lab.assert_is_as_after(&[(0b010, 0b101, 0)]);
 
-    // Its connection closes, no more.
+    // The client's connection closes, but its process lives.
     let lease = lab.acquire(4, 0, 1, false);
     let waiting = lab.waits(4, lease, (0, 1), 1);
     lab.simulator
@@ -369,7 +370,7 @@ fn a_takeover_withdraws_the_path_and_the_world_waits_for_the_taker() {
 }
 
 #[test]
-fn who_loses_one_of_two_robots_flies_neither() {
+fn a_client_that_loses_one_of_two_robots_flies_neither() {
     let mut lab = Lab::new(Duration::ZERO);
     let two = lab.acquire(1, 0, 2, false);
     let one = lab.acquire(2, 2, 1, false);
@@ -383,7 +384,7 @@ fn who_loses_one_of_two_robots_flies_neither() {
 }
 
 #[test]
-fn a_release_lets_the_others_go() {
+fn a_release_lets_the_other_robots_fly() {
     let (mut lab, leases) = Lab::of_three(Duration::ZERO);
     lab.waits(1, leases[0], (0, 1), 0);
     lab.waits(2, leases[1], (1, 1), 0);
@@ -394,7 +395,7 @@ fn a_release_lets_the_others_go() {
 }
 
 #[test]
-fn a_step_of_several_worlds_needs_them_whole() {
+fn a_step_of_several_worlds_needs_all_their_held_robots() {
     let mut lab = Lab::new(Duration::ZERO);
     let four = lab.acquire(1, 0, 4, false);
     let one = lab.acquire(2, 5, 1, false);
@@ -411,7 +412,7 @@ fn a_step_of_several_worlds_needs_them_whole() {
 }
 
 #[test]
-fn a_world_is_reset_by_who_holds_all_robots_that_are_held() {
+fn a_world_is_reset_only_by_the_holder_of_all_held_robots() {
     let (mut lab, leases) = Lab::of_three(Duration::ZERO);
     let reset = |lease| Request::Reset {
         lease,
@@ -424,7 +425,7 @@ fn a_world_is_reset_by_who_holds_all_robots_that_are_held() {
     assert_eq!(refused.status(), Status::Busy);
     let waiting = lab.waits(1, leases[0], (0, 1), 0);
     for (pid, lease) in [(2, leases[1]), (3, leases[2])] {
-        // The last release would move the world, if it were not taken over first.
+        // Client 1 takes the robot over first; otherwise the last release would move the world.
         lab.acquire(1, pid - 1, 1, true);
         let release = Request::Release { lease };
         assert_eq!(lab.ask(pid, &release).status(), Status::LeaseLost);

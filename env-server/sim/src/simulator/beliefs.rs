@@ -1,19 +1,19 @@
-//! Beliefs that agents leave for the next agents: bytes that the server does not interpret.
+//! Beliefs that an agent stores for the agent that takes over its robot. The server does not interpret the bytes.
 
 use crate::world::WorldOutcome;
 use emberwatch_messages::control::{BeliefInfo, MAX_BELIEF_PART};
 use std::ops::Range;
 
-/// States that a belief may have under any model, as learned ones have their own. It may have as many as the model.
+/// States for which every belief has space, because a learned model can have more states than the true one.
 const N_STATES: usize = 18;
 
-/// Most bytes beside 32-bit numbers: one for each state and cell, and one more for each cell.
+/// Maximum size of the data other than `f32` grids, in bytes.
 const MORE_BYTES: u64 = 32 << 10;
 
-/// The beliefs left, one for each robot at most.
+/// The stored beliefs, at most one per robot.
 #[derive(Debug)]
 pub struct Beliefs {
-    /// Most bytes of one.
+    /// Maximum length of a belief in bytes: an `f32` per state and cell, another per cell, and [`MORE_BYTES`].
     longest: u64,
     left: Vec<Option<StoredBelief>>,
 }
@@ -24,20 +24,20 @@ struct StoredBelief {
     bytes: Vec<u8>,
 }
 
-/// A part of a belief that an agent leaves.
+/// A part of a belief, as sent in one request.
 #[derive(Debug)]
 pub struct BeliefPart<'a> {
-    /// Tells other agents what the bytes are.
+    /// Describes the format of the bytes for other agents.
     pub kind: &'a str,
-    /// Where the part begins.
+    /// Position of the part in the belief, in bytes.
     pub offset: u64,
-    /// Length of the whole.
+    /// Length of the whole belief, in bytes.
     pub length: u64,
     pub bytes: &'a [u8],
 }
 
 impl Beliefs {
-    /// None yet, for robots in worlds of so many cells and states.
+    /// Creates an empty store for `n_robots` robots in worlds of `n_cells` cells and `n_states` states.
     pub fn new(n_robots: usize, n_cells: usize, n_states: usize) -> Self {
         let numbers = n_cells * (n_states.max(N_STATES) + 1);
         Self {
@@ -46,7 +46,7 @@ impl Beliefs {
         }
     }
 
-    /// Adds the next part of a belief for who flies a robot, at the step of its world; the first starts a new one.
+    /// Appends a part to the belief about a robot's world at its current step. Offset 0 starts a new belief.
     pub fn add(
         &mut self,
         robot: usize,
@@ -71,7 +71,7 @@ impl Beliefs {
         if part.offset != expected || end > part.length {
             let (offset, length) = (part.offset, part.length);
             return Err(format!(
-                "offset: expected the next bytes, from {expected}, within {length}, got {offset} to {end}"
+                "offset: expected bytes from {expected} to at most {length}, got {offset} to {end}"
             ));
         }
         if part.offset == 0 {
@@ -91,7 +91,7 @@ impl Beliefs {
         Ok(())
     }
 
-    /// The whole belief for a robot at the step of its world.
+    /// Returns the complete belief stored for a robot at the current step of its world.
     pub fn of(&self, robot: usize, at: &WorldOutcome) -> Option<(&BeliefInfo, &[u8])> {
         let StoredBelief { info, bytes } = self.left[robot].as_ref()?;
         let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
@@ -99,7 +99,7 @@ impl Beliefs {
         (is_there && is_whole).then_some((info, bytes))
     }
 
-    /// Drops the beliefs for the robots of a world that was replaced.
+    /// Drops the beliefs of the robots of a world that was replaced.
     pub fn forget(&mut self, robots: Range<usize>) {
         self.left[robots].fill_with(|| None);
     }

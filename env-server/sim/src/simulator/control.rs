@@ -1,4 +1,4 @@
-//! Control requests: parse, check, answer now or when worlds are ready.
+//! Control requests: parsing, checks, and answers, some of which wait until worlds are ready.
 
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
@@ -18,10 +18,10 @@ use rand_chacha::rand_core::Rng;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Longest lease a client may ask for: a day.
+/// Maximum duration of a lease: one day.
 const LONGEST_LEASE: Duration = Duration::from_secs(86_400);
 
-/// Shortest lease a client may ask for.
+/// Minimum duration of a lease.
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 
 impl Simulator {
@@ -42,7 +42,7 @@ impl Simulator {
         })
     }
 
-    /// The answer to a request that had to wait, once its worlds are ready.
+    /// Returns the answer to a waiting request once its worlds are ready, and `None` before.
     pub fn pending_reply(&mut self, now: Instant, pending: &PendingReply) -> Option<Reply> {
         let mut worlds = pending.worlds.iter();
         if worlds.any(|&world| self.episode(world).is_none()) {
@@ -53,7 +53,7 @@ impl Simulator {
         let held = self.leases.robots_held(pending.lease);
         // A burn-in longer than the lease must not end it.
         self.leases.end_wait(now, pending.lease);
-        if !pending.tells_lease {
+        if !pending.describes_lease {
             return Some(Reply::Reset { worlds });
         }
         let lease = self.leases.renew(now, pending.lease, pending.client);
@@ -68,7 +68,7 @@ impl Simulator {
         })
     }
 
-    /// Cancels the wait for a reply that no client waits for any more.
+    /// Cancels a pending reply whose client has stopped waiting.
     pub fn cancel_reply(&mut self, now: Instant, pending: &PendingReply) {
         self.leases.end_wait(now, pending.lease);
     }
@@ -136,12 +136,12 @@ impl Simulator {
         let token = (self.next_token)();
         self.leases.acquire(now, claim, token).map_err(refusal)?;
         self.settle(now);
-        Ok(self.tell_lease(token, client))
+        Ok(self.lease_reply(token, client))
     }
 
     fn renew(&mut self, now: Instant, client: ClientId, lease: u64) -> Result<Outcome, Reply> {
         self.leases.renew(now, lease, client).map_err(refusal)?;
-        Ok(self.tell_lease(lease, client))
+        Ok(self.lease_reply(lease, client))
     }
 
     fn release(&mut self, now: Instant, client: ClientId, lease: u64) -> Result<Outcome, Reply> {
@@ -150,14 +150,14 @@ impl Simulator {
         Ok(Outcome::Answer(Reply::Done))
     }
 
-    /// An answer when its worlds are ready; the lease lives until then.
+    /// Makes a request wait until its worlds are ready. The lease does not expire meanwhile.
     fn pending(&mut self, jobs: Vec<ResetJob>, pending: PendingReply) -> Outcome {
         self.leases.begin_wait(pending.lease);
         Outcome::Pending(jobs, pending)
     }
 
-    /// The robots of a lease, once their worlds are ready.
-    fn tell_lease(&mut self, lease: u64, client: ClientId) -> Outcome {
+    /// Answers with a description of the lease once its worlds are ready.
+    fn lease_reply(&mut self, lease: u64, client: ClientId) -> Outcome {
         let robots = self.leases.robots_held(lease);
         let mut worlds: Vec<usize> = robots
             .iter()
@@ -168,7 +168,7 @@ impl Simulator {
             worlds,
             lease,
             client,
-            tells_lease: true,
+            describes_lease: true,
         };
         self.pending(Vec::new(), pending)
     }
@@ -208,7 +208,7 @@ impl Simulator {
             worlds,
             lease,
             client,
-            tells_lease: false,
+            describes_lease: false,
         };
         Ok(self.pending(jobs, pending))
     }
@@ -237,7 +237,7 @@ impl Simulator {
         }
     }
 
-    /// What a server says of itself.
+    /// Returns the server's answer to `hello`.
     pub fn info(&self) -> ServerInfo {
         let (config, file) = (&self.checked.config, self.checked.model.file());
         let recorded = &self.checked.recorded;
@@ -295,7 +295,7 @@ impl Simulator {
     }
 }
 
-/// What differs from a grid that is open everywhere, with a sensor of the path.
+/// Describes no-fly cells and the sensor. Returns `None` for an open grid whose sensor sees only the path.
 fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
     let file = model.file();
     let sensor = file.sensor.clone().unwrap_or_default();
@@ -308,7 +308,7 @@ fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
     (info.radius > 0 || info.no_fly.is_some()).then_some(info)
 }
 
-/// The zones, if there are any.
+/// Describes the model's zones. Returns `None` if it has none.
 fn zones_info(model: &Model) -> Option<ZonesInfo> {
     let file = model.file();
     let map = file.zone_map.as_ref()?;
@@ -319,7 +319,7 @@ fn zones_info(model: &Model) -> Option<ZonesInfo> {
     })
 }
 
-/// The request in a message of this version.
+/// Checks the version of a message and parses its request.
 fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
     if version != VERSION {
         return Err(Reply::version_mismatch(version));
@@ -332,7 +332,8 @@ fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
     }
 }
 
-/// The seed after an episode whose reset names none; below 2^53, which every JSON reader holds.
+/// Returns the seed of the next episode for a reset without a seed. It is below 2^53, so that every JSON reader
+/// represents it exactly.
 fn next_seed(last: &WorldOutcome) -> u64 {
     stream(last.seed, Purpose::Episode, last.episode).next_u64() >> 11
 }

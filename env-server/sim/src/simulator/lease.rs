@@ -1,44 +1,44 @@
-//! Which client may fly which robots, and until when. Pure: time and tokens are arguments.
+//! Leases: which client may fly which robots, and until when. Pure functions: time and tokens are arguments.
 //!
-//! A lease covers consecutive robots, by their numbers. It ends by release, by expiry, with its client's connection or
-//! process, or by a takeover; a robot taken from a lease stays lost to that lease, also when it
-//! is free again.
+//! A lease covers robots with consecutive numbers. It ends when it is released, expires or loses its last robot to a
+//! takeover, or when its client's connection or process ends. A robot taken from a lease stays lost to that lease, even
+//! when the robot becomes free again.
 
 use emberwatch_messages::message::Status;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Ended leases that are remembered, to tell "lost" from "never had".
+/// Number of ended leases that are remembered, to distinguish a lost lease from one that never existed.
 const REMEMBERED: usize = 1024;
 
-/// The process behind a request.
+/// The connection and process behind a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClientId {
-    /// iceoryx2's id of the client's node.
+    /// The id of the client's iceoryx2 node.
     pub node: u128,
-    /// Its process id.
+    /// The client's process id.
     pub pid: u32,
 }
 
-/// A right to act.
+/// The exclusive right of a client to fly some robots.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Lease {
     /// Identifies the lease in requests.
     pub token: u64,
     pub client: ClientId,
-    /// The robots it was given for.
+    /// The robots for which it was acquired.
     pub robots: Range<usize>,
-    /// It ends this long after its last use.
+    /// The lease expires this long after its last use.
     pub time_to_live: Duration,
     expires: Instant,
-    /// The process that last took a robot from it.
+    /// The process that last took over one of its robots.
     taken_by: Option<u32>,
-    /// Requests that wait for resets or for the paths of other clients; it cannot expire meanwhile.
+    /// Number of requests that wait for resets or for other clients' paths. The lease cannot expire meanwhile.
     n_waiting: u32,
 }
 
-/// Why a request may not act, as a status and its detail.
+/// The reason for refusing a request: a status and its detail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Refusal {
     pub status: Status,
@@ -48,7 +48,7 @@ pub struct Refusal {
 /// All leases of a server.
 #[derive(Debug)]
 pub struct Leases {
-    /// The token that holds each robot.
+    /// The token of the lease that holds each robot.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
     ended: VecDeque<Ended>,
@@ -59,18 +59,18 @@ pub struct Leases {
 struct Ended {
     token: u64,
     first_robot: usize,
-    /// The process that took its last robot, if that was its end.
+    /// The process that took over its last robot, if the lease ended by that.
     taken_by: Option<u32>,
 }
 
-/// What a client asks for.
+/// A client's request for a lease.
 #[derive(Debug, Clone)]
 pub struct Claim {
     pub client: ClientId,
     pub robots: Range<usize>,
-    /// Whether to take robots from their holders.
+    /// Whether to take robots over from their holders.
     pub takeover: bool,
-    /// How long the lease lives without use.
+    /// How long the lease lasts without use.
     pub time_to_live: Duration,
 }
 
@@ -87,7 +87,7 @@ impl Lease {
 }
 
 impl Leases {
-    /// No leases on `n_robots` robots.
+    /// Creates a table of `n_robots` robots without leases.
     pub fn new(n_robots: usize) -> Self {
         Self {
             holders: vec![None; n_robots],
@@ -96,12 +96,10 @@ impl Leases {
         }
     }
 
-    /// Gives a lease under a new token.
-    ///
-    /// A client that claims robots it holds already gets them again, under the new token.
+    /// Grants a lease under a new token. Robots that the client already holds move to the new lease.
     ///
     /// # Errors
-    /// If there is no such robot, or another client holds one and it is no takeover.
+    /// If a robot does not exist, or another client holds one and the claim is not a takeover.
     pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
         self.check_robots(&claim.robots)?;
         self.expire(now);
@@ -140,7 +138,7 @@ impl Leases {
     /// Checks that a client may fly robots under a lease, and extends the lease.
     ///
     /// # Errors
-    /// If there is no such robot, or the client does not hold one under this lease.
+    /// If a robot does not exist, or the client does not hold it under this lease.
     pub fn use_lease(
         &mut self,
         now: Instant,
@@ -161,7 +159,7 @@ impl Leases {
     /// Extends a lease.
     ///
     /// # Errors
-    /// If the client does not have this lease, or has lost it.
+    /// If the client never had this lease or has lost it.
     pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
         let is_live = |lease: &&mut Lease| lease.client == client && !lease.has_expired(now);
         if self.live.get_mut(&token).filter(is_live).is_none() {
@@ -173,11 +171,10 @@ impl Leases {
         Ok(lease)
     }
 
-    /// Checks that a client may replace the world of some robots under a lease, which holds one of them, and extends
-    /// the lease.
+    /// Checks that a client may reset or replace the world of these robots under a lease, and extends the lease.
     ///
     /// # Errors
-    /// If the client holds none of them under this lease, or another client holds one.
+    /// If the client holds none of the robots under this lease, or another client holds one.
     pub fn use_world(
         &mut self,
         now: Instant,
@@ -197,14 +194,14 @@ impl Leases {
         }
     }
 
-    /// Keeps a lease from expiring while one more request waits.
+    /// Counts a waiting request, during which the lease does not expire.
     pub fn begin_wait(&mut self, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting += 1;
         }
     }
 
-    /// Ends what [`Self::begin_wait`] began; the lease lives on from now.
+    /// Ends a wait counted by [`Self::begin_wait`]. The lease's time without use starts again now.
     pub fn end_wait(&mut self, now: Instant, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting = lease.n_waiting.saturating_sub(1);
@@ -212,32 +209,32 @@ impl Leases {
         }
     }
 
-    /// Ends a lease; its robots are free.
+    /// Ends a lease, which frees its robots.
     ///
     /// # Errors
-    /// If the client does not have this lease, or has lost it.
+    /// If the client never had this lease or has lost it.
     pub fn release(&mut self, now: Instant, token: u64, client: ClientId) -> Result<(), Refusal> {
         self.renew(now, token, client)?;
         self.end(token);
         Ok(())
     }
 
-    /// Ends the leases that have expired; returns them.
+    /// Ends and returns the leases that have expired.
     pub fn expire(&mut self, now: Instant) -> Vec<Lease> {
         self.end_where(|lease| lease.has_expired(now))
     }
 
-    /// Ends the leases of a process that has died; returns them.
+    /// Ends and returns the leases of a process that has died.
     pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
         self.end_where(|lease| lease.client.pid == pid)
     }
 
-    /// Ends the leases of nodes that are not among these; returns them.
+    /// Ends and returns the leases whose client's node is not in `nodes`.
     pub fn end_of_nodes_except(&mut self, nodes: &HashSet<u128>) -> Vec<Lease> {
         self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
 
-    /// The robots of a lease that were not taken over.
+    /// Returns the robots that a lease still holds.
     pub fn robots_held(&self, token: u64) -> Vec<usize> {
         let held = |robot: &usize| self.holders[*robot] == Some(token);
         let lease = self.live.get(&token);
@@ -246,18 +243,18 @@ impl Leases {
         })
     }
 
-    /// The lease that holds a robot.
+    /// Returns the lease that holds a robot.
     pub fn holder(&self, robot: usize) -> Option<&Lease> {
         self.holders[robot].and_then(|token| self.live.get(&token))
     }
 
-    /// Which of at most 64 robots are held, bit by bit.
+    /// Returns a mask of the held robots, of at most 64: bit i stands for the i-th robot of the range.
     pub fn held(&self, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(Option::is_some))
     }
 
-    /// Which of at most 64 robots a lease holds, bit by bit.
+    /// Returns a mask of the robots that a lease holds, of at most 64.
     pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(|holder| *holder == Some(token)))
@@ -279,12 +276,12 @@ impl Leases {
         self.ended.iter().find(|ended| ended.token == token)
     }
 
-    /// Why a client does not hold a robot under a lease.
+    /// Returns the refusal of a client that does not hold a robot under a lease.
     pub fn not_held(&self, token: u64, client: ClientId, robot: usize) -> Refusal {
         let is_own = |lease: &&Lease| lease.client == client && lease.robots.contains(&robot);
         let holder = self.holder(robot).map(|holder| holder.client.pid);
         let taken_by = match (self.live.get(&token).filter(is_own), self.ended(token)) {
-            (Some(_), _) if self.holders[robot] == Some(token) => None, // It has expired.
+            (Some(_), _) if self.holders[robot] == Some(token) => None, // The lease has expired.
             (Some(lease), _) => holder.or(lease.taken_by),
             (None, Some(ended)) => ended.taken_by.or(holder),
             (None, None) => return Refusal::new(Status::NoLease, robot as u64),
@@ -322,7 +319,7 @@ impl Leases {
         Some(lease)
     }
 
-    /// Ends leases all of whose robots were taken.
+    /// Ends leases that have lost all their robots.
     fn forget_empty_leases(&mut self) {
         let holders = self.holders.clone();
         let is_empty = |lease: &Lease| {

@@ -1,4 +1,4 @@
-//! Leases that are given, kept and lost.
+//! Tests of leases: granting, use, expiry, takeover.
 
 use super::lease::{Claim, ClientId, Leases, Refusal};
 use emberwatch_messages::message::Status;
@@ -88,7 +88,7 @@ fn a_lease_does_not_expire_while_its_client_waits() {
 }
 
 #[test]
-fn a_lost_lease_names_who_holds_its_own_robots_now() {
+fn a_lost_lease_names_the_current_holder_of_its_own_robots() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     give(&mut leases, now, claim(1, 0..1, false), 11);
     give(&mut leases, now, claim(2, 1..2, false), 12);
@@ -108,7 +108,7 @@ fn a_lost_lease_names_its_taker_even_after_it_left() {
     leases.release(now, 13, client(3)).expect("held");
     assert_eq!(leases.use_lease(now, 11, client(1), &(1..2)), lost(3));
     give(&mut leases, now, claim(4, 1..2, false), 14);
-    // Not who came later.
+    // The refusal names the taker, not a later holder.
     assert_eq!(leases.use_lease(now, 11, client(1), &(1..2)), lost(3));
 }
 
@@ -142,7 +142,7 @@ fn robots_outside_the_server_are_refused() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     #[expect(
         clippy::reversed_empty_ranges,
-        reason = "what a hostile client may send"
+        reason = "a hostile client may send such a range"
     )]
     for robots in [0..3, 2..2, 5..7, 1..0] {
         let refused = leases
@@ -153,7 +153,7 @@ fn robots_outside_the_server_are_refused() {
 }
 
 #[test]
-fn a_world_is_replaced_by_who_holds_all_its_robots_that_are_held() {
+fn a_world_is_replaced_only_by_the_holder_of_all_its_held_robots() {
     let (mut leases, now) = (Leases::new(6), Instant::now());
     give(&mut leases, now, claim(1, 1..2, false), 11);
     assert_eq!(leases.use_world(now, 11, client(1), 0..3), Ok(()));
@@ -167,7 +167,7 @@ fn a_world_is_replaced_by_who_holds_all_its_robots_that_are_held() {
 }
 
 #[test]
-fn held_robots_are_told_bit_by_bit() {
+fn held_robots_are_reported_bit_by_bit() {
     let (mut leases, now) = (Leases::new(128), Instant::now());
     give(&mut leases, now, claim(1, 64..66, false), 11);
     give(&mut leases, now, claim(2, 127..128, false), 12);

@@ -1,4 +1,4 @@
-//! What a control request leads to.
+//! Outcomes of control requests.
 
 use super::lease::{ClientId, Refusal};
 use super::state::ResetJob;
@@ -8,17 +8,17 @@ use emberwatch_messages::message::Status;
 use std::ops::Range;
 use std::time::Duration;
 
-/// What a control request leads to.
+/// The work and the answer that follow a control request.
 pub enum Outcome {
-    /// An answer now.
+    /// An immediate answer.
     Answer(Reply),
-    /// Resets to run, and an answer when the worlds it names are ready.
+    /// Resets to run, and an answer when the requested worlds are ready.
     Pending(Vec<ResetJob>, PendingReply),
-    /// Worlds to publish, and an answer now.
+    /// Worlds to publish to observers, and an immediate answer.
     Changed(Range<usize>, Reply),
-    /// Work on a file, and an answer when it is done.
+    /// A file to read or write, and an answer when that is done.
     File(Job, PendingFile),
-    /// An answer now, then the end of the server.
+    /// An immediate answer, then the end of the server.
     Shutdown,
 }
 
@@ -27,28 +27,28 @@ pub struct PendingReply {
     pub(super) worlds: Vec<usize>,
     pub(super) lease: u64,
     pub(super) client: ClientId,
-    /// Whether the reply describes the lease, or the worlds only.
-    pub(super) tells_lease: bool,
+    /// Whether the reply describes the lease and the worlds, or only the worlds.
+    pub(super) describes_lease: bool,
 }
 
-/// The part of a status reply that only the server knows.
+/// The part of a status reply that the simulator does not know.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ServerStats {
     pub uptime: Duration,
-    /// World steps a second, over the last second or so.
+    /// World steps per second, measured over about the last second.
     pub steps_per_second: f64,
-    /// Clients on the step channel.
+    /// Number of clients on the step channel.
     pub n_clients: usize,
-    /// Observers of frames.
+    /// Number of observers of frames.
     pub n_observers: usize,
 }
 
 /// A reply that waits for a file.
 #[derive(Debug)]
 pub enum PendingFile {
-    /// Worlds that are written.
+    /// A snapshot: the worlds that are written.
     Saved(Vec<WorldInfo>),
-    /// Worlds that will replace those of a lease.
+    /// A restore: the worlds that will be replaced, and the lease under which the client asked.
     Restored {
         lease: u64,
         client: ClientId,
@@ -56,7 +56,7 @@ pub enum PendingFile {
     },
 }
 
-/// The reply to a malformed request.
+/// Returns the reply to a malformed request.
 pub(super) fn malformed(problem: &str) -> Reply {
     let message = format!("{}: {problem}", Status::Malformed.explain(0));
     Reply::error(Status::Malformed, 0, message)

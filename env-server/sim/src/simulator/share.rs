@@ -1,10 +1,10 @@
-//! Shares work among threads, of which the calling one is the first.
+//! Shares work between the calling thread and the threads of a pool.
 
 use rayon::{Scope, ThreadPool};
 use std::sync::{Mutex, PoisonError};
 
-/// Does all jobs, on the calling thread and on the threads of a pool. Each thread takes the next job when it has finished
-/// one, so a thread that wakes up late delays no job.
+/// Does all jobs, on the calling thread and on the threads of a pool. Each thread takes the next job when it has
+/// finished one, so that a thread that wakes up late delays no job.
 pub(super) fn share<J: Send>(
     threads: &ThreadPool,
     n_jobs: usize,
@@ -28,8 +28,8 @@ pub(super) fn share<J: Send>(
     });
 }
 
-/// Starts a helper, which starts two others before it works: waking all of them from one thread would take as long as
-/// many jobs.
+/// Starts a helper thread, which starts two further helpers before it works. Waking all helpers from one thread would
+/// take as long as many jobs.
 fn start<'s>(scope: &Scope<'s>, helper: usize, n_helpers: usize, work: &'s (impl Fn() + Sync)) {
     if helper < n_helpers {
         scope.spawn(move |scope| {
@@ -66,7 +66,7 @@ mod tests {
     fn all_threads_take_part_the_calling_one_among_them() {
         let (seen, all) = (Mutex::new(HashSet::new()), Barrier::new(4));
         share(&pool(4), 4, 0..4, |_| {
-            // Each waits for the others: one thread cannot have two of these jobs.
+            // Each job waits for all others, so that no thread can run two of them.
             all.wait();
             seen.lock().expect("no panic").insert(current().id());
         });

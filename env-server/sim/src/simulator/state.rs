@@ -1,4 +1,4 @@
-//! The worlds and leases of a server.
+//! The state of a simulator: worlds, leases, and waiting requests.
 
 use super::barrier::{Barrier, Waiter};
 use super::beliefs::Beliefs;
@@ -14,7 +14,7 @@ use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
 use std::time::Instant;
 
-/// All worlds and leases of a server: requests in, answers out, no I/O and no clock.
+/// All worlds and leases of a server. It answers requests without I/O and without a clock.
 pub struct Simulator {
     pub(super) checked: Checked,
     pub(super) spec: WorldSpec,
@@ -23,9 +23,9 @@ pub struct Simulator {
     pub(super) leases: Leases,
     /// Worlds for which requests wait.
     pub(super) waiting_worlds: Vec<usize>,
-    /// Requests whose wait is over, with the refusal of each that is refused.
+    /// Requests whose wait is over and that are not answered yet; `Err` holds a refusal.
     pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
-    /// Worlds that moved without a request of their own.
+    /// Worlds that moved without a request that completed them.
     pub(super) moved: Vec<usize>,
     pub(super) n_tickets: u64,
     pub(super) threads: ThreadPool,
@@ -34,16 +34,16 @@ pub struct Simulator {
     pub(super) n_refused: u64,
 }
 
-/// A world, and the paths for its next step.
+/// A world and its barrier.
 pub(super) struct Place {
     pub slot: Slot,
     pub barrier: Barrier,
 }
 
-/// A world, or what is known of it during its burn-in.
+/// A world that is ready, or that is in its burn-in.
 pub(super) enum Slot {
     Ready(Box<Episode>),
-    /// `last` and `cells` are its outcome and its robots before.
+    /// `last` and `cells` are the world's outcome and its robots' cells before the reset.
     Resetting {
         last: WorldOutcome,
         cells: Vec<[u32; 2]>,
@@ -52,18 +52,18 @@ pub(super) enum Slot {
     },
 }
 
-/// A world to reset, taken out of the simulator.
+/// A reset of a world, to be run outside the simulator.
 pub struct ResetJob {
     pub world: usize,
-    /// Its episode, if it had one before.
+    /// The world's previous episode, if any.
     pub before: Option<Box<Episode>>,
-    /// The number of its new one, if it had none.
+    /// Number of the new episode, which counts only if there is no previous one.
     pub episode: u64,
     pub seed: u64,
 }
 
 impl Simulator {
-    /// The worlds of a server and the jobs that start them; `next_token` makes the tokens of leases.
+    /// Creates the worlds of a server, and the jobs for their first burn-in. `next_token` generates lease tokens.
     pub fn new(
         checked: Checked,
         threads: ThreadPool,
@@ -101,44 +101,44 @@ impl Simulator {
         Ok((simulator, jobs))
     }
 
-    /// Replaces a world, for example by the same one after its reset.
+    /// Installs the episode of a world, for example after its reset.
     pub fn put(&mut self, world: usize, episode: Box<Episode>) {
         self.places[world].slot = Slot::Ready(episode);
         self.beliefs.forget(self.robots_of(world));
     }
 
-    /// What worlds must fit.
+    /// Returns the specification that worlds must fit.
     pub fn spec(&self) -> &WorldSpec {
         &self.spec
     }
 
-    /// Whether its worlds were recorded.
+    /// Returns whether the worlds show recorded states.
     pub fn is_recorded(&self) -> bool {
         self.checked.recorded.is_some()
     }
 
-    /// Ends leases that have expired, and moves worlds whose deadline has passed; returns the pid of each such lease.
+    /// Ends expired leases and moves worlds whose deadline has passed. Returns the process id of each expired lease.
     pub fn tick(&mut self, now: Instant) -> Vec<u32> {
         let expired = self.leases.expire(now);
         self.settle(now);
         expired.iter().map(|lease| lease.client.pid).collect()
     }
 
-    /// Ends the leases of a process that has died; returns how many there were.
+    /// Ends the leases of a process that has died, and returns their number.
     pub fn end_of_process(&mut self, now: Instant, pid: u32) -> usize {
         let n_leases = self.leases.end_of_process(pid).len();
         self.settle(now);
         n_leases
     }
 
-    /// Ends the leases of connections that were closed: of nodes that are not among these.
+    /// Ends the leases of closed connections, whose node is not in `nodes`, and returns their number.
     pub fn end_of_connections(&mut self, now: Instant, nodes: &HashSet<u128>) -> usize {
         let n_leases = self.leases.end_of_nodes_except(nodes).len();
         self.settle(now);
         n_leases
     }
 
-    /// The episode of a world that is not being reset.
+    /// Returns the episode of a world, or `None` if the world does not exist or is being reset.
     pub fn episode(&self, world: usize) -> Option<&Episode> {
         match &self.places.get(world)?.slot {
             Slot::Ready(episode) => Some(episode),
@@ -146,34 +146,34 @@ impl Simulator {
         }
     }
 
-    /// Every world.
+    /// Returns the range of all worlds.
     pub fn worlds(&self) -> Range<usize> {
         0..self.places.len()
     }
 
-    /// World steps so far.
+    /// Returns the number of world steps so far.
     pub fn n_steps(&self) -> u64 {
         self.n_steps
     }
 
-    /// Worlds by their numbers.
+    /// Checks that worlds exist, and returns their range.
     pub(super) fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
         checked(first, n_worlds, self.places.len(), Status::NoSuchWorld)
     }
 
-    /// Robots by their numbers.
+    /// Checks that robots exist, and returns their range.
     pub(super) fn robot_range(&self, first: u32, n_robots: u32) -> Result<Range<usize>, Refusal> {
         let n_all = self.places.len() * self.spec.rules.n_robots;
         checked(first, n_robots, n_all, Status::NoSuchRobot)
     }
 
-    /// The worlds of some robots.
+    /// Returns the worlds to which robots belong.
     pub fn worlds_of(&self, robots: &Range<usize>) -> Range<usize> {
         let team = self.spec.rules.n_robots;
         robots.start / team..robots.end.div_ceil(team)
     }
 
-    /// The robots of a world.
+    /// Returns the robots of a world.
     pub(super) fn robots_of(&self, world: usize) -> Range<usize> {
         let team = self.spec.rules.n_robots;
         world * team..(world + 1) * team
@@ -209,13 +209,13 @@ fn checked(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<
     Err(Refusal::new(otherwise, n_all as u64))
 }
 
-/// Which of a world's robots, by their place in it, are among some robots.
+/// Intersects `robots` with the robots of a world. Returns the result as indices within the world.
 pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usize> {
     let (first, end) = (of_world.start, of_world.end);
     robots.start.max(first) - first..robots.end.min(end) - first
 }
 
-/// `[row, col]` of each robot.
+/// Returns `[row, col]` of each robot.
 pub(super) fn cells(episode: &Episode) -> Vec<[u32; 2]> {
     let robots = episode.robots().iter();
     let cells = robots.map(Robot::cell);
@@ -236,7 +236,7 @@ impl Slot {
 }
 
 impl ResetJob {
-    /// Simulates the burn-in: the slow part, for any thread.
+    /// Simulates the burn-in. This is the slow part, which any thread can do.
     pub fn run(self, rules: &Rules) -> (usize, Box<Episode>) {
         let episode = match self.before {
             None => Box::new(Episode::numbered(rules, self.seed, self.episode)),

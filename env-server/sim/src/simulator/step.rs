@@ -1,6 +1,11 @@
-//! Step requests: check the whole, then step, observe or recall.
+//! Step requests: checks of the whole request, then a step, an observation or a recall.
 //!
-//! A refusal changes nothing. What a client sends is bytes and numbers it chose freely: nothing here may panic on them.
+//! A refused request changes nothing. Clients are not trusted: no bytes or numbers in a request may cause a panic.
+//!
+//! The order of the checks is: version, operation, robots and flags first, memory for the answer last. In between, a
+//! step checks path length, payload length, moves, coverage, lease, completeness, readiness (`resetting`,
+//! `episode_over`), k and waiting paths (`busy`). `observe` checks payload length and readiness; `recall` checks these,
+//! and whether the steps are kept.
 
 use super::barrier::{Ticket, Waiter, mask};
 use super::lease::{ClientId, Refusal};
@@ -13,29 +18,29 @@ use emberwatch_model::path::{MoveError, check_moves};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// What a step request leads to.
+/// The outcome of a step request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Stepped {
-    /// An answer now.
+    /// An immediate answer.
     Reply(StepReply),
-    /// An answer when the world has moved: [`Simulator::next_answer`] gives it.
+    /// The request waits until its world moves. [`Simulator::next_answer`] then returns the answer.
     Waits(Ticket),
 }
 
-/// What a request that is granted leads to.
+/// How a valid request is answered.
 enum Granted<'a> {
-    /// With the worlds as they are; the answer is written.
+    /// The payload already holds the answer.
     Written,
-    /// With the worlds as they are.
+    /// The answer shows the current step of the worlds.
     Present,
-    /// With the worlds as they were at these steps.
+    /// The answer shows past steps: one step number for each world, as bytes.
     Past(&'a [u8]),
-    /// Its world waits for other paths.
+    /// The world waits for other paths.
     Waits(Ticket),
 }
 
 impl Simulator {
-    /// Answers a step request or has it wait; results and frames go to `payload`, which is left empty otherwise.
+    /// Answers a step request or makes it wait. Writes results and frames, if any, to `payload`.
     pub fn step(
         &mut self,
         now: Instant,
@@ -102,8 +107,8 @@ impl Simulator {
         }
     }
 
-    /// Puts the paths of a request that was checked, and moves its worlds, unless the only one waits for other paths.
-    /// Writes the answer of worlds that have moved.
+    /// Stores the paths of a checked request. Moves its worlds and writes the answer, unless the request is for one
+    /// world that still waits for other paths: then returns the ticket.
     fn put_paths(
         &mut self,
         now: Instant,
@@ -125,7 +130,7 @@ impl Simulator {
             barrier.put(robots.start, n_moves, own, is_full);
             paths = rest;
         }
-        // A request for several worlds has all their robots, so that none of them waits.
+        // A request for several worlds includes all their held robots, so that none of these worlds waits.
         if worlds.len() > 1 || self.is_complete(now, worlds.start) {
             let parts = self.parts(request, payload);
             self.advance(now, worlds, Some(parts));
@@ -135,7 +140,7 @@ impl Simulator {
         Some(self.wait(now, client, request, worlds.start))
     }
 
-    /// Has a request wait for the other paths of its world.
+    /// Makes a request wait for the other paths of its world.
     fn wait(
         &mut self,
         now: Instant,
@@ -165,7 +170,7 @@ impl Simulator {
         ticket
     }
 
-    /// Checks that worlds kept what steps showed.
+    /// Checks that the history of each world holds the requested step.
     fn check_kept(&self, worlds: Range<usize>, steps: &[u8]) -> Result<(), Refusal> {
         let mut episodes = worlds
             .filter_map(|world| self.episode(world))
@@ -196,8 +201,9 @@ impl Simulator {
         coverage.map_err(|status| Refusal::new(status, 0))
     }
 
-    /// Checks that a request names all robots that its client holds in a world, and for several worlds all of their
-    /// robots. Only the first and the last world can have others.
+    /// Checks that a request for one world includes all robots that its client holds there, and that a request for
+    /// several worlds includes all their held robots. Only the first and the last world can have robots outside the
+    /// request.
     fn check_whole(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         let (team, worlds) = (self.spec.rules.n_robots, self.worlds_of(robots));
         for world in [worlds.start, worlds.end - 1] {
@@ -214,7 +220,7 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that no path of these robots waits already; a client with two ports could send another.
+    /// Checks that no path of these robots is waiting. A client with two ports could send a second path.
     fn check_new(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         for world in self.worlds_of(robots) {
             let own = within(robots, self.robots_of(world));
@@ -225,7 +231,7 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that each world can take a step, and that it is at the step that its paths are meant for.
+    /// Checks that each world can step, and that the paths are meant for its current step.
     fn check_ready(&self, robots: &Range<usize>, body: &[u8]) -> Result<(), Refusal> {
         for (world, step) in self.worlds_of(robots).zip(numbers(body)) {
             let Some(episode) = self.episode(world) else {
@@ -264,7 +270,7 @@ fn check_length(body: &[u8], expected: usize) -> Result<(), Refusal> {
     Err(Refusal::new(Status::WrongLength, expected as u64))
 }
 
-/// The numbers that a payload begins with.
+/// Reads 64-bit numbers from the start of a payload.
 pub(super) fn numbers(bytes: &[u8]) -> impl Iterator<Item = u64> {
     let (numbers, _) = bytes.as_chunks::<8>();
     numbers.iter().map(|&bytes| u64::from_ne_bytes(bytes))

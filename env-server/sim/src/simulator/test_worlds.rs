@@ -4,7 +4,7 @@ use super::state::{ResetJob, Simulator};
 use crate::config::ServerConfig;
 use rayon::ThreadPoolBuilder;
 
-/// A simulator whose worlds are in their first burn-in, and what ends it; its first lease is 1.
+/// Creates a simulator in its first burn-in, and the jobs that end it. The token of the first lease is 1.
 pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
     let threads = ThreadPoolBuilder::new().num_threads(1).build();
     let mut token = 0;
@@ -16,7 +16,7 @@ pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
     Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
 }
 
-/// Ends burn-ins.
+/// Runs burn-ins to their end.
 pub fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
     for job in jobs {
         let (world, episode) = job.run(&simulator.spec().rules);

@@ -1,4 +1,4 @@
-//! What waits for worlds that are being reset, and what leases do meanwhile.
+//! Tests of requests that wait for a reset, and of leases during that wait.
 
 use super::lease::ClientId;
 use super::outcome::{Outcome, PendingReply, ServerStats};
@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };
 
-/// A lease's length, as this server's settings say.
+/// Duration of a lease in these settings.
 const LEASE: Duration = Duration::from_secs(20);
 
-/// Two worlds in their first burn-in, and what ends it.
+/// Creates two worlds in their first burn-in, and the jobs that end it.
 fn start() -> (Simulator, Vec<ResetJob>) {
     new_simulator(ServerConfig {
         worlds: 2,
@@ -34,7 +34,7 @@ fn ask(simulator: &mut Simulator, now: Instant, request: &str) -> Outcome {
     simulator.control(now, US, VERSION, request.as_bytes(), &stats)
 }
 
-/// Asks for what is answered later.
+/// Sends a request whose answer must wait.
 fn wait(simulator: &mut Simulator, now: Instant, request: &str) -> (Vec<ResetJob>, PendingReply) {
     let Outcome::Pending(jobs, pending) = ask(simulator, now, request) else {
         panic!("{request} is not answered later");
@@ -42,18 +42,18 @@ fn wait(simulator: &mut Simulator, now: Instant, request: &str) -> (Vec<ResetJob
     (jobs, pending)
 }
 
-/// Asks for both worlds; the first token is 1.
+/// Acquires the robots of both worlds. The token of the first lease is 1.
 const ACQUIRE: &str = r#"{"op":"acquire","first_robot":0,"n_robots":2}"#;
 const RESET: &str = r#"{"op":"reset","lease":1,"worlds":[{"world":0,"seed":77}]}"#;
 
-/// The status of a step of world 0 from step k on.
+/// Requests a step of world 0 from step k, and returns the status.
 fn step(simulator: &mut Simulator, now: Instant, k: u64) -> Status {
     let mut body = Vec::new();
     write_step_body(&[k], &[1, 3], &mut body);
     status_of(simulator, now, Operation::Step, &body)
 }
 
-/// The status of a request for world 0.
+/// Sends a request for world 0 and returns the status.
 fn status_of(simulator: &mut Simulator, now: Instant, what: Operation, body: &[u8]) -> Status {
     let request = StepRequest {
         version: VERSION,
@@ -93,7 +93,7 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let Some(Reply::Reset { worlds }) = simulator.pending_reply(now, &pending) else {
         panic!("expected a reset");
     };
-    // The step before is forgotten.
+    // The reset has set the step back to 0.
     assert_eq!(
         (worlds[0].seed, worlds[0].step, worlds[0].episode),
         (77, 0, 1)
@@ -122,14 +122,14 @@ fn a_lease_lasts_from_its_last_use_or_renewal() {
 fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
     let ((mut simulator, mut jobs), mut now) = (start(), Instant::now());
     let (_, mut pending) = wait(&mut simulator, now, ACQUIRE);
-    for wait_of in ["the first", "that of a reset"] {
+    for wait_of in ["first burn-in", "burn-in of a reset"] {
         now += 9 * LEASE;
         assert!(simulator.tick(now).is_empty(), "{wait_of}");
         finish(&mut simulator, jobs);
         simulator.pending_reply(now, &pending).expect("ready");
         (jobs, pending) = wait(&mut simulator, now, RESET);
     }
-    // But not one that nobody waits for any more.
+    // A lease whose client has stopped waiting expires as usual.
     now += 9 * LEASE;
     simulator.cancel_reply(now, &pending);
     let almost = now + LEASE - Duration::from_millis(1);

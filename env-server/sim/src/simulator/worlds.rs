@@ -1,4 +1,4 @@
-//! Control requests about worlds as a whole: snapshot, restore, fork, and beliefs that are left.
+//! Control requests about whole worlds (snapshot, restore, fork), and about stored beliefs.
 
 use super::beliefs::BeliefPart;
 use super::lease::{ClientId, Refusal};
@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 impl Simulator {
-    /// Worlds as the bytes of a snapshot file.
+    /// Encodes worlds as the bytes of a snapshot file.
     pub fn snapshot(&self, worlds: Range<usize>) -> Result<Vec<u8>, SnapshotError> {
         let places = self.places[worlds].iter();
         let worlds: Vec<_> = places
@@ -29,7 +29,7 @@ impl Simulator {
         encode(&self.spec.settings, &worlds)
     }
 
-    /// Starts with a world of a file; returns the reset that it still needs.
+    /// Starts a world from a snapshot. Returns the reset job if the saved world was still in its burn-in.
     pub fn start_with(
         &mut self,
         world: usize,
@@ -54,7 +54,7 @@ impl Simulator {
         }
     }
 
-    /// The answer to a request that waited for a file.
+    /// Returns the answer to a request that waited for a file.
     pub fn file_reply(
         &mut self,
         now: Instant,
@@ -71,7 +71,7 @@ impl Simulator {
         }
     }
 
-    /// Replaces the worlds of a client that waits for a file.
+    /// Replaces the worlds of a restore request by the worlds read from its file.
     fn finish_restore(
         &mut self,
         now: Instant,
@@ -84,7 +84,7 @@ impl Simulator {
             worlds,
         } = pending
         else {
-            return malformed("expected worlds to restore");
+            return malformed("expected a pending restore, got a pending snapshot");
         };
         self.leases.end_wait(now, *lease);
         let may = self.check_replaceable(now, *lease, *client, worlds);
@@ -96,7 +96,7 @@ impl Simulator {
             SnapshotWorld::New(_) => None,
         });
         let Some(episodes) = episodes.collect::<Option<Vec<Box<Episode>>>>() else {
-            let message = "snapshot file: expected worlds at a step, got one in its burn-in";
+            let message = "snapshot file: expected worlds after their burn-in, got one during it";
             return Reply::error(Status::BadFile, 0, message.into());
         };
         for (world, episode) in worlds.clone().zip(episodes) {
@@ -106,7 +106,7 @@ impl Simulator {
         self.restored(worlds.clone())
     }
 
-    /// Cancels the wait for a file that failed, or that no client waits for any more.
+    /// Cancels the wait for a file that failed or whose client has stopped waiting.
     pub fn cancel_file(&mut self, now: Instant, pending: &PendingFile) {
         if let PendingFile::Restored { lease, .. } = pending {
             self.leases.end_wait(now, *lease);
@@ -180,7 +180,7 @@ impl Simulator {
         let at = self.present(&robots)?;
         if (left.episode, left.step) != (at.episode, at.step) {
             return Err(malformed(&format!(
-                "episode and step: expected {} and {}, as the world is, got {} and {}",
+                "episode and step: expected {} and {}, as in the world, got {} and {}",
                 at.episode, at.step, left.episode, left.step
             )));
         }
@@ -208,7 +208,7 @@ impl Simulator {
         let robots = self.robot_range(robot, 1).map_err(refusal)?;
         let at = self.present(&robots)?;
         let Some((info, bytes)) = self.beliefs.of(robots.start, &at) else {
-            let message = format!("no belief was left for robot {robot} at step {}", at.step);
+            let message = format!("no belief is stored for robot {robot} at step {}", at.step);
             return Err(Reply::error(Status::NotKept, at.step, message));
         };
         let start = usize::try_from(offset).map_or(bytes.len(), |offset| offset.min(bytes.len()));
@@ -220,7 +220,7 @@ impl Simulator {
         }))
     }
 
-    /// Checks that a client may replace worlds under a lease.
+    /// Checks that a client may replace worlds under a lease, and that none of them is in a reset.
     fn check_replaceable(
         &mut self,
         now: Instant,
@@ -235,7 +235,7 @@ impl Simulator {
         self.check_present(worlds)
     }
 
-    /// The world of a robot at present.
+    /// Returns the current outcome of the robots' world, or the refusal if it is being reset.
     fn present(&self, robots: &Range<usize>) -> Result<WorldOutcome, Reply> {
         let world = self.worlds_of(robots).start;
         let episode = self.episode(world);
@@ -255,14 +255,14 @@ fn absolute(path: String) -> Result<PathBuf, Reply> {
         return Ok(path.into());
     }
     Err(malformed(&format!(
-        "path: expected an absolute one, got {path:?}"
+        "path: expected an absolute path, got {path:?}"
     )))
 }
 
-/// The answer to a snapshot that was written, with the worlds as they were then.
+/// Returns the answer to a snapshot request, with the worlds as they were written.
 fn saved(pending: &PendingFile, path: &Path, n_bytes: usize) -> Reply {
     let PendingFile::Saved(worlds) = pending else {
-        return malformed("expected worlds that were saved");
+        return malformed("expected a pending snapshot, got a pending restore");
     };
     Reply::Snapshot {
         path: path.display().to_string(),

@@ -1,20 +1,20 @@
-//! Why a snapshot is refused.
+//! Errors of snapshots.
 
 use thiserror::Error;
 
-/// Why a snapshot is refused; each says what was expected and what is there.
+/// The reason for refusing a snapshot: what was expected and what was found.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// The file is damaged; an older one may be whole.
+    /// The file is damaged. An older file may still be intact.
     #[error("{0}")]
     Damaged(String),
-    /// A snapshot of other settings or another version, or one that cannot be continued.
+    /// The snapshot has different settings, another version or invalid values.
     #[error("{0}")]
     Unfit(String),
 }
 
 impl SnapshotError {
-    /// The refusal of a file with other worlds than are wanted.
+    /// Creates the error of a file with the wrong number of worlds.
     pub fn n_worlds(expected: impl ToString, got: usize) -> Self {
         let expected = expected.to_string();
         Self::Unfit(format!("worlds: expected {expected}, got {got}"))

@@ -1,4 +1,4 @@
-//! Snapshot files: written whole or not at all.
+//! Snapshot files, which are written completely or not at all.
 
 use super::error::SnapshotError;
 use super::format::{HEADER_BYTES, MAGIC, MAX_BYTES, Snapshot, checked_length, decode};
@@ -10,38 +10,38 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use thiserror::Error;
 
-/// What is wrong with pipes, devices, folders and links.
+/// The error for pipes, devices, folders and links.
 const NOT_A_FILE: &str = "expected a regular file, got something else";
 
-/// Ending of the name of a file that is being written.
+/// Ending of a file's name while it is being written.
 pub(super) const PART: &str = ".part";
 
 static N_PARTS: AtomicU64 = AtomicU64::new(0);
 
-/// A file that could not be written or is refused.
+/// An error in writing or reading a snapshot file.
 #[derive(Debug, Error)]
 #[error("snapshot file {path}: {problem}")]
 pub struct FileError {
-    /// The file, or its folder.
+    /// The file or its folder.
     pub path: String,
     pub problem: String,
-    /// Whether this file is damaged, so that an older one may be used.
+    /// Whether the file is damaged, so that an older one should be tried.
     pub is_damaged: bool,
 }
 
-/// What a file that was just written survives.
+/// The failures that a newly written file survives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Durability {
     /// The death of any process.
     Kill,
-    /// A loss of power, too: the disk has it. Takes some milliseconds.
+    /// Also a loss of power, because the data has reached the disk. This takes some milliseconds.
     PowerLoss,
 }
 
-/// Writes a file under another name first, so that there is never half of it; mode 0600.
+/// Writes a file, with mode 0600, under a temporary name and then renames it, so that it is never incomplete.
 pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), FileError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
-    // Several threads of a process may write one file.
+    // Several threads of a process may write the same file.
     let n = N_PARTS.fetch_add(1, Ordering::Relaxed);
     name.push(format!(".{}-{n}{PART}", std::process::id()));
     let part = path.with_file_name(name);
@@ -61,12 +61,12 @@ pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), Fi
     })
 }
 
-/// Waits for the disk to have the folder, too, so that the new name survives a loss of power.
+/// Waits until the folder has reached the disk, so that the new name survives a loss of power.
 fn sync_folder_of(path: &Path) -> io::Result<()> {
     let folder = path
         .parent()
         .filter(|folder| !folder.as_os_str().is_empty());
-    // Other systems do not open folders.
+    // Other systems cannot open folders.
     if cfg!(unix) {
         File::open(folder.unwrap_or(Path::new(".")))?.sync_all()?;
     }
@@ -80,7 +80,7 @@ pub fn read(path: &Path) -> Result<Snapshot, FileError> {
     snapshot.map_err(|error| refused(path, error))
 }
 
-/// The error of a file whose contents are refused.
+/// Creates the error of a file whose contents are refused.
 pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     FileError {
         path: path.display().to_string(),
@@ -89,7 +89,7 @@ pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     }
 }
 
-/// A new file; anything of its name, such as a link or a pipe, is removed and not opened.
+/// Creates a new file. Anything that has its name, such as a link or a pipe, is removed and not opened.
 pub(super) fn create(path: &Path) -> io::Result<File> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -102,7 +102,7 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
     options.open(path)
 }
 
-/// Checks that nothing but a snapshot is replaced: no other file, no device, no link.
+/// Checks that the path is free or holds a snapshot: other files, devices and links must not be replaced.
 fn may_be_replaced(path: &Path) -> io::Result<()> {
     if path.file_name().is_none() {
         return Err(io::Error::other(NOT_A_FILE));
@@ -117,7 +117,7 @@ fn may_be_replaced(path: &Path) -> io::Result<()> {
                 Ok(())
             } else {
                 Err(io::Error::other(
-                    "expected no file or a snapshot to replace, got another kind of file",
+                    "expected a new file or a snapshot to replace, got another kind of file",
                 ))
             }
         }
@@ -127,13 +127,14 @@ fn may_be_replaced(path: &Path) -> io::Result<()> {
 fn open(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.read(true);
-    // Opening a pipe would wait for its writer.
+    // Without this flag, opening a pipe would wait for its writer.
     #[cfg(unix)]
     options.custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32);
     options.open(path)
 }
 
-/// All of a regular file whose header fits it: a pipe would block, and a device might never end.
+/// Reads a whole file after checking that it is a regular file of the length that its header states. A pipe would
+/// block, and a device might never end.
 fn read_bytes(path: &Path) -> io::Result<Result<Vec<u8>, SnapshotError>> {
     let mut file = open(path)?;
     let metadata = file.metadata()?;

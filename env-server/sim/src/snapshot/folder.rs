@@ -1,17 +1,17 @@
-//! A folder of an instance's last snapshot files.
+//! The folder of an instance's latest snapshot files.
 
 use super::file::{Durability, FileError, PART, create, failed, write};
 use emberwatch_messages::instance::Instance;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Digits of a file's number.
+/// Number of digits in a file's number.
 const DIGITS: usize = 12;
 
-/// How the files of a folder end.
+/// Ending of snapshot files in a folder.
 const EXTENSION: &str = "snapshot";
 
-/// A folder with the last snapshots of an instance, numbered.
+/// A folder with the latest, numbered snapshots of an instance.
 #[derive(Debug, Clone)]
 pub struct Folder {
     path: PathBuf,
@@ -19,7 +19,7 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// The files of an instance; does not read the folder.
+    /// Names the folder and the instance without reading the folder.
     pub fn new(path: &Path, instance: &Instance) -> Self {
         Self {
             path: path.into(),
@@ -27,7 +27,7 @@ impl Folder {
         }
     }
 
-    /// Makes the folder and checks that files can be made in it.
+    /// Creates the folder, checks that files can be created in it, and removes unfinished files.
     pub fn prepare(&self) -> Result<(), FileError> {
         let probe = self.path.join(format!(".{}.probe", self.instance));
         let made = std::fs::create_dir_all(&self.path)
@@ -37,19 +37,19 @@ impl Folder {
         made.map_err(|error| failed(&self.path, error))
     }
 
-    /// The error of a folder with another run's files, which would be replaced one by one.
+    /// Creates the error that new snapshots would gradually replace those of an earlier run.
     pub fn not_empty(&self, n_files: usize) -> FileError {
         let instance = &self.instance;
         FileError {
             path: self.path.display().to_string(),
             problem: format!(
-                "expected none of instance {instance:?}, or --restore, got {n_files} of another run"
+                "expected no snapshots of instance {instance:?} without --restore, got {n_files} of an earlier run"
             ),
             is_damaged: false,
         }
     }
 
-    /// Removes unfinished files of servers that were killed.
+    /// Removes unfinished files of killed servers.
     fn remove_parts(&self) -> io::Result<()> {
         for entry in std::fs::read_dir(&self.path)?.flatten() {
             let name = entry.file_name();
@@ -64,7 +64,7 @@ impl Folder {
         Ok(())
     }
 
-    /// The instance's files, the oldest first.
+    /// Returns the numbers and paths of the instance's files, the oldest first.
     pub fn files(&self) -> Result<Vec<(u64, PathBuf)>, FileError> {
         let entries = std::fs::read_dir(&self.path).map_err(|error| failed(&self.path, error))?;
         let number = |path: &Path| {
@@ -81,12 +81,12 @@ impl Folder {
         Ok(files)
     }
 
-    /// How the instance's files are named.
+    /// Returns the pattern of the instance's file names.
     pub fn pattern(&self) -> String {
         format!("{}-<{DIGITS} digits>.{EXTENSION}", self.instance)
     }
 
-    /// The names of the folder's snapshots of all instances, by their ending.
+    /// Returns the names of the folder's snapshots of all instances, sorted.
     pub fn snapshots(&self) -> Vec<String> {
         let entries = std::fs::read_dir(&self.path)
             .into_iter()
@@ -101,7 +101,7 @@ impl Folder {
         names
     }
 
-    /// Writes the next file and removes all but the last few and `also_keep`.
+    /// Writes the next file. Removes all others except the latest `keep` files, the new one included, and `also_keep`.
     pub fn save(
         &self,
         bytes: &[u8],
@@ -117,7 +117,7 @@ impl Folder {
         let n_old = (files.len() + 1).saturating_sub(keep);
         let old_files = files[..n_old].iter().map(|(_, old)| old);
         for old in old_files.filter(|old| Some(old.as_path()) != also_keep) {
-            let _ = std::fs::remove_file(old); // It may have been removed meanwhile.
+            let _ = std::fs::remove_file(old); // The file may have been removed already.
         }
         Ok(path)
     }

@@ -1,8 +1,8 @@
-//! Worlds as bytes: everything that decides their future, in a versioned file with a checksum.
+//! The format of snapshots: everything that decides the worlds' future, with a version and a checksum.
 //!
-//! A file is [`MAGIC`], the version, the CRC-32 of the rest, its length, and the rest: [`Settings`] and
-//! worlds as bincode writes them. All of it is in the byte order of the host; a file of the other order
-//! is one of an unknown version.
+//! A file consists of [`MAGIC`], the version, the CRC-32 of the body, the length of the body, and the body:
+//! [`Settings`] and worlds, encoded by bincode. The byte order is the host's. A file in the other byte order appears to
+//! have an unknown version.
 
 use super::error::SnapshotError;
 use super::settings::{Settings, WorldSpec};
@@ -16,34 +16,34 @@ use emberwatch_messages::limits::memory::in_words;
 use emberwatch_model::Grid;
 use emberwatch_model::path::path_to_bytes;
 
-/// What every snapshot begins with.
+/// The first bytes of every snapshot.
 pub const MAGIC: [u8; 8] = *b"EMBRSNAP";
 
-/// The version of the file's form.
+/// The version of the format.
 pub const VERSION: u32 = 2;
 
-/// Magic, version, checksum and length.
+/// Length of the header: magic, version, checksum and body length.
 pub(super) const HEADER_BYTES: usize = 8 + 4 + 4 + 8;
 
-/// Largest file: 4 GiB.
+/// Maximum size of a file's body: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// How bincode writes: integers of fixed size.
+/// The configuration of bincode: integers of fixed size.
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// Worlds of a server, and the settings that they follow.
+/// Saved worlds of a server, and the settings that they depend on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     pub settings: Settings,
     pub worlds: Vec<SnapshotWorld<Box<SavedWorld>>>,
 }
 
-/// A world at some step, or one that is yet to be simulated.
+/// A world at some step, or an episode that is yet to be simulated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SnapshotWorld<T> {
     Ready(T),
-    /// In its burn-in.
+    /// A world in its burn-in.
     New(NewEpisode),
 }
 
@@ -51,25 +51,25 @@ pub enum SnapshotWorld<T> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NewEpisode {
     pub seed: u64,
-    /// Its number.
+    /// Number of the episode.
     pub episode: u64,
 }
 
-/// A world in the order of its bytes.
+/// A world with its fields in the order in which they are encoded.
 #[derive(Encode)]
 struct EncodedWorld<'a> {
     result: Vec<u8>,
     states: &'a [u8],
     first_states: &'a [u8],
-    /// Result, frame and path of each robot.
+    /// Result, frame and path of each robot, in order.
     robots: Vec<(Vec<u8>, &'a [u8], Vec<u8>)>,
     history: Vec<Past<&'a [u8]>>,
 }
 
-/// A step's result; result, cells and values of its robots.
+/// A past step: the world's result, and the result, cells and values of each robot.
 type Past<B> = (Vec<u8>, Vec<(Vec<u8>, B, B)>);
 
-/// The same, out of a file.
+/// A world decoded from a file, with the same fields as [`EncodedWorld`].
 #[derive(Decode)]
 struct DecodedWorld {
     result: Vec<u8>,
@@ -79,7 +79,7 @@ struct DecodedWorld {
     history: Vec<Past<Vec<u8>>>,
 }
 
-/// Worlds as the bytes of a file.
+/// Encodes worlds as the bytes of a file.
 pub fn encode(
     settings: &Settings,
     worlds: &[SnapshotWorld<&Episode>],
@@ -96,7 +96,7 @@ pub fn encode(
         ))
     })?;
     bytes.resize(HEADER_BYTES, 0);
-    // Only a writer can fail, and memory does not.
+    // Encoding can fail only if the writer fails, and writing to memory does not.
     let _ = bincode::encode_into_std_write((settings, worlds), &mut bytes, FORM);
     let body = &bytes[HEADER_BYTES..];
     let (checksum, length) = (crc32fast::hash(body), body.len() as u64);
@@ -107,7 +107,7 @@ pub fn encode(
     Ok(bytes)
 }
 
-/// The worlds in the bytes of a file, whole or not at all; [`Snapshot::restore`] checks their values.
+/// Checks length and checksum, and decodes the worlds. [`Snapshot::restore`] checks their values.
 pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     let malformed = |problem: String| SnapshotError::Unfit(format!("malformed: {problem}"));
     let body = checked_body(bytes)?;
@@ -115,7 +115,7 @@ pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
         decode_body(body).map_err(|error| malformed(error.to_string()))?;
     if length != body.len() {
         let rest = body.len() - length;
-        return Err(malformed(format!("{rest} bytes behind the last world")));
+        return Err(malformed(format!("{rest} bytes after the last world")));
     }
     let decoded = |(seed, episode, world): (u64, u64, Option<DecodedWorld>)| {
         Ok(match world {
@@ -129,7 +129,7 @@ pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     })
 }
 
-/// Converts every world of a file; the error names the first that is invalid.
+/// Converts every world of a file. The error names the first invalid world.
 fn each_world<T, U>(
     worlds: Vec<T>,
     convert: impl Fn(T) -> Result<U, InvalidWorld>,
@@ -146,15 +146,15 @@ fn check_size(n_bytes: u64) -> Result<(), SnapshotError> {
         return Ok(());
     }
     Err(SnapshotError::Unfit(format!(
-        "expected a snapshot of at most {MAX_BYTES} bytes, got worlds of {n_bytes}"
+        "expected a snapshot of at most {MAX_BYTES} bytes, got {n_bytes}"
     )))
 }
 
-/// What a file holds.
+/// The body of a file: settings, and for each world its seed, episode number and, after its burn-in, its state.
 type Contents = (Settings, Vec<(u64, u64, Option<DecodedWorld>)>);
 
-/// Reads contents; returns how many bytes they took, too. bincode accepts lengths up to a limit, which is part of its
-/// types: the smallest sufficient one, so that a small file cannot ask for much memory.
+/// Decodes a body, and returns the contents and the number of bytes read. The limit of bincode's allocations is a
+/// constant in its type, so that this picks the smallest sufficient limit: a small file cannot claim much memory.
 fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
     match body.len() {
         0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),
@@ -175,7 +175,7 @@ fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
     Ok(body)
 }
 
-/// Checks a header, with the number of bytes behind it; returns their checksum.
+/// Checks a header against the actual length of the body, `got`, and returns the checksum in the header.
 pub(super) fn checked_length(header: &[u8], got: u64) -> Result<u32, SnapshotError> {
     if header.len() < HEADER_BYTES || header[..8] != MAGIC {
         let problem =
@@ -255,7 +255,7 @@ impl<'a> EncodedWorld<'a> {
 }
 
 impl Snapshot {
-    /// The worlds, ready to continue on a server.
+    /// Checks the settings and values, and returns the worlds, ready to continue on a server.
     pub fn restore(
         self,
         spec: &WorldSpec,

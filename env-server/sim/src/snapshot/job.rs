@@ -1,4 +1,4 @@
-//! Work on snapshot files, for a thread that may wait for a disk.
+//! Jobs that read or write snapshot files, for a thread that may wait for a disk.
 
 use super::error::SnapshotError;
 use super::file::{Durability, FileError, read, refused, write};
@@ -9,22 +9,22 @@ use crate::world::Episode;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// What to do with a file.
+/// A job that reads or writes a snapshot file.
 #[derive(Debug)]
 pub enum Job {
-    /// Write a snapshot.
+    /// Writes a snapshot.
     Save { path: PathBuf, bytes: Vec<u8> },
-    /// Write the next of the server's own snapshots.
+    /// Writes the next of the server's automatic snapshots.
     Autosave {
         folder: Folder,
         durability: Durability,
-        /// How many files to keep.
+        /// Number of files to keep.
         keep: usize,
-        /// Another one to keep.
+        /// A further file to keep.
         also_keep: Option<PathBuf>,
         bytes: Vec<u8>,
     },
-    /// Read worlds of a snapshot.
+    /// Reads worlds of a snapshot.
     Load { path: PathBuf, worlds: Range<usize> },
 }
 
@@ -61,7 +61,7 @@ impl Job {
     }
 }
 
-/// Worlds of a file; `None`: all.
+/// Reads worlds of a file, all of them if `worlds` is `None`.
 pub fn load(
     spec: &WorldSpec,
     path: &Path,

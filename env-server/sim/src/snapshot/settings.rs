@@ -1,4 +1,4 @@
-//! The settings that a server's worlds depend on: a snapshot fits a server with the same ones.
+//! The settings that a server's worlds depend on. A snapshot fits a server with equal settings.
 
 use super::error::SnapshotError;
 use crate::config::Checked;
@@ -8,10 +8,10 @@ use emberwatch_model::ModelError;
 use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
-/// Names the task; it stands last, and only where the worlds are one.
+/// Key of the task's name: the last setting, present only if a task set the worlds' settings.
 const TASK: &str = "task";
 
-/// Raised whenever the same settings and seed give another trajectory or another reward.
+/// Version of the dynamics. Increased when equal settings and seeds yield a different trajectory or different rewards.
 const WORLDS: u32 = 1;
 
 /// The settings of a server that its worlds depend on.
@@ -19,11 +19,11 @@ const WORLDS: u32 = 1;
 pub struct Settings {
     /// The model file as TOML.
     pub model: String,
-    /// Every other setting by name.
+    /// All other settings, as pairs of name and value.
     pub others: Vec<(String, String)>,
 }
 
-/// What the worlds of a server must fit.
+/// The settings and rules that the worlds of a server must fit.
 #[derive(Debug, Clone)]
 pub struct WorldSpec {
     pub settings: Settings,
@@ -31,7 +31,7 @@ pub struct WorldSpec {
 }
 
 impl WorldSpec {
-    /// Those of a server.
+    /// Returns the specification of a server's worlds.
     pub fn of(checked: &Checked) -> Result<Self, ModelError> {
         let Checked {
             config,
@@ -58,7 +58,7 @@ impl WorldSpec {
 }
 
 impl Settings {
-    /// The settings of a server.
+    /// Extracts the settings that worlds depend on.
     pub fn of(checked: &Checked) -> Self {
         let config = &checked.config;
         let model = toml::to_string(checked.model.file());
@@ -90,15 +90,15 @@ impl Settings {
         }
     }
 
-    /// Returns 16 hexadecimal digits that identify the worlds: results can be compared only where they are equal.
+    /// Returns 16 hexadecimal digits that identify the worlds. Results are comparable only if these digits are equal.
     ///
-    /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see every
-    /// cell. It leaves out the task's name and `max_steps`: a result has its own number of steps.
+    /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see
+    /// every cell. It omits the task's name and `max_steps`, because a result has its own number of steps.
     pub fn worlds_fingerprint(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(format!("worlds {WORLDS}\n{}\n", self.model));
         for (name, value) in &self.others {
-            // The path's cells are seen, unless a client asks for more.
+            // With `client`, robots see the cells of their path unless the client asks for more.
             let value = if value == "client" { "path" } else { value };
             if name != TASK && name != "max_steps" {
                 hash.update(format!("{name} = {value}\n"));
@@ -111,23 +111,23 @@ impl Settings {
             .collect()
     }
 
-    /// Checks that these settings of a file are those of a server.
+    /// Checks that these settings, which come from a file, equal a server's settings.
     pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
         let other = |setting: &str, expected: &str, got: &str| {
-            let problem = format!("{setting}: expected {expected} as this server's, got {got}");
+            let problem = format!("{setting}: expected {expected}, as on this server, got {got}");
             SnapshotError::Unfit(problem)
         };
         if self.model != server.model {
             let pairs = server.model.lines().zip(self.model.lines());
             let line = pairs.into_iter().find(|(expected, got)| expected != got);
-            let (expected, got) = line.unwrap_or(("its model", "a longer or shorter one"));
+            let (expected, got) = line.unwrap_or(("as many lines", "fewer or more lines"));
             return Err(other(
                 "model",
                 &format!("{:?}", start_of(expected)),
                 &format!("{:?}", start_of(got)),
             ));
         }
-        // The same worlds have the same settings, whether by a task or by flags.
+        // The task's name is not compared: equal settings may come from a task or from flags.
         let others = server.others.iter().filter(|(name, _)| name != TASK);
         for (index, (setting, expected)) in others.enumerate() {
             let got = self
@@ -143,7 +143,7 @@ impl Settings {
     }
 }
 
-/// A line of a model file in an error; that of a map may be long.
+/// Shortens a line of a model file for an error, because lines with a map can be long.
 fn start_of(line: &str) -> String {
     line.chars().take(80).collect()
 }

@@ -1,4 +1,4 @@
-//! Snapshots that are whole, damaged and forged.
+//! Tests of intact, damaged and forged snapshots.
 
 use super::format::{HEADER_BYTES, NewEpisode, SnapshotWorld, decode, encode};
 use super::settings::{Settings, WorldSpec};
@@ -38,7 +38,7 @@ fn episodes(rules: &Rules) -> Vec<Episode> {
     episodes
 }
 
-/// Both robots fly; those of `full` observe every cell.
+/// Flies both robots. Robots in `full` observe every cell.
 fn step(rules: &Rules, episode: &mut Episode, full: u64) {
     let flown = Flown {
         moves: &[Move::Right, Move::Down, Move::Left, Move::Up],
@@ -87,7 +87,7 @@ fn every_cut_and_every_changed_byte_is_noticed() {
         let refused = decode(&[header, body].concat());
         refused.expect_err("no snapshot").to_string()
     };
-    // As a hostile author would write it: any body, with a header that fits.
+    // A hostile author can write any body with a matching header.
     let sealed = |body: &[u8]| {
         let mut header = header.to_vec();
         header[12..16].copy_from_slice(&crc32fast::hash(body).to_ne_bytes());
@@ -98,15 +98,15 @@ fn every_cut_and_every_changed_byte_is_noticed() {
     let (expected, got) = (body.len(), longer.len());
     let words = format!("damaged: expected {expected} bytes, got {got}");
     assert_eq!(refusal(header, &longer), words);
-    let words = "malformed: 1 bytes behind the last world";
+    let words = "malformed: 1 bytes after the last world";
     assert_eq!(sealed(&longer), words);
-    // A length that no memory holds.
+    // A claimed length that exceeds any memory.
     let claims = [&u64::MAX.to_ne_bytes(), &body[8..]].concat();
     let said = sealed(&claims);
     assert!(said.starts_with("malformed: "), "{said}");
 }
 
-/// Rows of changes to a world, and what is said of each.
+/// Builds an array of changes to a world and the error for each.
 macro_rules! changes {
     ($world:ident: $($change:block $words:literal)*) => {
         &[$((|$world| $change, $words)),*]
@@ -117,7 +117,7 @@ type Change = fn(&mut SavedWorld);
 
 const MISFITS: &[(Change, &str)] = changes! { world:
     { world.states[3] = 3; } "states: expected states below 3, got 3"
-    { world.first_states.truncate(14); } "first states: expected 15, got 14"
+    { world.first_states.truncate(14); } "first states: expected 15 cells, got 14"
     { world.robots[0].frame[0] = 3; } "expected an observation below 3 or 255"
     { world.robots[1].path = vec![4, 0]; } "move"
     { world.robots[0].path = vec![0]; } "path: expected 0 or 2 moves, got 1"
@@ -125,15 +125,15 @@ const MISFITS: &[(Change, &str)] = changes! { world:
     { world.robots[1].outcome.start.col = 5; } "start of the path: expected a cell of 3 x 5"
     { world.robots[0].outcome.cell = CLOSED; } "robot: expected a cell where robots may be, got (2, 0)"
     { world.robots[1].outcome.n_moves = 0; } "moves of the path: expected 2, got 0"
-    { world.robots[0].outcome.reward = f64::NAN; } "reward: expected a number, got NaN"
-    { world.robots[0].outcome.marginal = f64::INFINITY; } "reward: expected a number, got inf"
+    { world.robots[0].outcome.reward = f64::NAN; } "reward: expected a finite number, got NaN"
+    { world.robots[0].outcome.marginal = f64::INFINITY; } "reward: expected a finite number, got inf"
     { world.robots.pop(); } "robots: expected 2, got 1"
     { world.outcome.late = 4; } "robots that stayed: expected bits below 2, got 4"
     { world.outcome.hovered = 8; } "robots that stayed: expected bits below 2, got 8"
     { world.outcome.step = u64::MAX; } "step: expected at most"
     { world.outcome.episode = u64::MAX; } "episode: expected at most"
-    { world.outcome.reward = f64::NAN; } "reward: expected a number, got NaN"
-    { world.outcome.is_truncated = true; } "ends: expected [0, 0], got [0, 1]"
+    { world.outcome.reward = f64::NAN; } "reward: expected a finite number, got NaN"
+    { world.outcome.is_truncated = true; } "terminated, truncated: expected [0, 0], got [0, 1]"
     { world.history.clear(); } "history: expected 1 to 8 steps, got 0"
     { world.history = vec![world.history[0].clone(); 9]; } "history: expected 1 to 8 steps, got 9"
     { world.history[0].outcome.step = 9; } "history: expected seed, episode and step [2, 0, 4], got [2, 0, 9]"
@@ -144,7 +144,7 @@ const MISFITS: &[(Change, &str)] = changes! { world:
     { world.history[3].robots[0].values.pop(); } "history: expected 0 values, got 14"
 };
 
-/// Where no robot may be.
+/// A no-fly cell.
 const CLOSED: Cell = Cell { row: 2, col: 0 };
 
 #[test]
@@ -173,12 +173,12 @@ fn a_world_that_cannot_be_is_refused() {
 }
 
 #[test]
-fn the_first_other_setting_is_named() {
+fn the_first_different_setting_is_named() {
     let ours = spec().settings;
     let mut theirs = ours.clone();
     theirs.others[4].1 = "9".into();
     let error = theirs.check(&ours).expect_err("another burn-in");
-    let expected = "burn_in: expected 300 as this server's, got 9";
+    let expected = "burn_in: expected 300, as on this server, got 9";
     assert_eq!(error.to_string(), expected);
     theirs.model = theirs.model.replace("0.1", "0.2");
     let error = theirs.check(&ours).expect_err("a model").to_string();

@@ -1,7 +1,7 @@
 //! One world with its robots: reset, step, reward, truncation.
 //!
-//! A step flies the paths, moves the world from X_k to X_{k+1}, and observes the visited cells of
-//! X_{k+1} (paper Algorithm 1; the order is the authors').
+//! A step flies the paths, moves the world from X_k to X_{k+1}, and observes the visited cells of X_{k+1} (paper
+//! Algorithm 1, in the authors' order).
 
 use super::flown::Flown;
 use super::hidden::World;
@@ -15,33 +15,33 @@ use super::sensor::{Sensor, path_cells};
 use emberwatch_model::path::path_from_bytes;
 use emberwatch_model::{Coverage, Frame, Grid};
 
-/// One world's episode.
+/// The current episode of one world.
 #[derive(Debug, Clone)]
 pub struct Episode {
     world: World,
-    /// The world at k = 0, so that the next reset to the same seed needs no burn-in.
+    /// The world at k = 0, so that a reset to the same seed needs no burn-in.
     beginning: World,
     robots: Vec<Robot>,
     outcome: WorldOutcome,
-    /// A 0 for each cell, for [`pay`].
+    /// A buffer for [`pay`], which holds 0 for each cell between calls.
     counts: Vec<u8>,
     scratch: Scratch,
     history: History,
 }
 
 impl Episode {
-    /// A new world at k = 0.
+    /// Creates a world at k = 0, in its first episode.
     pub fn new(rules: &Rules, seed: u64) -> Self {
         Self::numbered(rules, seed, 0)
     }
 
-    /// A new world at k = 0 that was reset before.
+    /// Creates a world at k = 0, in the episode with this number.
     pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
         let world = World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended);
         Self::beginning(rules, world, episode)
     }
 
-    /// Starts over with a seed: frames are empty, robots at their starts, k = 0.
+    /// Starts the next episode with a seed: k = 0, empty frames, and all robots at their starts.
     pub fn reset(&mut self, rules: &Rules, seed: u64) {
         let world = if self.beginning.seed() == seed {
             self.beginning.clone()
@@ -51,7 +51,7 @@ impl Episode {
         *self = Self::beginning(rules, world, self.outcome.episode.wrapping_add(1));
     }
 
-    /// Flies paths and moves the world once.
+    /// Flies the paths, moves the world by one step, and computes frames and rewards.
     pub fn step(&mut self, rules: &Rules, flown: &Flown<'_>) {
         let n_moves = flown.moves.len() / self.robots.len();
         for (r, robot) in self.robots.iter_mut().enumerate() {
@@ -81,20 +81,20 @@ impl Episode {
         self.history.push(&self.outcome, &self.robots);
     }
 
-    /// What the last step gave, or the beginning after a reset.
+    /// Returns the world's outcome of the last step or reset.
     pub fn outcome(&self) -> &WorldOutcome {
         &self.outcome
     }
 
-    /// Its robots, in order.
+    /// Returns the robots, in order.
     pub fn robots(&self) -> &[Robot] {
         &self.robots
     }
 
-    /// What step k showed.
+    /// Returns the outcomes and frames of step k.
     ///
     /// # Errors
-    /// If it is not kept; the error is the nearest step that is, the oldest or the present.
+    /// If the history does not hold step k. The error is the nearest step that it holds: the oldest or the current one.
     pub fn recall(&self, step: u64) -> Result<&PastStep, u64> {
         let oldest = self.history.all().next().map(|past| past.outcome.step);
         let present = self.outcome.step;
@@ -102,34 +102,34 @@ impl Episode {
         self.history.step(step).ok_or(nearest)
     }
 
-    /// About how many bytes a snapshot of it takes.
+    /// Estimates the size of this episode in a snapshot, in bytes.
     pub fn n_bytes(&self) -> usize {
         let of_robot = |robot: &Robot| robot.frame.as_bytes().len() + robot.path.len() + 128;
         let robots: usize = self.robots.iter().map(of_robot).sum();
         2 * self.counts.len() + robots + self.history.n_bytes() + 256
     }
 
-    /// The hidden states, shape `[H, W]`.
+    /// Returns the hidden states, shape `[H, W]`.
     pub fn states(&self) -> &Grid<u8> {
         self.world.states()
     }
 
-    /// Whether the episode was truncated: it takes no step before it is reset.
+    /// Returns whether the episode was truncated and cannot step before a reset.
     pub fn is_over(&self) -> bool {
         self.outcome.is_truncated
     }
 
-    /// The hidden states at k = 0, shape `[H, W]`.
+    /// Returns the hidden states at k = 0, shape `[H, W]`.
     pub fn first_states(&self) -> &Grid<u8> {
         self.beginning.states()
     }
 
-    /// The last steps, the oldest first.
+    /// Returns the steps in the history, the oldest first.
     pub fn history(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.history.all()
     }
 
-    /// The episode that was saved: it continues bit for bit as the original.
+    /// Restores a saved episode. It continues bit for bit like the original.
     pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
         saved.check(rules)?;
         let SavedWorld {
@@ -218,7 +218,7 @@ fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
 }
 
 fn count(states: &Grid<u8>, wanted: u8) -> u32 {
-    // Bytes summed in chunks that cannot overflow: the compiler makes vector code of it.
+    // Sums of up to 255 bytes cannot overflow a byte, and the compiler vectorises them.
     let states = states.as_slice().expect("invariant: states are row-major");
     let of_chunk = |chunk: &[u8]| {
         u32::from(
@@ -247,7 +247,7 @@ mod tests {
         path_from_bytes(bytes).expect("test path")
     }
 
-    /// Flies the only robot.
+    /// Flies the only robot, which observes every cell if `full` is 1.
     fn step(episode: &mut Episode, rules: &Rules, moves: &[u8], full: u64) {
         let flown = Flown {
             moves: &path(moves),
@@ -298,7 +298,7 @@ mod tests {
         let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
         assert_eq!(cells, [20, 21, 22]);
         assert_eq!(full.observed().count(), 240);
-        // Neither readings nor states depend on the path.
+        // The path changes neither the readings of its cells nor the states.
         for (cell, value) in masked.observed() {
             assert_eq!(full.as_bytes()[cell], value);
         }

@@ -1,24 +1,24 @@
-//! What one step of a world is given.
+//! The input of a step: the paths of a world's robots.
 
 use emberwatch_model::{Coverage, Move};
 
-/// Which robots of a world fly in a step, and where. Of each mask, bit r is robot r of the world.
+/// The paths that the robots of a world fly in a step. In each mask, bit r stands for robot r of the world.
 #[derive(Debug, Clone, Copy)]
 pub struct Flown<'a> {
-    /// One path of equal length for each robot of the world, in order; only those of `ready` are flown.
+    /// One path per robot of the world, in order and of equal length. Only paths of robots in `ready` are flown.
     pub moves: &'a [Move],
-    /// The robots that have a path.
+    /// Robots that have a path.
     pub ready: u64,
-    /// Those that observe every cell, not only their path.
+    /// Robots that observe every cell, not only their path.
     pub full: u64,
-    /// Those that stay because nobody holds them.
+    /// Robots that stay because no client holds them.
     pub hovered: u64,
-    /// Those that stay because their path has not come in time.
+    /// Robots that stay because their path missed the deadline.
     pub late: u64,
 }
 
 impl Flown<'_> {
-    /// What a robot observes.
+    /// Returns which cells a robot observes.
     pub(super) fn coverage(&self, robot: usize) -> Coverage {
         match (self.ready >> robot & 1, self.full >> robot & 1) {
             (0, _) => Coverage::Empty,

@@ -1,22 +1,22 @@
-//! The hidden states of one world: simulated, a pure function of (model, seed, k), or recorded, of (sequences, seed, k).
+//! The hidden states of one world: a pure function of (model or recorded sequences, seed, k).
 //!
-//! A simulated world starts from the model's initial distribution, runs `burn_in` steps, and calls what it
-//! reached k = 0. Its absolute step `burn_in + k` indexes the random streams, so that a world with
-//! burn-in B at k equals the one without burn-in at B + k.
+//! A simulated world starts from the model's initial distribution and runs `burn_in` steps; the state it reaches is
+//! k = 0. Its absolute step `burn_in + k` indexes the random streams, so that a world with burn-in B at step k equals a
+//! world without burn-in at step B + k.
 
 use super::recorded::Recorded;
 use emberwatch_model::{Dynamics, Grid};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Where hidden states come from.
+/// The source of hidden states.
 #[derive(Debug, Clone)]
 pub enum Source {
     Simulated(Dynamics),
     Recorded(Arc<Recorded>),
 }
 
-/// The hidden states of one world at its present step.
+/// The hidden states of one world at its current step.
 #[derive(Debug, Clone)]
 pub struct World {
     source: Source,
@@ -27,7 +27,7 @@ pub struct World {
 }
 
 impl Source {
-    /// The last step of an episode, if it has one.
+    /// Returns the last step of a seed's episode, if the source limits it.
     pub(super) fn last_step(&self, seed: u64) -> Option<u64> {
         match self {
             Self::Simulated(_) => None,
@@ -37,7 +37,7 @@ impl Source {
 }
 
 impl World {
-    /// Starts a world; simulates `burn_in` steps, or fewer once it has `ended`.
+    /// Creates a world at k = 0. Simulates `burn_in` steps, and stops early when `ended` is set.
     pub fn new(mut source: Source, seed: u64, burn_in: u64, ended: &AtomicBool) -> Self {
         let states = match &mut source {
             Source::Recorded(recorded) => recorded.states(seed, 0),
@@ -52,7 +52,7 @@ impl World {
         Self::at(source, seed, burn_in, 0, states)
     }
 
-    /// A world at step k.
+    /// Creates a world at step k from its hidden states.
     pub fn at(source: Source, seed: u64, burn_in: u64, step: u64, states: Grid<u8>) -> Self {
         Self {
             source,
@@ -63,7 +63,7 @@ impl World {
         }
     }
 
-    /// Moves the world from k to k + 1 (paper eq. 4, each cell drawn from `Phi` of the states).
+    /// Moves the world from k to k + 1: draws each cell's next state from `Phi` of the current states (paper eq. 4).
     ///
     /// # Panics
     /// If a recorded sequence has ended.
@@ -76,7 +76,7 @@ impl World {
         }
     }
 
-    /// Hidden states, shape `[H, W]`.
+    /// Returns the hidden states, shape `[H, W]`.
     pub fn states(&self) -> &Grid<u8> {
         &self.states
     }
@@ -85,12 +85,12 @@ impl World {
         self.seed
     }
 
-    /// Step index k.
+    /// Returns the step index k.
     pub fn step(&self) -> u64 {
         self.step
     }
 
-    /// `burn_in + k`, which indexes random streams.
+    /// Returns `burn_in + k`, the index of the random streams.
     pub fn absolute_step(&self) -> u64 {
         self.burn_in + self.step
     }

@@ -1,66 +1,65 @@
-//! A world's last frames, kept so that the next agent can compute its belief from them.
+//! A world's latest frames, from which an agent that takes over can compute its belief.
 
 use super::outcome::{RobotOutcome, WorldOutcome};
 use super::robot::Robot;
 use emberwatch_model::{Cell, Coverage};
 use std::collections::VecDeque;
 
-/// Minimum capacity for a world's frames, bytes: whole frames share it, however many steps are to be kept.
-pub const LEAST_ROOM: usize = 1 << 20;
+/// Minimum capacity of a world's history, in bytes. It leaves space for frames with full coverage.
+pub const MIN_HISTORY_BYTES: usize = 1 << 20;
 
-/// The frames of consecutive steps, the last one the world's present; bounded in steps and in bytes.
+/// The frames of consecutive steps up to the current one, bounded in steps and in bytes.
 #[derive(Debug, Clone)]
 pub struct History {
     n_steps: usize,
-    /// Bytes that the frames may take.
-    room: usize,
+    /// Capacity for frames, in bytes.
+    max_bytes: usize,
     n_bytes: usize,
     steps: VecDeque<PastStep>,
 }
 
-/// The memory of the frames of `n_steps` steps of `n_robots` paths each, from which so many cells are seen.
+/// Returns the size in bytes of `n_steps` steps, if each of `n_robots` paths shows up to `most_seen` cells.
 pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> usize {
     let of_robot = size_of::<PastRobot>() + 5 * most_seen;
     let of_step = size_of::<PastStep>() + n_robots * of_robot;
     n_steps.saturating_mul(of_step)
 }
 
-/// What one step showed.
+/// The outcomes and frames of one step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PastStep {
-    /// What the step gave the world.
+    /// The world's outcome.
     pub outcome: WorldOutcome,
-    /// What its robots saw.
+    /// The outcome and frame of each robot, in order.
     pub robots: Vec<PastRobot>,
 }
 
-/// What one robot saw in a step.
+/// One robot's outcome and frame of a step, in sparse form.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PastRobot {
-    /// What the step gave the robot.
+    /// The robot's outcome.
     pub outcome: RobotOutcome,
-    /// The observed cells, row-major indices; empty where every cell was observed.
+    /// Row-major indices of the observed cells. Empty if all cells were observed.
     pub cells: Vec<u32>,
-    /// What was observed there.
+    /// The observations in these cells, or in all cells in row-major order.
     pub values: Vec<u8>,
 }
 
 impl History {
-    /// Room for the frames of `n_steps` steps of `n_robots` paths each, from which so many cells are seen; at least for
-    /// the present one.
+    /// Creates a history for `n_steps` steps, at least one, if each of `n_robots` paths shows up to `most_seen` cells.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
         Self {
             n_steps,
-            room: LEAST_ROOM.max(bytes_of_history(n_steps, n_robots, most_seen)),
+            max_bytes: MIN_HISTORY_BYTES.max(bytes_of_history(n_steps, n_robots, most_seen)),
             n_bytes: 0,
             steps: VecDeque::new(),
         }
     }
 
-    /// Keeps a step; forgets the oldest if there is no room.
+    /// Appends a step, and drops the oldest ones while the history exceeds its capacity.
     pub fn push(&mut self, outcome: &WorldOutcome, robots: &[Robot]) {
-        let mut past = self.make_room().unwrap_or_default();
+        let mut past = self.evict_if_full().unwrap_or_default();
         past.outcome = *outcome;
         past.robots.resize_with(robots.len(), PastRobot::blank);
         for (past, robot) in past.robots.iter_mut().zip(robots) {
@@ -69,18 +68,19 @@ impl History {
         self.keep(past);
     }
 
-    /// Keeps a step, and as many before it as there is room for.
+    /// Appends a step that is already in sparse form, and drops the oldest ones while the history exceeds its capacity.
     pub fn keep(&mut self, past: PastStep) {
         self.n_bytes += past.n_bytes();
         self.steps.push_back(past);
-        while self.steps.len() > 1 && (self.steps.len() > self.n_steps || self.n_bytes > self.room)
+        while self.steps.len() > 1
+            && (self.steps.len() > self.n_steps || self.n_bytes > self.max_bytes)
         {
             self.forget();
         }
     }
 
-    /// Removes the oldest step if another one would be too many.
-    fn make_room(&mut self) -> Option<PastStep> {
+    /// Removes and returns the oldest step if the history has its maximum number of steps, to reuse its buffers.
+    fn evict_if_full(&mut self) -> Option<PastStep> {
         (self.steps.len() >= self.n_steps).then(|| self.forget())?
     }
 
@@ -90,17 +90,17 @@ impl History {
         Some(past)
     }
 
-    /// Bytes of all frames.
+    /// Returns the size of all frames, in bytes.
     pub fn n_bytes(&self) -> usize {
         self.n_bytes
     }
 
-    /// The steps that are kept, the oldest first.
+    /// Returns the kept steps, the oldest first.
     pub fn all(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.steps.iter()
     }
 
-    /// What step k showed, if it is kept.
+    /// Returns the outcomes and frames of step k, if they are kept.
     pub fn step(&self, step: u64) -> Option<&PastStep> {
         let oldest = self.steps.front()?.outcome.step;
         self.steps
@@ -116,7 +116,7 @@ impl PastStep {
 }
 
 impl PastRobot {
-    /// Room for what a robot saw.
+    /// Creates an empty entry, whose buffers [`Self::set`] fills.
     fn blank() -> Self {
         Self {
             outcome: RobotOutcome::at(Cell { row: 0, col: 0 }),
@@ -143,8 +143,8 @@ impl PastRobot {
         self.values.extend(seen.map(|it| bytes[it.cell]));
     }
 
-    /// Writes what was observed over `frame`, one byte per cell; leaves the other cells as they are, and those that
-    /// another robot saw from a ring further in.
+    /// Writes the observations into `frame`, one byte per cell. Unobserved cells keep their value. Where `frame`
+    /// already holds an observation, the smaller value stays: the one from the inner sensor ring.
     pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn at_least_the_present_is_kept_and_no_more_than_there_is_room_for() {
+    fn at_least_the_current_step_is_kept_and_no_more_than_the_capacity() {
         let present = (History::new(0, 1, 6), 6);
         for (mut history, n_values) in [present, (History::new(256, 1, 64), 1 << 19)] {
             for _ in 0..5 {

@@ -1,56 +1,56 @@
-//! What a step gives a world and its robots.
+//! Outcomes of a step: results of a world and of its robots.
 
 use emberwatch_model::{Cell, Coverage};
 
-/// A world after a step or a reset, and what the step gave its robots together.
+/// A world's result of a step or a reset, including the sums over its robots.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct WorldOutcome {
     /// Step index k after the step; 0 after a reset.
     pub step: u64,
-    /// Seed of the episode.
+    /// The episode's seed.
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of rewards, in X_{k+1}, over the distinct cells that pay.
+    /// Sum of the rewards of the distinct rewarded cells, by their states in X_{k+1}.
     pub reward: f64,
-    /// Bit r is set if nobody held robot r: it stayed and saw nothing.
+    /// Bit r is set if no client held robot r: it stayed and observed nothing.
     pub hovered: u64,
-    /// Bit r is set if robot r was held, but its path had not come by the deadline: it stayed and saw nothing.
+    /// Bit r is set if robot r was held but its path missed the deadline: it stayed and observed nothing.
     pub late: u64,
-    /// Cells of the whole grid in the state that pays most.
+    /// Number of cells of the whole grid in the state with the highest reward.
     pub n_target_cells: u32,
-    /// Distinct cells that any robot visited.
+    /// Number of distinct cells that the robots visited.
     pub n_visited: u32,
-    /// Distinct paying cells in the state that pays most.
+    /// Number of distinct rewarded cells in the state with the highest reward.
     pub n_hits: u32,
-    /// Whether the episode ended by itself.
+    /// Whether the episode reached a terminal state.
     pub is_terminated: bool,
-    /// Whether it reached its last step.
+    /// Whether the episode reached its last step.
     pub is_truncated: bool,
 }
 
-/// What a step gave one robot; also its place after a reset.
+/// A robot's result of a step, or its position after a reset.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobotOutcome {
-    /// Its share of the world's reward: a cell that v robots visited pays each of them 1/v.
+    /// The robot's share of the world's reward: each of v robots that visited a cell gets 1/v of the cell's reward.
     pub reward: f64,
-    /// What the world's reward would lack without this robot.
+    /// Marginal reward: the decrease of the world's reward if this robot had not flown.
     pub marginal: f64,
-    /// Distinct cells that it visited.
+    /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
-    /// Its distinct paying cells in the state that pays most.
+    /// Number of the robot's distinct rewarded cells in the state with the highest reward.
     pub n_hits: u32,
-    /// Where its path began, or where it stays.
+    /// The first cell of its path, or the cell where it stayed.
     pub start: Cell,
-    /// Where it is.
+    /// The robot's current cell.
     pub cell: Cell,
     pub coverage: Coverage,
-    /// Moves that it flew; 0 after a reset, and where it stayed.
+    /// Number of moves flown; 0 after a reset and for a robot that stayed.
     pub n_moves: u32,
 }
 
 impl RobotOutcome {
-    /// Of a robot that stays in a cell.
+    /// Creates the outcome of a robot that stays in a cell.
     pub fn at(cell: Cell) -> Self {
         Self {
             reward: 0.0,

@@ -1,22 +1,22 @@
-//! Hidden states that were recorded: which sequence a world shows, how it is turned, and from which recorded step on.
+//! Recorded hidden states. A world's seed selects the sequence, its symmetry and its first recorded step.
 
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_model::{Grid, Shape};
 use ndarray::{Array3, ArrayView2, Axis};
 use rand::RngExt;
 
-/// What the worlds of a server show.
+/// The recorded sequences that the worlds of a server show.
 #[derive(Debug)]
 pub struct Recorded {
-    /// Each of shape `[K, H, W]`, row-major, K at least 2.
+    /// Each has shape `[K, H, W]`, row-major, with K at least 2.
     sequences: Vec<Array3<u8>>,
     shape: Shape,
     with_symmetries: bool,
-    /// Largest recorded step to begin with.
+    /// Maximum recorded step at which an episode begins.
     most_offset: u64,
 }
 
-/// What the world of a seed shows.
+/// A seed's selection from the recorded states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Choice {
     sequence: usize,
@@ -25,13 +25,13 @@ struct Choice {
 }
 
 impl Recorded {
-    /// Sequences of one shape; an episode begins at a recorded step of `0..=most_offset`.
+    /// Checks and stores the sequences. An episode begins at a recorded step in `0..=most_offset`.
     ///
     /// # Errors
-    /// If an episode could begin at the last recorded step; the error is the largest possible offset.
+    /// If an episode could begin at the last recorded step of a sequence. The error is the maximum valid offset.
     ///
     /// # Panics
-    /// If there is no sequence, or one has another shape or fewer than two recorded steps.
+    /// If there is no sequence, or a sequence has a different grid or fewer than two recorded steps.
     pub fn new(
         sequences: Vec<Array3<u8>>,
         shape: Shape,
@@ -55,17 +55,17 @@ impl Recorded {
             .ok_or(possible)
     }
 
-    /// Number of sequences.
+    /// Returns the number of sequences.
     pub fn n_sequences(&self) -> usize {
         self.sequences.len()
     }
 
-    /// Steps of the shortest possible episode.
+    /// Returns the number of steps of the shortest possible episode.
     pub fn n_steps(&self) -> u64 {
         self.shortest() - 1 - self.most_offset
     }
 
-    /// The last step of an episode.
+    /// Returns the last step of a seed's episode.
     pub(super) fn last_step(&self, seed: u64) -> u64 {
         let Choice {
             sequence, offset, ..
@@ -73,14 +73,14 @@ impl Recorded {
         self.sequences[sequence].len_of(Axis(0)) as u64 - 1 - offset
     }
 
-    /// The hidden states of a seed's world at a step of its episode, shape `[H, W]`.
+    /// Returns the hidden states at a step of a seed's episode, shape `[H, W]`.
     pub(super) fn states(&self, seed: u64, step: u64) -> Grid<u8> {
         let mut states = Grid::zeros(self.shape.dim());
         self.show(seed, step, &mut states);
         states
     }
 
-    /// [`Self::states`] in the place of others.
+    /// Writes [`Self::states`] into an existing grid.
     ///
     /// # Panics
     /// If the episode ends before the step.
@@ -114,7 +114,7 @@ impl Recorded {
     }
 }
 
-/// One of the symmetries of a square: from 4 on transposed, then bit 0 reverses the rows and bit 1 the columns.
+/// Applies a symmetry of the square: bit 2 transposes, then bit 0 reverses the rows and bit 1 the columns.
 fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> ArrayView2<'_, u8> {
     let mut turned = match symmetry & 4 {
         0 => states,
@@ -193,7 +193,7 @@ mod tests {
             let first = recorded.states(seed, 0)[[0, 0]];
             assert_eq!(u64::from(first), 50 * sequence as u64 + 10 * offset);
         }
-        // 4,000 independent draws of 1 in 4: 4.5 standard errors, 1 in 150,000 for each of 4.
+        // 4,000 independent draws of 4 values. Each check exceeds 4.5 standard errors in 1 of 150,000 runs.
         let bound = 4.5 * (4000.0_f64 * 0.25 * 0.75).sqrt();
         let is_likely = |count: &f64| (count - 1000.0).abs() < bound;
         assert!(counts.iter().all(is_likely), "{counts:?}");

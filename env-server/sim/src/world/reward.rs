@@ -1,15 +1,15 @@
-//! What a step pays: a cell that several robots visit pays once, or see where seeing pays.
+//! The rewards of a step. A cell that several robots visit counts once; under `Pays::Seen`, a cell that they see.
 
 use super::outcome::WorldOutcome;
 use super::robot::Robot;
 use super::rules::Rules;
 use emberwatch_model::Pays;
 
-/// Set in the count of a cell that the team was paid for.
+/// Flag in a cell's count: the team has received this cell's reward.
 const PAID: u8 = 0x80;
 
-/// Counts the paying cells of robots in `states`, X_{k+1}: for each its share and its marginal reward, for the
-/// world the team's. `counts` has a 0 for each cell, before and after.
+/// Computes the rewards of a step from `states`, X_{k+1}: each robot's share and marginal reward, and the team's total.
+/// `counts` must hold 0 for each cell, and holds 0 again on return.
 pub(super) fn pay(
     rules: &Rules,
     states: &[u8],
@@ -53,7 +53,7 @@ pub(super) fn pay(
     }
 }
 
-/// Distinct cells that any robot visited.
+/// Counts the distinct cells that the robots visited.
 fn n_distinct(robots: &[Robot], counts: &mut [u8]) -> u32 {
     let mut n_visited = 0;
     for &cell in robots.iter().flat_map(|robot| &robot.visited) {
@@ -86,7 +86,7 @@ mod tests {
             let states: Vec<u8> = (0..20).map(|cell| (draw(cell) % 3) as u8).collect();
             let fly = |r: usize| {
                 let mut robot = Robot::at(&rules.airspace, shape.cell(draw(100 + r) % 20));
-                let n_moves = draw(200 + r) % 8; // 0: it stays.
+                let n_moves = draw(200 + r) % 8; // 0: the robot stays.
                 let moves =
                     (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) as u64 >> 9));
                 let moves: Vec<Move> = moves.collect();
@@ -103,7 +103,7 @@ mod tests {
             pay(&rules, &states, &mut robots, &mut counts, &mut team);
             assert!(counts.iter().all(|&count| count == 0));
 
-            // The distinct cells of all robots but one, and their reward.
+            // The number of distinct cells of all robots but one, and their total reward.
             let of_cell = |cell: &usize| rules.reward[usize::from(states[*cell])];
             let without = |one: usize| {
                 let others = robots.iter().enumerate().filter(|(robot, _)| *robot != one);

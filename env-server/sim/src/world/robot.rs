@@ -1,32 +1,31 @@
-//! One robot of a world: where it is, what it flew and what it saw.
+//! One robot of a world: its position, its last path and its last frame.
 
 use super::outcome::RobotOutcome;
 use emberwatch_model::{Airspace, Cell, Coverage, Frame, Move};
 use emberwatch_model::{Pays, SeenCell};
 
-/// A robot after a step or a reset.
+/// The state of a robot after a step or a reset.
 #[derive(Debug, Clone)]
 pub struct Robot {
     pub(super) outcome: RobotOutcome,
     pub(super) frame: Frame,
     pub(super) path: Vec<Move>,
-    /// The distinct cells of the path, row-major indices in the order of the first visit.
+    /// Row-major indices of the distinct cells of the path, in the order of the first visit.
     pub(super) visited: Vec<usize>,
-    /// The cells in sight of these.
+    /// The cells that the sensor sees from the visited cells.
     pub(super) seen: Vec<SeenCell>,
-    /// Row-major indices of the distinct cells that pay, where these are not the visited ones.
+    /// Row-major indices of the distinct rewarded cells. `None` if these are the visited cells.
     pub(super) paying: Option<Vec<usize>>,
 }
 
-/// Work space of flights, of any content.
+/// Reusable buffers for flights, with arbitrary content between calls.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
     visited: Vec<u64>,
     rings: Vec<u8>,
 }
 
-/// The memory of a robot that flies `n_moves` moves and sees up to `most_seen` of `n_cells` cells, and of its path
-/// before that is flown.
+/// Returns the memory of a robot and its next path, in bytes. It sees up to `most_seen` of `n_cells` cells.
 pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize {
     let of_path = n_moves * (2 * size_of::<Move>() + size_of::<usize>());
     let of_sight = most_seen * (size_of::<SeenCell>() + size_of::<usize>());
@@ -34,7 +33,7 @@ pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize
 }
 
 impl Robot {
-    /// A robot after a reset.
+    /// Creates a robot as after a reset.
     pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {
         let mut robot = Self {
             outcome: RobotOutcome::at(cell),
@@ -48,7 +47,7 @@ impl Robot {
         robot
     }
 
-    /// Flies a path, or stays if it is empty; what the step pays is yet to be counted.
+    /// Flies a path, or stays if the path is empty. The caller then writes the frame and the rewards.
     pub(super) fn fly(
         &mut self,
         airspace: &Airspace,
@@ -73,27 +72,27 @@ impl Robot {
         };
     }
 
-    /// What the last step gave it.
+    /// Returns the robot's outcome of the last step or reset.
     pub fn outcome(&self) -> &RobotOutcome {
         &self.outcome
     }
 
-    /// Row-major indices of the distinct cells that pay.
+    /// Returns the row-major indices of the distinct rewarded cells.
     pub(super) fn paying(&self) -> &[usize] {
         self.paying.as_ref().unwrap_or(&self.visited)
     }
 
-    /// What it saw in the last step.
+    /// Returns the frame of the last step.
     pub fn frame(&self) -> &Frame {
         &self.frame
     }
 
-    /// What it flew in the last step; empty after a reset, and if it stayed.
+    /// Returns the path of the last step. Empty after a reset or if the robot stayed.
     pub fn path(&self) -> &[Move] {
         &self.path
     }
 
-    /// Where it is.
+    /// Returns the robot's current cell.
     pub fn cell(&self) -> Cell {
         self.outcome.cell
     }

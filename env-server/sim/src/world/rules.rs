@@ -1,4 +1,4 @@
-//! What all episodes of a server share: the model, the grid, and the settings that decide a world's future.
+//! The rules that all episodes of a server share: the model, the grid, and the settings that decide a world's future.
 
 use super::hidden::Source;
 use super::recorded::Recorded;
@@ -12,40 +12,40 @@ use rand::RngExt;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// What all episodes of a server share.
+/// The model, the grid and the settings that all episodes of a server share.
 #[derive(Debug, Clone)]
 pub struct Rules {
     pub shape: Shape,
     pub airspace: Airspace,
-    /// Cells where random starts may be; `None`: all.
+    /// Row-major indices of the possible random starts; `None`: all cells.
     starts: Option<Arc<Vec<usize>>>,
-    /// Reward for each distinct cell that pays, by state.
+    /// Reward of a distinct visited (or seen) cell, by the cell's state.
     pub reward: Vec<f64>,
-    /// The state that pays most.
+    /// The state with the highest reward.
     pub target_state: u8,
     /// Number of states S.
     pub n_states: usize,
     /// Number of observations O.
     pub n_observations: usize,
-    /// Steps simulated before k = 0.
+    /// Number of steps simulated before k = 0.
     pub burn_in: u64,
     /// Episode length; 0: never truncated.
     pub max_steps: u64,
     pub start: Start,
-    /// Steps whose frames are kept.
+    /// Number of steps whose frames are kept.
     pub history: usize,
-    /// Moves in a path.
+    /// Number of moves in a path.
     pub n_moves: usize,
-    /// Robots of a world.
+    /// Number of robots per world.
     pub n_robots: usize,
-    /// Set when nobody wants the worlds any more: burn-ins that still run end at once, and are not to be used.
+    /// Set when the worlds are no longer needed. Running burn-ins then stop at once, and their worlds must not be used.
     pub ended: Arc<AtomicBool>,
     pub(super) sensor: Sensor,
     pub(super) source: Source,
 }
 
 impl Rules {
-    /// The rules under a model, for one robot; `history` and `n_moves` are 0.
+    /// Creates the rules of a model for one robot, with `history` and `n_moves` set to 0.
     pub fn new(
         model: &Model,
         shape: Shape,
@@ -74,13 +74,13 @@ impl Rules {
         })
     }
 
-    /// The same, of worlds whose hidden states were recorded.
+    /// Replaces the simulation by recorded hidden states.
     pub fn with_recorded(mut self, recorded: Arc<Recorded>) -> Self {
         self.source = Source::Recorded(recorded);
         self
     }
 
-    /// Whether the episode of a seed is truncated at a step.
+    /// Returns whether the episode of a seed is truncated at a step.
     pub(super) fn truncates(&self, seed: u64, step: u64) -> bool {
         let last = self.source.last_step(seed);
         (self.max_steps > 0 && step >= self.max_steps) || last.is_some_and(|last| step >= last)
@@ -97,13 +97,13 @@ impl Rules {
         })
     }
 
-    /// The maximum number of cells that a robot sees in a step.
+    /// Returns the maximum number of cells that a robot sees in a step.
     pub(super) fn most_seen(&self) -> usize {
         most_seen(self.airspace.radius(), self.n_moves, self.shape.n_cells())
     }
 }
 
-/// The maximum number of cells that a robot sees from a path, with a sensor of this radius.
+/// Returns the maximum number of cells that a robot with a sensor of this radius sees from a path.
 pub fn most_seen(radius: usize, n_moves: usize, n_cells: usize) -> usize {
     match radius {
         0 => n_moves,

@@ -1,4 +1,4 @@
-//! A world out of a file, and the checks that an episode relies on.
+//! Worlds read from a file, and the checks that an episode relies on.
 
 use super::history::{PastRobot, PastStep};
 use super::outcome::{RobotOutcome, WorldOutcome};
@@ -7,33 +7,33 @@ use emberwatch_messages::capacity::MAX_ROBOTS;
 use std::fmt::Display;
 use thiserror::Error;
 
-/// Largest k and number of an episode: no sum can overflow.
+/// Maximum step index k and maximum episode number, small enough that no sum overflows.
 const MAX_COUNT: u64 = 1 << 62;
 
-/// One world: everything that decides its future, and what its robots saw last.
+/// A saved world: everything that decides its future, and the latest outcomes and frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedWorld {
-    /// What the last step gave: seed, episode, k.
+    /// The world's outcome of the last step, with seed, episode number and k.
     pub outcome: WorldOutcome,
     /// Hidden states, row-major.
     pub states: Vec<u8>,
-    /// Hidden states at k = 0.
+    /// Hidden states at k = 0, row-major.
     pub first_states: Vec<u8>,
     pub robots: Vec<SavedRobot>,
-    /// The last steps, the oldest first.
+    /// The kept steps, the oldest first.
     pub history: Vec<PastStep>,
 }
 
 /// One robot of a saved world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedRobot {
-    /// What the last step gave it, and where it is.
+    /// The robot's outcome of the last step, with its position.
     pub outcome: RobotOutcome,
     pub frame: Vec<u8>,
     pub path: Vec<u8>,
 }
 
-/// Why a saved world cannot continue: what was expected, and what is there.
+/// An error in a saved world: what was expected and what was found.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("{0}")]
 pub struct InvalidWorld(pub String);
@@ -46,7 +46,8 @@ impl SavedWorld {
             ("states", &self.states),
             ("first states", &self.first_states),
         ] {
-            expect(what, states.len() == n_cells, &n_cells, &states.len())?;
+            let expected = format!("{n_cells} cells");
+            expect(what, states.len() == n_cells, &expected, &states.len())?;
             let most = states.iter().copied().max().unwrap_or(0);
             let n_states = rules.n_states;
             let fine = usize::from(most) < n_states;
@@ -63,7 +64,7 @@ impl SavedWorld {
             expect(what, got <= MAX_COUNT, &expected, &got)?;
         }
         let reward = self.outcome.reward;
-        expect("reward", reward.is_finite(), &"a number", &reward)?;
+        expect("reward", reward.is_finite(), &"a finite number", &reward)?;
         let (stayed, n_robots) = (self.outcome.hovered | self.outcome.late, rules.n_robots);
         let fine = stayed <= u64::MAX >> (MAX_ROBOTS - n_robots);
         let expected = format!("bits below {n_robots}");
@@ -71,7 +72,7 @@ impl SavedWorld {
         let ends = [self.outcome.is_terminated, self.outcome.is_truncated].map(u16::from);
         let expected = [0, u16::from(rules.truncates(seed, step))];
         let (expected, got) = (format!("{expected:?}"), format!("{ends:?}"));
-        expect("ends", expected == got, &expected, &got)?;
+        expect("terminated, truncated", expected == got, &expected, &got)?;
         let got = self.robots.len();
         expect("robots", got == n_robots, &n_robots, &got)?;
         self.robots
@@ -80,7 +81,7 @@ impl SavedWorld {
         self.check_history(rules)
     }
 
-    /// Checks that the history ends with the last result and has no gap.
+    /// Checks that the history ends with the current step and has no gap.
     fn check_history(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let last = self.outcome.step;
         let n_kept = self.history.len() as u64;
@@ -124,7 +125,7 @@ impl SavedRobot {
         let fine = outcome.n_moves as usize == got;
         expect("moves of the path", fine, &got, &outcome.n_moves)?;
         for reward in [outcome.reward, outcome.marginal] {
-            expect("reward", reward.is_finite(), &"a number", &reward)?;
+            expect("reward", reward.is_finite(), &"a finite number", &reward)?;
         }
         Ok(())
     }

@@ -1,26 +1,26 @@
-//! Observation noise: what a sensor reads where it looks (paper eq. 1).
+//! Observation noise: draws a sensor's reading of each observed cell (paper eq. 1).
 //!
-//! The reading at (seed, step, cell, ring) is a pure function, so two agents that look at one cell at one
-//! step from one ring see the same. One ChaCha8 draw keys the step, SplitMix64 of that key gives each cell's
-//! number: constant work per cell looked at, nothing for the others.
+//! A reading is a pure function of (seed, step, cell, ring), so that two agents which observe the same cell in the same
+//! step and ring get the same reading. One ChaCha8 draw keys the step, and SplitMix64 of that key yields each cell's
+//! random number. The cost is constant per observed cell, and zero for other cells.
 
 use emberwatch_model::SeenCell;
 use emberwatch_model::randomness::{Purpose, split_mix, stream};
 use emberwatch_model::{Frame, Grid, Model};
 use rand_chacha::rand_core::Rng;
 
-/// `P(y | x)` as thresholds on a 32-bit number.
+/// The observation probabilities `P(y | x)` as thresholds on a 32-bit random number.
 #[derive(Debug, Clone)]
 pub struct Sensor {
-    /// `thresholds[(x * n_rings + ring) * n_named + y]`: upper end of `y`'s share, of 2^32.
+    /// `thresholds[(x * n_rings + ring) * n_named + y]` is the upper end of `y`'s share of the 2^32 numbers.
     thresholds: Vec<u64>,
     n_rings: usize,
-    /// Observations without regard to the ring.
+    /// Number of observations per ring.
     n_named: usize,
 }
 
 impl Sensor {
-    /// The sensor of a model.
+    /// Creates the sensor of a model.
     pub fn new(model: &Model) -> Self {
         let (n_rings, n_named) = (model.n_rings(), model.n_observations() / model.n_rings());
         let cumulative = |row: &[f64]| {
@@ -32,7 +32,7 @@ impl Sensor {
                     (sum * 2f64.powi(32)).round() as u64
                 })
                 .collect();
-            // Rounding must leave no number without an observation.
+            // Despite rounding, every number must map to an observation.
             let last = row.iter().rposition(|p| *p > 0.0).unwrap_or(row.len() - 1);
             thresholds[last..].fill(1 << 32);
             thresholds
@@ -47,12 +47,12 @@ impl Sensor {
         }
     }
 
-    /// The key of all readings in one step of a world.
+    /// Returns the key of all readings in one step of a world.
     pub fn key(seed: u64, absolute_step: u64) -> u64 {
         stream(seed, Purpose::Sensor, absolute_step).next_u64()
     }
 
-    /// Looks at cells and records the readings in the frame; `key` is the step's.
+    /// Draws the readings of `cells` and writes them to the frame. `key` is the step's [`Self::key`].
     pub fn observe(
         &self,
         key: u64,
@@ -65,7 +65,7 @@ impl Sensor {
             let number = split_mix(key, cell as u64) >> 32;
             let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
             let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
-            // All of them, in order or not: stopping at the first mispredicts at every latent cell.
+            // Counts over all thresholds: an early stop would mispredict a branch at every latent cell.
             let passed = of_state.iter().filter(|threshold| number >= **threshold);
             let reading = passed.count() + usize::from(ring) * self.n_named;
             frame.observe(cell, reading as u8);
@@ -73,7 +73,7 @@ impl Sensor {
     }
 }
 
-/// Cells that are seen from themselves.
+/// Returns cells of the path itself, which lie in ring 0.
 pub(super) fn path_cells(cells: impl Iterator<Item = usize>) -> impl Iterator<Item = SeenCell> {
     cells.map(|cell| SeenCell { cell, ring: 0 })
 }
@@ -84,7 +84,7 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn readings_follow_the_observation_matrix_wherever_else_is_looked() {
+    fn readings_follow_the_observation_matrix_whatever_other_cells_are_observed() {
         let sensor = Sensor::new(&Model::wildfire());
         let shape = Shape::new(100, 100).expect("shape");
         let matrix = [
@@ -112,7 +112,7 @@ mod tests {
             }
             let n = 20.0 * 10_000.0;
             for (count, &p) in counts.iter().zip(expected) {
-                // 200,000 independent draws: 4.5 standard errors, 1 in 150,000 for each of 9.
+                // 200,000 independent draws. Each of the 9 checks exceeds 4.5 standard errors in 1 of 150,000 runs.
                 let bound = 4.5 * (p * (1.0 - p) / n).sqrt();
                 assert!((count / n - p).abs() < bound, "state {state}: {counts:?}");
             }

@@ -1,4 +1,4 @@
-//! Where robots start, and how much of the free cells they can reach from there.
+//! The cells where robots start, and the number of free cells that they can reach from there.
 
 use emberwatch_model::Parts;
 use emberwatch_model::task::Start;
@@ -6,18 +6,18 @@ use emberwatch_model::{Airspace, Cell, Shape};
 use std::collections::BTreeSet;
 use std::fmt::{Display, Formatter};
 
-/// What no-fly cells leave to the robots of a world.
+/// The free cells that the robots of a world can reach in spite of no-fly cells.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reach {
     /// Number of free cells.
     pub n_free: usize,
-    /// Free cells outside the largest connected part, in which random starts are.
+    /// Number of free cells outside the largest connected part. Random starts lie only in that part.
     pub n_cut_off: usize,
-    /// The fixed starts outside it.
+    /// The fixed starts outside the largest connected part.
     pub closed_in: Vec<ClosedIn>,
 }
 
-/// A fixed start from which most free cells cannot be reached.
+/// A fixed start outside the largest connected part of the free cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClosedIn {
     cell: Cell,
@@ -26,10 +26,10 @@ pub struct ClosedIn {
 }
 
 impl Reach {
-    /// Checks that so many robots can start in an airspace and leave their start.
+    /// Checks that `n_robots` robots can start in an airspace and leave their start cells.
     ///
     /// # Errors
-    /// What was expected of the start, and what was got.
+    /// If a start is a no-fly cell or cannot be left. The error holds the texts after "expected" and "got".
     pub fn of(start: Start, airspace: &Airspace, n_robots: usize) -> Result<Self, [String; 2]> {
         if airspace.is_open() {
             let n_free = airspace.shape().n_cells();
@@ -40,7 +40,7 @@ impl Reach {
         }
         let parts = Parts::of(airspace);
         if parts.n_largest() < 2 {
-            let got = "a no-fly map that leaves none".into();
+            let got = "a no-fly map that leaves no two adjacent free cells".into();
             return Err(["a cell that robots can leave".into(), got]);
         }
         let n_free = parts.n_free();
@@ -71,7 +71,7 @@ impl Reach {
         })
     }
 
-    /// The share of the free cells that random starts cannot reach, in words; `None` if there are no such cells.
+    /// Describes the share of the free cells that random starts cannot reach. Returns `None` if they reach all.
     pub fn cut_off(&self) -> Option<String> {
         let Self {
             n_free, n_cut_off, ..
@@ -79,8 +79,8 @@ impl Reach {
         let percent = 100.0 * n_cut_off as f64 / n_free as f64;
         (n_cut_off > 0).then(|| {
             format!(
-                "no-fly cells close off {n_cut_off} of {n_free} free cells ({percent:.2} %) from the largest connected \
-                 part, in which random starts are"
+                "no-fly cells cut off {n_cut_off} of {n_free} free cells ({percent:.2} %) from the largest connected \
+                 part, in which random starts lie"
             )
         })
     }
@@ -95,18 +95,18 @@ impl Display for ClosedIn {
         } = self;
         write!(
             f,
-            "start: no-fly cells close in {cell}: robots that start there reach {n_reached} of {n_free} free cells; \
-             choose another start, or open the map `no_fly`"
+            "start: no-fly cells enclose {cell}: robots that start there reach {n_reached} of {n_free} free cells; \
+             choose another start, or free cells in the map `no_fly`"
         )
     }
 }
 
-/// The cells of random starts, by row-major index; `None` if that is all of the grid.
+/// Returns the row-major indices of the possible random starts, or `None` if these are all cells of the grid.
 pub(super) fn random_starts(airspace: &Airspace) -> Option<Vec<usize>> {
     (!airspace.is_open()).then(|| Parts::of(airspace).starts())
 }
 
-/// Where a robot starts, unless that is random.
+/// Returns the start cell of a robot, or `None` if starts are random.
 pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Cell> {
     match start {
         Start::Corner => Some(corner_or_side(shape, robot)),
@@ -116,7 +116,7 @@ pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Ce
     }
 }
 
-/// A place at the edge, another one for each of eight robots.
+/// Returns a corner or the middle of a side. The first eight robots get different ones.
 fn corner_or_side(shape: Shape, robot: usize) -> Cell {
     let (bottom, right) = (shape.height() - 1, shape.width() - 1);
     let places = [
@@ -141,7 +141,7 @@ mod tests {
     use emberwatch_model::{CellMap, Model};
     use rand::RngExt;
 
-    /// A model in which no robot may be where rows have `#`.
+    /// Returns a model whose no-fly cells are marked by `#`.
     fn model(rows: [&str; 3]) -> Model {
         let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
         let mut file = Model::wildfire().file().clone();

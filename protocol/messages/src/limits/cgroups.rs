@@ -1,38 +1,38 @@
-//! The limits of the cgroups that this process is in, versions 1 and 2: a container's, and those around it.
+//! The limits of the cgroups (versions 1 and 2) of this process: its container's, and those of the cgroups around it.
 
 use std::path::{Path, PathBuf};
 
-/// Values of at least this many bytes or processes mean "no limit": version 1 writes the largest multiple of a page.
+/// Values from this on mean "no limit": version 1 writes the largest multiple of a page.
 const UNLIMITED: u64 = 1 << 60;
 
-/// A controller of cgroups: the names of its files in versions 1 and 2.
+/// A controller of cgroups. Its files have one name in version 1 and another in version 2.
 pub(super) struct Controller {
     pub(super) name: &'static str,
-    /// What the cgroup may have.
+    /// The file with the limit of the cgroup.
     pub(super) limit: [&'static str; 2],
-    /// What it has.
+    /// The file with the current use.
     pub(super) used: [&'static str; 2],
-    /// Counts in `memory.stat` that the kernel can take back, such as cached files.
+    /// Counts in `memory.stat` that the kernel can reclaim, such as cached files.
     pub(super) reclaimable: [&'static [&'static str]; 2],
 }
 
 /// The limit of one cgroup.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CgroupLimit {
-    /// The file that has it.
+    /// The file with the limit.
     pub(super) file: PathBuf,
     pub(super) limit: u64,
     pub(super) free: u64,
 }
 
-/// A hierarchy that is mounted: its version less one, the cgroup at its top, and where that is.
+/// A mounted hierarchy: its version minus one, the cgroup at its top, and the folder where it is mounted.
 struct Mount {
     version: usize,
     top: PathBuf,
     folder: PathBuf,
 }
 
-/// The limits of a controller on this process, by the files below `root`.
+/// Returns the limits of a controller on this process, from the files below `root`.
 pub(super) fn limits(root: &Path, controller: &Controller) -> Vec<CgroupLimit> {
     let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap_or_default();
     let (own, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));
@@ -48,7 +48,7 @@ pub(super) fn limits(root: &Path, controller: &Controller) -> Vec<CgroupLimit> {
     limits.collect()
 }
 
-/// A line of `mountinfo`, such as `35 31 0:32 / /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory`.
+/// Parses a line of `mountinfo`, such as `35 31 0:32 / /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory`.
 fn mount(line: &str, controller: &Controller) -> Option<Mount> {
     let (place, kind) = line.split_once(" - ")?;
     let mut place = place.split(' ').skip(3);
@@ -68,7 +68,7 @@ fn mount(line: &str, controller: &Controller) -> Option<Mount> {
     })
 }
 
-/// The cgroup of this process, relative to the top of a mount, by the lines of `/proc/self/cgroup`, such as
+/// Returns the cgroup of this process, relative to the top of a mount, from the lines of `/proc/self/cgroup`. A line is
 /// `4:memory:/docker/id` or, in version 2, `0::/user.slice`.
 fn own_group(own: &str, mount: &Mount, controller: &Controller) -> Option<PathBuf> {
     let path = own.lines().find_map(|line| {
@@ -80,13 +80,13 @@ fn own_group(own: &str, mount: &Mount, controller: &Controller) -> Option<PathBu
         };
         is_of.then_some(path)
     })?;
-    // In a container, the mount may show a part of the hierarchy alone.
+    // In a container, the mount may show only a part of the hierarchy.
     let below = Path::new(path).strip_prefix(&mount.top).ok()?;
     let is_plain = !below.components().any(|it| it.as_os_str() == "..");
     is_plain.then(|| below.to_owned())
 }
 
-/// The limit of one cgroup, if it has one.
+/// Returns the limit of one cgroup, if it has one.
 fn limit(folder: &Path, version: usize, controller: &Controller) -> Option<CgroupLimit> {
     let number = |name: &str| {
         let text = std::fs::read_to_string(folder.join(name)).ok()?;
@@ -124,8 +124,8 @@ mod tests {
         reclaimable: [&["total_inactive_file"], &["inactive_file"]],
     };
 
-    /// Checks what is read where the system has these files, one a line, whose own lines end with `;`: the folder, the
-    /// limit and what is free, the innermost first.
+    /// Checks the limits found in a system with these files. Each line of `files` is one file, with `;` at the end of
+    /// its lines. An expected limit has the folder, the limit and the free amount, from the innermost cgroup outward.
     fn check(name: &str, files: &str, expected: &[&str]) {
         let root = std::env::temp_dir().join(format!("emberwatch-{name}-{}", std::process::id()));
         for line in files.trim().lines() {
@@ -157,7 +157,7 @@ mod tests {
         check("v2", &format!("{outer}max;"), &[expected]);
         let inner = "sys/fs/cgroup/outer/inner 600 100";
         check("v2-both", &format!("{outer}600;"), &[inner, expected]);
-        // In a namespace of its own, a process sees its group as the top, or its parent as "..".
+        // In a separate namespace, a process sees its group as the top, or its parent as "..".
         for own in ["0::/", "0::/../other"] {
             let top = format!(
                 "proc/self/cgroup = {own}

@@ -1,4 +1,4 @@
-//! Memory: how much this process may still take, and the refusal of more before anything is allocated.
+//! Checks the memory that this process can still allocate, and rejects larger requests before anything is allocated.
 
 use super::cgroups::{self, Controller};
 #[cfg(target_os = "linux")]
@@ -17,31 +17,31 @@ const CGROUP: Controller = Controller {
     ],
 };
 
-/// More memory than there is.
+/// The error for more memory than is available.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("memory: expected {} for {what}, got {got}", in_words(*.needed))]
 pub struct NoMemory {
     what: String,
     needed: u64,
-    /// What there is, by which limit, and what to do.
+    /// The available memory, the limit that applies, and what to do.
     got: String,
 }
 
-/// A limit on the memory of this process, bytes.
+/// A limit on the memory of this process in bytes.
 #[derive(Debug, PartialEq, Eq)]
 struct Limit {
     free: u64,
-    /// Its amount, its name, and how to raise it.
+    /// The amount of the limit, its name, and how to raise it.
     words: String,
 }
 
-/// Checks that this process may take so many bytes for `what`.
+/// Checks that this process can allocate `n_bytes` for `what`.
 ///
 /// # Errors
-/// If the machine, a cgroup or a `ulimit` has less.
+/// If the machine, a cgroup or a `ulimit` has less memory.
 pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     check_below(Path::new("/"), &what, n_bytes)?;
-    // What no file tells, such as the limits of an overcommitted system.
+    // Some limits are in no file, such as those on an overcommitted system.
     let mut probe = Vec::<u8>::new();
     let reserved = usize::try_from(n_bytes).map(|n_bytes| probe.try_reserve_exact(n_bytes));
     match reserved {
@@ -50,7 +50,7 @@ pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     }
 }
 
-/// The error of an allocation that has failed.
+/// Returns the error for an allocation that failed.
 pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
     let none = |_| NoMemory {
         what: what.to_string(),
@@ -60,7 +60,7 @@ pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
     check_below(Path::new("/"), &what, n_bytes).map_or_else(|error| error, none)
 }
 
-/// An empty vector with a capacity that comes from outside.
+/// Allocates an empty vector whose capacity comes from outside.
 ///
 /// # Errors
 /// If there is not enough memory.
@@ -73,7 +73,7 @@ pub fn with_capacity<T>(what: impl Display, capacity: usize) -> Result<Vec<T>, N
     }
 }
 
-/// [`check`] by the files below `root`.
+/// Checks like [`check`], with the limits in the files below `root`.
 fn check_below(root: &Path, what: &impl Display, needed: u64) -> Result<(), NoMemory> {
     let limits = limits(root).into_iter();
     let tightest = limits.min_by_key(|limit| limit.free);
@@ -87,12 +87,12 @@ fn check_below(root: &Path, what: &impl Display, needed: u64) -> Result<(), NoMe
     })
 }
 
-/// All limits that can be read.
+/// Returns all limits that can be read.
 fn limits(root: &Path) -> Vec<Limit> {
     let of_cgroup = |it: cgroups::CgroupLimit| Limit {
         free: it.free,
         words: format!(
-            "that are left of {}, the limit of a cgroup ({}); give the container more (docker: --memory; Kubernetes: \
+            "left of {}, the limit of a cgroup ({}); give the container more (docker: --memory; Kubernetes: \
              resources.limits.memory)",
             in_words(it.limit),
             it.file.display()
@@ -105,25 +105,25 @@ fn limits(root: &Path) -> Vec<Limit> {
         .collect()
 }
 
-/// What all processes share.
+/// Returns the limit of the machine, which all processes share.
 fn of_machine(root: &Path) -> Option<Limit> {
     let text = std::fs::read_to_string(root.join("proc/meminfo")).ok()?;
     Some(Limit {
         free: kib(&text, "MemAvailable:")?,
         words: format!(
-            "that are free of {}, the machine's memory",
+            "available of {}, the machine's memory",
             in_words(kib(&text, "MemTotal:")?)
         ),
     })
 }
 
-/// The limits that `ulimit` sets; unknown on other systems, as are those of cgroups and `/proc`.
+/// Returns no limits of `ulimit`: they are unknown on other systems, like those of cgroups and `/proc`.
 #[cfg(not(target_os = "linux"))]
 fn of_process(_root: &Path) -> Vec<Limit> {
     Vec::new()
 }
 
-/// The limits that `ulimit` sets.
+/// Returns the limits that `ulimit` sets.
 #[cfg(target_os = "linux")]
 fn of_process(root: &Path) -> Vec<Limit> {
     let text = std::fs::read_to_string(root.join("proc/self/status")).unwrap_or_default();
@@ -132,7 +132,7 @@ fn of_process(root: &Path) -> Vec<Limit> {
         Some(Limit {
             free: limit.saturating_sub(kib(&text, used)?),
             words: format!(
-                "that are left of {}, the limit {name}; raise it (`ulimit {flag}`)",
+                "left of {}, the limit {name}; raise it (`ulimit {flag}`)",
                 in_words(limit)
             ),
         })
@@ -144,14 +144,14 @@ fn of_process(root: &Path) -> Vec<Limit> {
     kinds.into_iter().filter_map(limit).collect()
 }
 
-/// Bytes of a line such as `MemTotal:  1024 kB`.
+/// Returns the number of bytes in a line such as `MemTotal:  1024 kB`.
 fn kib(text: &str, name: &str) -> Option<u64> {
     let line = text.lines().find_map(|line| line.strip_prefix(name))?;
     let number = line.trim().strip_suffix(" kB")?.parse::<u64>().ok()?;
     number.checked_mul(1 << 10)
 }
 
-/// A number of bytes, rounded up to the next KiB or MiB.
+/// Formats a number of bytes, rounded up to the next KiB or MiB.
 pub fn in_words(n_bytes: u64) -> String {
     match n_bytes >> 20 {
         0..10 => format!("{} KiB", n_bytes.div_ceil(1 << 10)),

@@ -1,4 +1,4 @@
-//! Threads that the system does not start, and the limit that is the reason.
+//! Errors for threads that the system does not start, with the limit that prevents them.
 
 use super::cgroups::{self, Controller};
 use super::memory;
@@ -14,28 +14,28 @@ const CGROUP: Controller = Controller {
     reclaimable: [&[]; 2],
 };
 
-/// Address space of a thread: its stack of 2 MiB, and what the C library keeps for it.
+/// Address space of a thread in bytes: its stack of 2 MiB, and the C library's data for it.
 const THREAD_BYTES: u64 = 4 << 20;
 
-/// Where the C library asks for a call that the container forbids, and does not fall back on another.
+/// The advice if the container forbids a call of the C library, which has no other call to fall back on.
 const REFUSED: &str = "the seccomp profile of the container forbids `clone3`; allow it, or let it fail with ENOSYS (Docker \
                        does since 20.10.10; --security-opt seccomp=PROFILE)";
 
-/// Threads that could not be started.
+/// The error for threads that could not be started.
 #[derive(Debug, thiserror::Error)]
 #[error("threads: expected to start {n_threads}, got: {problem}; {reason}")]
 pub struct NoThreads {
     n_threads: usize,
-    /// The system's words.
+    /// The system's error.
     problem: String,
     /// The limit, and what to do.
     reason: String,
 }
 
-/// Starts a thread of this name.
+/// Starts a thread with this name.
 ///
 /// # Errors
-/// If the system does not start it.
+/// If the system does not start the thread.
 pub fn spawn<T: Send + 'static>(
     name: &str,
     work: impl FnOnce() -> T + Send + 'static,
@@ -45,9 +45,9 @@ pub fn spawn<T: Send + 'static>(
 }
 
 impl NoThreads {
-    /// Looks for the limit on account of which `n_threads` threads could not be started.
+    /// Makes the error for `n_threads` threads that could not be started, and looks for the limit that prevents them.
     pub fn new(n_threads: usize, error: &(dyn Error + 'static)) -> Self {
-        // A thread pool's error repeats that of the system.
+        // A thread pool's error repeats the system's error.
         let error = error.source().unwrap_or(error);
         let kind = error.downcast_ref().map(std::io::Error::kind);
         Self {
@@ -73,7 +73,7 @@ fn reason(root: &Path, n_threads: u64) -> String {
     {
         let (limit, free, file) = (it.limit, it.free, it.file.display());
         return format!(
-            "a cgroup allows {limit} processes and threads, of which {free} are left ({file}); allow more (docker: \
+            "a cgroup allows {limit} processes and threads, and {free} more can start ({file}); allow more (docker: \
              --pids-limit; systemd: TasksMax)"
         );
     }
@@ -83,12 +83,13 @@ fn reason(root: &Path, n_threads: u64) -> String {
              --ulimit nproc), or end some"
         ),
         None => {
-            "the system has no more (kernel.threads-max, kernel.pid_max); end some processes".into()
+            "the system allows no more (kernel.threads-max, kernel.pid_max); end some processes"
+                .into()
         }
     }
 }
 
-/// The number of processes and threads that this user may have, where the system tells.
+/// Returns the number of processes and threads that this user may have, if the system limits it.
 #[cfg(target_os = "linux")]
 fn limit_of_user() -> Option<u64> {
     use rustix::process::{Resource, getrlimit, getuid};

@@ -1,4 +1,4 @@
-//! The bytes of a recording: file and record headers, what records hold, and the errors.
+//! The binary format of a recording: headers of files and records, contents of records, and errors.
 
 use crate::capacity::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::control::{MAX_CONTROL_BYTES, ServerInfo};
@@ -13,17 +13,17 @@ use thiserror::Error;
 /// The first bytes of every recording.
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
-/// Version of the format. The other byte order's is another number, so such a file is refused.
+/// Version of the format. A file in the other byte order has another number here, and is rejected.
 pub const VERSION: u32 = 2;
 
-/// Longest body before compression, bytes: the largest frames and the longest paths of the most robots.
+/// Maximum size of a body before compression in bytes: the largest frames and the longest paths of the largest team.
 pub const MAX_BODY_BYTES: usize =
     size_of::<FrameHeader>() + MAX_TEAM_CELLS + MAX_ROBOTS * (ROBOT_BYTES + MAX_MOVES);
 
-/// Longest body in the file, bytes: what deflate may add to one that it cannot compress.
+/// Maximum size of a stored body in bytes: deflate may enlarge a body that it cannot compress.
 pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
 
-/// The beginning of a file.
+/// The header of a file.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct FileHeader {
@@ -35,121 +35,122 @@ pub struct FileHeader {
     pub reserved: u32,
 }
 
-/// In front of each record's body.
+/// The header of a record, before its body.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct RecordHeader {
-    /// Time since the recording began, nanoseconds; never less than in the record before.
+    /// Time since the recording began in nanoseconds; never less than in the previous record.
     pub nanos: u64,
     /// A [`Kind`].
     pub kind: u32,
-    /// Bytes of the body as it is stored.
+    /// Size of the stored body in bytes.
     pub length: u32,
-    /// Samples of the channel that the recorder missed right before this one.
+    /// Number of the channel's samples that the recorder missed directly before this one.
     pub n_lost: u32,
-    /// CRC-32 of the 20 bytes before it and the stored body.
+    /// CRC-32 of the first 20 bytes of this header and the stored body.
     pub checksum: u32,
 }
 
-/// What a record is.
+/// The kind of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Kind {
-    /// A server that the samples behind it are from: its [`ServerInfo`] in JSON.
+    /// The server of the samples that follow: its [`ServerInfo`] in JSON.
     Server = 1,
     /// A sample of `frames`: header and payload.
     Frame = 2,
     /// A sample of `truth`: header and payload.
     Truth = 3,
-    /// The end: [`Totals`] in JSON.
+    /// The end of the recording: [`Totals`] in JSON.
     End = 4,
 }
 
-/// A record, checked.
+/// A checked record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
-    /// Time since the recording began, nanoseconds; never less than in the record before.
+    /// Time since the recording began in nanoseconds; never less than in the previous record.
     pub nanos: u64,
-    /// Samples of the channel that the recorder missed right before this one; 0 for a server.
+    /// Number of the channel's samples that the recorder missed directly before this one; 0 for a server.
     pub n_lost: u32,
-    /// What happened.
+    /// The content of the record.
     pub event: Event,
 }
 
-/// What a record holds.
+/// The content of a record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
-    /// The samples from here on are from this server.
+    /// The server of the samples that follow.
     Server(Box<ServerInfo>),
-    /// What the robots of a world saw, and the paths that they flew.
+    /// The frames of a world's robots, and the paths that they flew.
     Frame(Sample<FrameHeader>),
-    /// Hidden states; for evaluation and pictures, never for learners.
+    /// Hidden states, for evaluation and pictures, never for learners.
     Truth(Sample<TruthHeader>),
 }
 
-/// How much a recording holds, and how much of it was lost while recording.
+/// The contents of a recording, and its losses while recording.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Totals {
-    /// Servers.
+    /// Number of servers.
     pub n_servers: u64,
-    /// Frames.
+    /// Number of frames.
     pub n_frames: u64,
-    /// Hidden states.
+    /// Number of hidden states.
     pub n_truths: u64,
-    /// Frames that the recorder missed.
+    /// Number of frames that the recorder missed.
     pub n_lost_frames: u64,
-    /// Hidden states that the recorder missed.
+    /// Number of hidden states that the recorder missed.
     pub n_lost_truths: u64,
 }
 
-/// Why a recording could not be written, or not be read further.
+/// The reason why a recording cannot be written, or not be read further.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecordingError {
-    /// The system refused.
+    /// The system returned an error.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// Another kind of file, or a format of another release or byte order.
+    /// The file is not a recording, or its format has another version or byte order.
     #[error("{0}")]
     Foreign(String),
-    /// The file has no end record: its recorder was killed, or bytes are missing. Everything before is whole.
+    /// The file has no end record, because its recorder was killed or bytes are missing. The records before are
+    /// complete.
     #[error(
         "the recording was cut short: expected a whole record at byte {offset}, got {got} bytes; good before it: \
          {n_steps} steps"
     )]
     Cut {
-        /// Where the last whole record ends, bytes from the start of the file.
+        /// Offset in the file where the last complete record ends, in bytes.
         offset: u64,
-        /// Bytes behind it.
+        /// Number of bytes after it.
         got: u64,
-        /// World steps before it.
+        /// Number of world steps before it.
         n_steps: u64,
     },
-    /// Bytes that no recorder wrote. Everything before is whole.
+    /// The file contains bytes that no recorder wrote. The records before are complete.
     #[error(
         "the recording is damaged at byte {offset}: {problem}; good before it: {n_steps} steps"
     )]
     Damaged {
-        /// Where the record begins.
+        /// Offset in the file where the record begins, in bytes.
         offset: u64,
-        /// What was expected, and what is there.
+        /// What was expected and what was found.
         problem: String,
-        /// World steps before it.
+        /// Number of world steps before it.
         n_steps: u64,
     },
-    /// A record that does not belong here, so that it was not written.
+    /// A record is invalid at this point, so it was not written.
     #[error("not recorded: {0}")]
     Refused(String),
 }
 
 impl RecordingError {
-    /// Whether everything before is whole, so that it can be used.
+    /// Returns whether the records before the error are complete and can be used.
     pub fn leaves_good_records(&self) -> bool {
         matches!(self, Self::Cut { .. } | Self::Damaged { .. })
     }
 }
 
-/// The checksum of a record.
+/// Returns the checksum of a record.
 pub(super) fn checksum(header: &RecordHeader, stored: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     let bytes = bytemuck::bytes_of(header);

@@ -1,4 +1,4 @@
-//! How far a recording has come, and which record may follow.
+//! The state of a recording while it is written or read, and the checks of the next record.
 
 use super::format::{Event, Record, Totals};
 use crate::capacity::{MAX_ROBOTS, MAX_TEAM_CELLS};
@@ -10,20 +10,20 @@ use emberwatch_model::path::MAX_MOVES;
 use std::collections::HashMap;
 use std::fmt::Display;
 
-/// What the records so far hold. Writer and reader both keep it, so that neither accepts a record that the other
-/// would refuse.
+/// The contents of the records so far. Writer and reader both keep it, so that neither accepts a record that the other
+/// would reject.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     pub(super) nanos: u64,
     server: Option<Limits>,
     pub(super) totals: Totals,
-    /// Episode and step of each world's last frame: a frame may be published again.
+    /// Episode and step of each world's last frame. A frame may be published more than once.
     last: HashMap<u32, (u64, u64)>,
-    /// World steps.
+    /// Number of world steps.
     pub(super) n_steps: u64,
 }
 
-/// What the samples of a server must fit.
+/// The sizes that a server's samples must fit.
 #[derive(Debug, Clone)]
 struct Limits {
     n_worlds: u32,
@@ -34,10 +34,10 @@ struct Limits {
 }
 
 impl Progress {
-    /// Counts a record.
+    /// Checks and counts a record.
     ///
     /// # Errors
-    /// If it cannot follow the records before it; the error says what was expected.
+    /// If the record is invalid after the records before it. The error has the expected value.
     pub(super) fn accept(&mut self, record: &Record) -> Result<(), String> {
         if record.nanos < self.nanos {
             let (expected, got) = (self.nanos, record.nanos);
@@ -86,7 +86,7 @@ impl Limits {
         let n_robots = info.n_robots as usize;
         if !(1..=MAX_ROBOTS).contains(&n_robots) || n_robots * shape.n_cells() > MAX_TEAM_CELLS {
             return Err(format!(
-                "robots: expected 1 to {MAX_ROBOTS}, and at most {MAX_TEAM_CELLS} cells of all their frames, \
+                "robots: expected 1 to {MAX_ROBOTS}, with at most {MAX_TEAM_CELLS} cells in all their frames, \
                  got {n_robots}"
             ));
         }
@@ -114,14 +114,14 @@ impl Limits {
         )?;
         if world >= self.n_worlds {
             return Err(format!(
-                "world: expected one below {}, got {world}",
+                "world: expected a number below {}, got {world}",
                 self.n_worlds
             ));
         }
         Ok(())
     }
 
-    /// Checks that robots are those of a world, and that each flew a whole path or none.
+    /// Checks that the robots belong to the world, and that each flew a complete path or none.
     fn check_robots(
         &self,
         world: u32,

@@ -1,4 +1,4 @@
-//! Reads a recording, record by record; every byte is checked before it is used.
+//! Reads a recording record by record, and checks every byte before using it.
 
 use super::format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, MAX_STORED_BYTES, Record, RecordHeader,
@@ -11,10 +11,10 @@ use flate2::bufread::DeflateDecoder;
 use serde::de::DeserializeOwned;
 use std::io::Read;
 
-/// Reads a recording: an iterator of records that ends after the first error.
+/// A reader of a recording: an iterator of records that ends after the first error.
 ///
-/// A file without an end gives [`RecordingError::Cut`] after its last whole record, a damaged one
-/// [`RecordingError::Damaged`] before the first that is not.
+/// A file without an end yields [`RecordingError::Cut`] after its last complete record. A damaged file yields
+/// [`RecordingError::Damaged`] at the first damaged record.
 #[derive(Debug)]
 pub struct Reader<R> {
     input: R,
@@ -25,10 +25,10 @@ pub struct Reader<R> {
 }
 
 impl<R: Read> Reader<R> {
-    /// Begins to read; give it a buffered reader at the beginning of the file.
+    /// Begins to read. `input` should be buffered, and at the beginning of the file.
     ///
     /// # Errors
-    /// If it is another kind of file, of another version, or shorter than a header.
+    /// If the file is not a recording, has another version, or is shorter than a header.
     pub fn new(mut input: R) -> Result<Self, RecordingError> {
         let mut header = FileHeader::zeroed();
         let n_read = fill(&mut input, &mut header)?;
@@ -66,12 +66,12 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    /// What has been read so far.
+    /// Returns the contents that were read so far.
     pub fn totals(&self) -> Totals {
         self.progress.totals
     }
 
-    /// The next record; `None` at the end.
+    /// Reads the next record, or `None` at the end.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
         let (offset, n_steps) = (self.offset, self.progress.n_steps);
         let mut header = RecordHeader::zeroed();
@@ -94,7 +94,7 @@ impl<R: Read> Reader<R> {
             let problem = format!("body: expected at most {MAX_STORED_BYTES} bytes, got {length}");
             return Err(damaged(problem));
         }
-        // Grows as bytes arrive, so a false length costs nothing.
+        // The buffer grows as bytes arrive, so a false length does not allocate memory.
         self.stored.clear();
         let mut body = (&mut self.input).take(length as u64);
         body.read_to_end(&mut self.stored)?;
@@ -129,7 +129,7 @@ impl<R: Read> Reader<R> {
         }
         match fill(&mut self.input, &mut [0u8; 1]) {
             Ok(0) => Ok(()),
-            Ok(_) => Err("expected nothing behind the end, got more bytes".into()),
+            Ok(_) => Err("expected nothing after the end, got more bytes".into()),
             Err(error) => Err(error.to_string()),
         }
     }
@@ -148,7 +148,7 @@ impl<R: Read> Iterator for Reader<R> {
     }
 }
 
-/// Reads a value's bytes; returns how many there were.
+/// Reads a value's bytes, and returns the number of bytes read.
 fn fill<T: Pod>(input: &mut impl Read, value: &mut T) -> Result<usize, std::io::Error> {
     let bytes = bytemuck::bytes_of_mut(value);
     let mut n_read = 0;
@@ -178,7 +178,7 @@ fn inflated(stored: &[u8]) -> Result<Vec<u8>, String> {
     match decoder.into_inner().len() {
         0 => Ok(body),
         got => Err(format!(
-            "body: expected one deflate stream, got {got} bytes behind it"
+            "body: expected one deflate stream, got {got} bytes after it"
         )),
     }
 }

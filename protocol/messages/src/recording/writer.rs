@@ -1,4 +1,4 @@
-//! Writes a recording, record by record.
+//! Writes a recording record by record.
 
 use super::format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, Record, RecordHeader, RecordingError, Totals,
@@ -8,11 +8,11 @@ use super::progress::Progress;
 use flate2::{Compress, Compression, FlushCompress, Status};
 use std::io::Write;
 
-/// A frame of 64 x 64 cells and 64 moves takes 153 bytes and 15 us, hidden states 651 bytes and 48 us; level
-/// 1 takes 207 and 1,025 bytes for the same time, level 6 146 and 560 bytes for five times as long.
+/// The compression level. A frame of 64 x 64 cells and 64 moves takes 153 bytes and 15 us, hidden states 651 bytes and
+/// 48 us. Level 1 takes 207 and 1,025 bytes in the same time, level 6 146 and 560 bytes in five times as long.
 const LEVEL: u32 = 2;
 
-/// Writes a recording. What is dropped without [`Self::finish`] has no end, and readers say so.
+/// A writer of a recording. A recording without [`Self::finish`] has no end, which readers report as an error.
 #[derive(Debug)]
 pub struct Writer<W> {
     output: W,
@@ -27,7 +27,7 @@ impl<W: Write> Writer<W> {
     /// Begins a recording.
     ///
     /// # Errors
-    /// If the system refuses.
+    /// If the system returns an error.
     pub fn new(mut output: W) -> Result<Self, RecordingError> {
         let header = FileHeader {
             magic: MAGIC,
@@ -48,8 +48,8 @@ impl<W: Write> Writer<W> {
     /// Writes a record.
     ///
     /// # Errors
-    /// If a sample does not fit the last server, or is earlier than the record before: nothing is written then. If the
-    /// system refuses.
+    /// If a sample does not fit the last server, or is earlier than the previous record; then nothing is written. Or if
+    /// the system returns an error.
     pub fn write(&mut self, record: &Record) -> Result<(), RecordingError> {
         self.progress
             .accept(record)
@@ -74,23 +74,23 @@ impl<W: Write> Writer<W> {
         self.append(kind, record.nanos, record.n_lost)
     }
 
-    /// Passes everything written so far to the system.
+    /// Flushes everything written so far to the system.
     ///
     /// # Errors
-    /// If the system refuses.
+    /// If the system returns an error.
     pub fn flush(&mut self) -> Result<(), RecordingError> {
         Ok(self.output.flush()?)
     }
 
-    /// Bytes written so far.
+    /// Returns the number of bytes written so far.
     pub fn n_bytes(&self) -> u64 {
         self.n_bytes
     }
 
-    /// Writes the end; returns what the recording holds.
+    /// Writes the end, and returns the contents of the recording.
     ///
     /// # Errors
-    /// If the system refuses.
+    /// If the system returns an error.
     pub fn finish(&mut self) -> Result<Totals, RecordingError> {
         let totals = self.progress.totals;
         self.body.clear();
@@ -115,7 +115,7 @@ impl<W: Write> Writer<W> {
             self.compressor
                 .compress_vec(&self.body, &mut self.stored, FlushCompress::Finish);
         if !matches!(status, Ok(Status::StreamEnd)) {
-            let problem = format!("compressing gave {status:?}");
+            let problem = format!("compression: expected the end of the stream, got {status:?}");
             return Err(RecordingError::Io(std::io::Error::other(problem)));
         }
         let mut header = RecordHeader {

@@ -1,17 +1,20 @@
-//! One random byte decides most cells.
+//! Decides most cells with one random byte each.
 //!
-//! Why it is fast: whole rows of cells take a few comparisons and blends of bytes, 64 at a time.
+//! Why it is fast: a row of cells takes a few comparisons and blends of bytes, 64 cells at a time.
 //!
-//! Why it is the same: let `f(n)` be the state that neighbour state `n` mostly leads to (itself, in the wildfire).
-//! Whatever the neighbours, [`super::parents`] draws "tap `t`, and outcome `f(n_t)`" with at least the probability
-//! `p[t] = min_n w[f(n), n, t] / C`. Of the 256 values of a byte, `floor(256 * p[t])` stand for it. The other values,
-//! the *escapes*, are left to the residual distribution, from which `parents` draws first. In the wildfire 24 of 256
-//! escape. `tests/model/dynamics.rs` compares draws with `Phi` for any models and grids.
+//! Why the distribution is the same: let `f(n)` be the most likely vote of a neighbour in state `n` (`n` itself, in the
+//! wildfire). Whatever the neighbours' states, [`super::parents`] draws "tap `t`, and outcome `f(n_t)`" with at least
+//! the probability `p[t] = min_n w[f(n), n, t] / C`. So `floor(256 * p[t])` of the 256 values of a byte stand for this
+//! draw. The other values, the *escapes*, leave the cell to `parents`, which first draws from the residual
+//! distribution. In the wildfire 24 of 256 values escape. `tests/model/dynamics.rs` compares draws with `Phi` for
+//! random models and grids.
 //!
-//! Where kernels see the cell's own state, each own state has byte values of its own: the centre tap has one state
-//! alone, so that `f` there is the likeliest outcome, and a cell that stays as it is for certain takes its byte alone.
+//! If kernels depend on the cell's own state, byte values stand for different draws in each own state. The neighbour at
+//! the centre tap is the cell itself, with only one possible state, so `f` there is the most likely vote of that state.
+//! A cell that certainly keeps its state is always decided by its byte.
 //!
-//! Where zones differ, lanes have bounds of their own: a table for each pattern of zones that [`LANES`] cells have.
+//! If the model has several zones, the bounds of byte values differ between lanes. There is one table for each pattern
+//! of zones that occurs in [`LANES`] cells.
 
 use super::super::grid::Shape;
 use super::lanes::{
@@ -23,31 +26,32 @@ use super::places::{Places, centre};
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// What byte values stand for.
+/// The meaning of byte values: a tap, or an escape.
 #[derive(Debug)]
 pub(super) struct Bytes {
     fast: Fast,
-    /// Which table of `fast` each chunk of homes takes, where zones differ; else the first.
+    /// The index in `fast` of each chunk's table, if the model has several zones. Otherwise all chunks use the first
+    /// table.
     of_chunk: Option<Vec<u32>>,
-    /// A bit for each home: whether it is a cell's.
+    /// One bit per home: whether it belongs to a cell of the grid.
     on_grid: Vec<u64>,
 }
 
 #[derive(Debug)]
 enum Fast {
-    /// In every cell.
+    /// The same for all cells, one table per pattern of zones.
     Alike {
         tables: Vec<Vec<FastTap>>,
-        /// `f` as a table over bytes, unless it maps every state to itself.
+        /// `f` as a table over bytes, or `None` if it maps every state to itself.
         likeliest: Option<Box<[u8; 256]>>,
     },
-    /// By the cell's own state, with the offset under which it lies.
+    /// For each pattern of zones, one table per own state; and the offset of the cell from its home.
     Own(Vec<Vec<FastOwn>>, usize),
 }
 
 impl Bytes {
-    /// Tables of one mixture for all cells, or of one for each own state; as many for each zone, where `zones` has that
-    /// of each home. Without any mixture, every byte escapes.
+    /// Makes the tables for each zone's mixtures: one for all cells, or one per own state. `zones` has the zone of each
+    /// home. Without any mixture, every byte escapes.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
@@ -90,7 +94,7 @@ impl Bytes {
         }
     }
 
-    /// Writes next states of a band's cells, and marks of those that escape.
+    /// Writes the next state of each cell in a band, or a mark if its byte escapes.
     #[inline(always)]
     pub(super) fn decide(&self, places: &mut Places, band: Range<usize>, key: u64) {
         let bytes = &mut places.next[band.clone()];
@@ -129,8 +133,8 @@ impl Bytes {
         }
     }
 
-    /// Lists the homes of a band that hold a mark and returns how many there are.
-    #[inline(never)] // Within its caller LLVM runs out of registers: 10 % more a step.
+    /// Lists the homes of the marked cells in a band and returns their number.
+    #[inline(never)] // Inlined, LLVM runs out of registers, and a step takes 10 % longer.
     pub(super) fn list_undecided(
         &self,
         places: &Places,
@@ -144,7 +148,7 @@ impl Bytes {
             let bits = high_bits(lanes) & on_grid;
             let to = undecided[n_undecided..]
                 .first_chunk_mut()
-                .expect("invariant: LANES more than a band has");
+                .expect("invariant: the list is LANES longer than a band");
             list_lanes(bits, home as u32, to);
             n_undecided += bits.count_ones() as usize;
         }
@@ -152,7 +156,7 @@ impl Bytes {
     }
 }
 
-/// The patterns of zones that chunks of homes have, and which of them each has.
+/// Returns the distinct patterns of zones in chunks of homes, and the index of each chunk's pattern.
 fn patterns(zones: &[u8]) -> (Vec<[u8; LANES]>, Option<Vec<u32>>) {
     let mut numbers = HashMap::new();
     let mut patterns = Vec::new();
@@ -166,7 +170,8 @@ fn patterns(zones: &[u8]) -> (Vec<[u8; LANES]>, Option<Vec<u32>>) {
     (patterns, Some(of_chunk))
 }
 
-/// What the bytes stand for in cells whose own state does not matter, by the mixture of each lane.
+/// Returns the taps that bytes stand for in cells whose own state does not matter. `mixtures` has the mixture of each
+/// lane.
 fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -> Vec<FastTap> {
     let taps = offsets.iter().enumerate();
     let taps = taps.map(|(tap, offset)| (mixtures.map(|it| it.counts()[tap]), *offset));
@@ -177,7 +182,7 @@ fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -
     }
 }
 
-/// What the bytes stand for in cells of one own state, by the mixture of each lane.
+/// Returns the meaning of bytes in cells of one own state. `mixtures` has the mixture of each lane.
 fn fast_own(
     own: usize,
     mixtures: &[&Mixture; LANES],
@@ -208,7 +213,7 @@ fn fast_own(
     }
 }
 
-/// Which homes are a cell's, a bit each.
+/// Returns one bit per home: whether it belongs to a cell of the grid.
 fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
     let mut bits = vec![0; (shape.height() * stride).div_ceil(LANES)];
     for row in 0..shape.height() {
@@ -219,7 +224,7 @@ fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
     bits
 }
 
-/// `f` over all bytes, marks unchanged.
+/// Returns `f` over all bytes, with marks unchanged, or `None` if it maps every state to itself.
 fn table_unless_identity(likeliest: &[usize]) -> Option<Box<[u8; 256]>> {
     let mut table: [u8; 256] = std::array::from_fn(|byte| byte as u8);
     let identity = table;

@@ -3,18 +3,19 @@
 use super::super::parameters::Model;
 use ndarray::Array4;
 
-/// The weights of eq. 2: of all cells, or of those in one state themselves.
+/// The weights of eq. 2, for all cells or for cells in one own state.
 #[derive(Debug, Clone)]
 pub(super) struct Kernel {
     pub(super) n_states: usize,
     pub(super) n_taps: usize,
-    /// `w[m, n, t]` as `[tap][from][to]`. The bias counts as weight of the centre tap, whose neighbour is the cell
-    /// itself and always there. Where the cell's own state is known, the centre has its weights in place of all others.
+    /// `w[m, n, t]` as `[tap][from][to]`. The centre tap includes the bias, because its neighbour is the cell itself,
+    /// which always exists. In the kernel of one own state, the centre tap has the weights of that state for every
+    /// `from`.
     pub(super) weights: Vec<f64>,
 }
 
 impl Kernel {
-    /// One for all cells, or one for each state that a cell itself can be in; as many for each zone.
+    /// Returns the kernels of a model, zone by zone: one per zone, or one per own state of the cell.
     pub(super) fn of_model(model: &Model) -> Vec<Self> {
         let bias = model.bias().to_vec();
         let own = |index| (model.sees_own_state()).then_some(index % model.n_states());
@@ -27,7 +28,7 @@ impl Kernel {
     fn new(kernel: &Array4<f64>, bias: &[f64], own: Option<usize>) -> Self {
         let (n_states, _, kernel_height, kernel_width) = kernel.dim();
         let n_taps = kernel_height * kernel_width;
-        // Eq. 3 cancels a common factor; taken out, no sum of weights overflows.
+        // Eq. 3 cancels a common factor. Dividing by the largest weight keeps sums of weights from overflowing.
         let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
         let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
         for tap in 0..n_taps {
@@ -48,18 +49,18 @@ impl Kernel {
         }
     }
 
-    /// The weight of each next state, given a tap and the state of the neighbour under it.
+    /// Returns the weight of each next state, given a tap and the state of the neighbour there.
     pub(super) fn weights(&self, tap: usize, from: usize) -> &[f64] {
         &self.weights[(tap * self.n_states + from) * self.n_states..][..self.n_states]
     }
 }
 
-/// A number in `[0, 1)` from the high 53 bits.
+/// Returns a number in `[0, 1)` from the high 53 bits.
 pub(super) fn uniform(random: u64) -> f64 {
     (random >> 11) as f64 * 2f64.powi(-53)
 }
 
-/// The state at `uniform` of the cumulated weights, which need not sum to one.
+/// Returns the state at the fraction `uniform` of the cumulative weights, which need not sum to one.
 pub(super) fn invert(weights: &[f64], uniform: f64) -> u8 {
     let target = uniform * weights.iter().sum::<f64>();
     let mut sum = 0.0;
@@ -67,7 +68,7 @@ pub(super) fn invert(weights: &[f64], uniform: f64) -> u8 {
         sum += weight;
         target < sum
     });
-    // Rounding can leave the target at the very end: that is the last state with a weight.
+    // Rounding can leave the target beyond the last sum. Then the last state with a weight is drawn.
     let last = || weights.iter().rposition(|&weight| weight > 0.0);
     let state = reached
         .or_else(last)

@@ -1,39 +1,40 @@
-//! The vectorised part of [`super::bytes`]: work on [`LANES`] cells at once.
+//! The vectorised loops of [`super::bytes`], over [`LANES`] cells at once.
 //!
 //! Plain loops over arrays, inlined so that LLVM compiles them for their caller's vectors.
 
 use super::super::randomness::split_mix;
 
-/// Cells decided at once by the first byte, and searched at once for undecided ones.
+/// Number of cells that are decided by bytes at once, and searched for undecided cells at once.
 pub(super) const LANES: usize = 64;
 
-/// Mark of a cell that its byte left to the residual distribution. Even, and its high bit is set, as in no state.
+/// Mark of a cell that its byte left to the residual distribution. Its high bit distinguishes it from all states, and
+/// its even value from the mark of a rejected cell.
 const ESCAPED: u8 = 254;
 
 /// The byte values that stand for one tap.
 #[derive(Debug)]
 pub(super) struct FastTap {
     offset: usize,
-    /// In every lane the last of them (the first follows on the tap before); where lanes differ, the first beyond them,
-    /// so that there may be none.
+    /// In each lane, the last byte value of this tap; the first one follows the previous tap's. If lanes differ, the
+    /// first value beyond instead, so that a lane can have none.
     bound: [u8; LANES],
 }
 
-/// What bytes stand for in cells of one own state: first the centre, then the other taps.
+/// The meaning of byte values in cells of one own state: first the centre tap, then the other taps.
 #[derive(Debug)]
 pub(super) struct FastOwn {
     pub(super) own: u8,
-    /// The state that the cell itself leads to.
+    /// The most likely vote of the cell itself.
     pub(super) likeliest: u8,
-    /// The bound of the byte values that stand for it, as in [`FastTap`]; `None` if none does in any lane.
+    /// The bound of the centre tap's byte values, as in [`FastTap`]. `None` if no lane has any.
     pub(super) bound: Option<[u8; LANES]>,
     pub(super) neighbours: Vec<FastTap>,
-    /// Where a neighbour's state mostly leads to another: that state, and the other.
+    /// The pairs `(n, f(n))` of neighbour states whose most likely vote is another state.
     pub(super) changes: Vec<(u8, u8)>,
 }
 
-/// The taps that bytes from `first` on stand for, each with its offset and how many do in each lane; `DIFFER`: whether
-/// lanes do.
+/// Returns the taps that byte values from `first` on stand for. For each tap, `taps` has the number of values in each
+/// lane and the offset. `DIFFER` is whether lanes differ.
 pub(super) fn fast_taps<const DIFFER: bool>(
     first: [usize; LANES],
     taps: impl Iterator<Item = ([usize; LANES], usize)>,
@@ -50,19 +51,19 @@ pub(super) fn fast_taps<const DIFFER: bool>(
     fast
 }
 
-/// The bounds of byte values below `end`.
+/// Returns the bounds of the byte values below `end`.
 pub(super) fn bounds<const DIFFER: bool>(end: [usize; LANES]) -> [u8; LANES] {
     let bound = |end: usize| if DIFFER { end } else { end - 1 };
     end.map(|end| u8::try_from(bound(end)).expect("invariant: fast probabilities sum to <= 1"))
 }
 
-/// Whether a byte is within a bound.
+/// Returns whether a byte is within a bound.
 #[inline(always)]
 fn is_within<const DIFFER: bool>(byte: u8, bound: u8) -> bool {
     if DIFFER { byte < bound } else { byte <= bound }
 }
 
-/// Words `first..` of the SplitMix64 generator of a key; `bytes` are whole words.
+/// Fills `bytes`, which are whole words, with the words `first..` of the SplitMix64 generator of a key.
 #[inline(always)]
 pub(super) fn fill(bytes: &mut [u8], key: u64, first: usize) {
     let (words, _) = bytes.as_chunks_mut();
@@ -71,7 +72,7 @@ pub(super) fn fill(bytes: &mut [u8], key: u64, first: usize) {
     }
 }
 
-/// The words of a key's SplitMix64 generator, one after the other.
+/// The words of a key's SplitMix64 generator, in sequence.
 #[derive(Debug)]
 pub(super) struct Words {
     key: u64,
@@ -95,17 +96,17 @@ impl Words {
     }
 }
 
-/// Replaces each byte by the parent under the tap that it stands for, or by [`ESCAPED`].
+/// Replaces each byte by the state of the neighbour at the tap that it stands for, or by [`ESCAPED`].
 #[inline(always)]
 pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
-    // From the last tap back, so that each overwrites the lanes of the taps after it.
+    // Bounds are cumulative. From the last tap back, each tap overwrites the lanes that a later tap should not have.
     for tap in fast.iter().rev() {
         let parent: &[u8; LANES] = parents[tap.offset..]
             .first_chunk()
             .expect("invariant: a whole chunk of places is under every tap");
         for lane in 0..LANES {
-            // Arithmetic where an `if` would do: LLVM vectorises this one.
+            // Arithmetic instead of an `if`, because LLVM vectorises it.
             let is_chosen = is_within::<DIFFER>(lanes[lane], tap.bound[lane]);
             let chosen = u8::from(is_chosen).wrapping_neg();
             states[lane] ^= (states[lane] ^ parent[lane]) & chosen;
@@ -114,7 +115,8 @@ pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap
     *lanes = states;
 }
 
-/// The same where the cell's own state, which lies under `centre`, tells what bytes stand for.
+/// Replaces bytes like [`blend`], with the table of the cell's own state. `centre` is the offset of the cell from its
+/// home.
 #[inline(always)]
 pub(super) fn blend_own<const DIFFER: bool>(
     lanes: &mut [u8; LANES],
@@ -154,8 +156,8 @@ fn replace(lanes: &mut [u8; LANES], by: u8, is_chosen: impl Fn(usize) -> bool) {
     }
 }
 
-/// The high bit of every lane, that of lane `8 w + b` at position `8 b + w`: an order that takes one
-/// shift a word, with no multiplication to gather its bits.
+/// Returns the high bits of all lanes, with the bit of lane `8 w + b` at position `8 b + w`. This order takes one shift
+/// per word, and no multiplication to gather the bits.
 #[inline]
 pub(super) fn high_bits(lanes: &[u8; LANES]) -> u64 {
     let (words, _) = lanes.as_chunks();
@@ -167,15 +169,15 @@ pub(super) fn high_bits(lanes: &[u8; LANES]) -> u64 {
     bits.fold(0, |all, bits| all | bits)
 }
 
-/// The lane of a bit's position in [`high_bits`], and the position of a lane's bit.
+/// Converts a bit's position in [`high_bits`] to its lane, and a lane to the position of its bit.
 #[inline]
 pub(super) fn transposed(at: u32) -> u32 {
     at % 8 * 8 + at / 8
 }
 
-/// Writes `first` plus the lane of each bit of [`high_bits`] that is set; what follows in `to` is lost.
+/// Writes `first` plus the lane of each set bit of [`high_bits`]. May overwrite the rest of `to`.
 ///
-/// Eight at a time, needed or not, as in simdjson's `flatten_bits`: a loop over the bits alone would
+/// Writes eight at a time, needed or not, like simdjson's `flatten_bits`. A loop over the set bits alone would
 /// mispredict its end in most chunks.
 #[inline]
 pub(super) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {

@@ -1,8 +1,8 @@
-//! A kernel as a mixture over its taps: what [`super::bytes`] and [`super::parents`] make their tables of.
+//! A kernel as a mixture over its taps, from which [`super::bytes`] and [`super::parents`] make their tables.
 
 use super::kernel::Kernel;
 
-/// The kernel of all cells, or of those in one state themselves, as a mixture over taps.
+/// The kernel of all cells, or of cells in one own state, as a mixture over taps.
 #[derive(Debug)]
 pub(super) struct Mixture<'k> {
     kernel: &'k Kernel,
@@ -10,15 +10,15 @@ pub(super) struct Mixture<'k> {
     most: Vec<f64>,
     /// `C`, the sum of `most`.
     total: f64,
-    /// `f`: the state that each state mostly leads to under each tap, `[tap][from]`.
+    /// `f`: the most likely vote of each neighbour state at each tap, as `[tap][from]`.
     likeliest: Vec<Vec<usize>>,
-    /// How many of 256 byte values stand for each tap.
+    /// Number of the 256 byte values that stand for each tap.
     counts: Vec<usize>,
     n_zones: usize,
 }
 
 impl<'k> Mixture<'k> {
-    /// One mixture for each kernel; those of all zones agree in `f`.
+    /// Returns one mixture per kernel. The mixtures of all zones have the same `f`.
     pub(super) fn of_kernels(
         kernels: &'k [Kernel],
         n_zones: usize,
@@ -47,7 +47,7 @@ impl<'k> Mixture<'k> {
             (256.0 * certain.fold(f64::INFINITY, f64::min) / total) as usize
         };
         let mut counts: Vec<usize> = (0..kernel.n_taps).map(count).collect();
-        // Where lanes differ, bounds are the first value beyond: a byte holds 255 at most.
+        // If lanes differ, a bound is the first value beyond the tap's, and a byte holds at most 255.
         if n_zones > 1
             && counts.iter().sum::<usize>() > 255
             && let Some(most) = counts.iter_mut().max()
@@ -72,29 +72,29 @@ impl<'k> Mixture<'k> {
         self.kernel.n_states
     }
 
-    /// How many weights are not zero.
+    /// Returns the number of nonzero weights.
     pub(super) fn n_weights(&self) -> usize {
         let weights = self.kernel.weights.iter();
         weights.filter(|&&weight| weight > 0.0).count()
     }
 
-    /// `f` under a tap.
+    /// Returns `f` at a tap.
     pub(super) fn likeliest(&self, tap: usize) -> &[usize] {
         &self.likeliest[tap]
     }
 
-    /// How many of 256 byte values stand for each tap.
+    /// Returns the number of the 256 byte values that stand for each tap.
     pub(super) fn counts(&self) -> &[usize] {
         &self.counts
     }
 
-    /// The probability of a tap.
+    /// Returns the probability of a tap.
     pub(super) fn share(&self, tap: usize) -> f64 {
         self.most[tap] / self.total
     }
 
-    /// For each state of the parent under a tap, where each outcome's part of the tap's interval ends;
-    /// `taken` has gone from the likeliest outcome's.
+    /// Returns where each outcome's part of a tap's interval ends, as `[parent state][outcome]`. The part of the most
+    /// likely outcome is shorter by `taken`, the probability that bytes decide already.
     pub(super) fn ends(&self, tap: usize, taken: f64) -> Vec<Vec<f64>> {
         let of_parent = |(from, &likeliest): (usize, &usize)| {
             let mut end = 0.0;
@@ -111,7 +111,7 @@ impl<'k> Mixture<'k> {
     }
 }
 
-/// `f` of some kernels together, by tap.
+/// Returns the common `f` of several kernels, as `[tap][from]`.
 fn likeliest(kernels: &[&Kernel], see_own_state: bool) -> Vec<Vec<usize>> {
     let n_taps = kernels[0].n_taps;
     if !see_own_state {
@@ -124,7 +124,7 @@ fn likeliest(kernels: &[&Kernel], see_own_state: bool) -> Vec<Vec<usize>> {
     likeliest
 }
 
-/// The state that each state mostly leads to under some taps.
+/// Returns the most likely vote of each state, summed over some taps.
 fn likeliest_under(kernels: &[&Kernel], taps: impl Iterator<Item = usize> + Clone) -> Vec<usize> {
     let n_states = kernels[0].n_states;
     let sum = |from, to| {

@@ -1,78 +1,79 @@
-//! Draws of a *parent*: one neighbour of a cell, whose vote decides.
+//! Draws a *parent* of a cell: one neighbour, whose vote alone decides the cell.
 //!
 //! Why it is fast: a draw costs one random number and two look-ups, whatever the size of the kernel.
 //!
-//! Why it is the same: the weight of outcome `m` is `sum_t w[m, n_t, t]`. Pick tap `t` with probability `most[t] / C`,
-//! where `most[t] = max_n sum_m w[m, n, t]` and `C = sum_t most[t]`; then outcome `m` with probability
-//! `w[m, n_t, t] / most[t]`. What is missing to one rejects, and so does a neighbour off the grid, whose weight is zero.
-//! So `m` is accepted with probability `sum_t w[m, n_t, t] / C`: in proportion to its weight. After a rejection, draw
-//! again. `tests/model/dynamics.rs` compares draws with `Phi` for any models and grids.
+//! Why the distribution is the same: the weight of outcome `m` is `sum_t w[m, n_t, t]`. A draw picks tap `t` with
+//! probability `most[t] / C`, where `most[t] = max_n sum_m w[m, n, t]` and `C = sum_t most[t]`. It then picks outcome
+//! `m` with probability `w[m, n_t, t] / most[t]`. If these probabilities sum to less than one, the rest is the
+//! probability of a rejection. A neighbour off the grid has no weight, so it is always rejected. Thus `m` is accepted
+//! with probability `sum_t w[m, n_t, t] / C`, in proportion to its weight. After a rejection, the cell is drawn again.
+//! `tests/model/dynamics.rs` compares draws with `Phi` for random models and grids.
 
 use super::lanes::Words;
 use super::mixture::Mixture;
 use super::places::{OFF_GRID, Places, centre};
 
-/// Mark of a cell to be drawn again: its parent is off the grid, or has no such vote. Odd, and its high bit is set, as
-/// in no state.
+/// Mark of a cell to be drawn again, because its parent is off the grid or the vote was rejected. Its high bit
+/// distinguishes it from all states, and its odd value from the mark of an escaped byte.
 const REJECTED: u8 = OFF_GRID;
 
-/// Rounds of drawing parents before a cell's kernel is summed. The wildfire rejects about 1 in 30,
-/// in a corner 1 in 3; only models with columns of very different sums come here often.
+/// Maximum number of draws of a cell before its kernel is summed. The wildfire rejects about 1 draw in 30, in a corner
+/// 1 in 3. Only models with very unequal column sums often need them all.
 const ROUNDS: usize = 8;
 
-/// Most rules of [`Parents`]: 64 states have as many with a 3 x 3 kernel. The tables of more would not
-/// stay in any cache.
-const MOST_RULES: usize = 1 << 16;
+/// Maximum number of rules of [`Parents`]. 64 states with a 3 x 3 kernel stay below it. Larger tables would not stay in
+/// any cache.
+const MAX_RULES: usize = 1 << 16;
 
-/// Tables to draw a tap and its outcome, from the residual distribution of [`super::bytes`] or from the whole.
+/// Tables that draw a tap and its outcome, from the residual distribution of [`super::bytes`] or from the whole.
 ///
-/// Tap `t` has an interval as long as its probability, and each state of its parent divides it among
-/// the outcomes. All their ends together cut it into *rules*: pieces in which a parent's state
-/// leads to one outcome. So one draw, by an alias table (Walker 1977, Vose 1991), and two
-/// look-ups decide a cell. The wildfire has 53 rules in its residual distribution.
+/// Tap `t` has an interval as long as its probability. Each state of its parent divides this interval among the
+/// outcomes. The ends of all these divisions cut it into *rules*: pieces in which each parent state leads to one
+/// outcome. So one draw from an alias table (Walker 1977, Vose 1991) and two look-ups decide a cell. The wildfire has
+/// 53 rules in its residual distribution.
 #[derive(Debug)]
 pub(super) struct Parents {
-    /// For each mixture two alias tables, all of one length, a power of two: the residual distribution,
-    /// then the whole.
+    /// Two alias tables per mixture: the residual distribution, then the whole. All have the same length, a power of
+    /// two.
     slots: Vec<Slot>,
     log_n_slots: u32,
-    /// Outcomes, in rows of a power of two.
+    /// Rows of outcomes by parent state. The length of a row is a power of two.
     outcomes: Vec<u8>,
-    /// What of a parent indexes a row; takes [`OFF_GRID`] to the row's end.
+    /// The bits of a parent's state that index a row. They map [`OFF_GRID`] to the row's last entry.
     mask: u8,
-    /// Where a cell's own state lies, if it chooses the mixture.
+    /// The offset of the cell from its home, if its own state chooses the mixture.
     own: Option<usize>,
-    /// The first mixture of each home's zone, where zones differ.
+    /// The first mixture of each home's zone, if the model has several zones.
     first_mixtures: Option<Vec<u16>>,
 }
 
 /// A tap, and the outcome for each state of its parent.
 #[derive(Debug, Clone, Copy, Default)]
 struct Rule {
-    /// Where the tap reads, relative to a cell's home.
+    /// The place that the tap reads, relative to a cell's home.
     offset: u32,
-    /// The first of its row of outcomes.
+    /// The start of the rule's row in `Parents::outcomes`.
     outcomes: u32,
 }
 
 /// One slot of an alias table.
 #[derive(Debug, Clone, Copy, Default)]
 struct Slot {
-    /// Below it the first rule is drawn, else the second.
+    /// Below this number the first rule is drawn, otherwise the second.
     threshold: u32,
     rules: [Rule; 2],
 }
 
 impl Parents {
-    /// What the bytes leave of each mixture, and the whole of it; the taps read at `offsets`, and `zones` has that of
-    /// each home. `None` if the rules would be too many.
+    /// Makes the tables of each mixture: the part that bytes leave, and the whole. Taps read at `offsets`, and `zones`
+    /// has the zone of each home. Returns `None` if the rules would be too many.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
         zones: Option<&[u8]>,
     ) -> Option<Self> {
         let n_weights: usize = mixtures.iter().map(Mixture::n_weights).sum();
-        if n_weights + mixtures.len() * offsets.len() > MOST_RULES {
+        if n_weights + mixtures.len() * offsets.len() > MAX_RULES {
             return None;
         }
         let mut outcomes = Vec::new();
@@ -98,8 +99,8 @@ impl Parents {
         })
     }
 
-    /// Draws a parent for every listed cell, and again for the rejected ones, up to [`ROUNDS`] times; those still
-    /// rejected stay first in the list, which has as many as are returned.
+    /// Draws a parent for every listed cell, and again for rejected ones, up to [`ROUNDS`] times. Returns the number of
+    /// cells that are still rejected; they come first in the list.
     #[inline(always)]
     pub(super) fn decide(
         &self,
@@ -134,9 +135,9 @@ impl Parents {
         n_undecided
     }
 
-    /// One draw for every listed cell, by the `mixture` that states and home tell; the rejected ones come first in the
-    /// list, which has as many as are returned.
-    #[inline(never)] // As `Bytes::list_undecided`.
+    /// Draws once for every listed cell. `mixture` returns the index of a cell's mixture from the states and the cell's
+    /// home. Returns the number of rejected cells; they come first in the list.
+    #[inline(never)] // For the same reason as `Bytes::list_undecided`.
     fn round(
         &self,
         places: &mut Places,
@@ -154,15 +155,15 @@ impl Parents {
             let mixture = mixture(states, home as usize);
             let state = self.outcome(mixture, mark, random, states, home);
             next[home as usize] = state;
-            // Branch-free: no rejection is predictable.
+            // Branch-free, because the processor cannot predict rejections.
             undecided[n_rejected] = home;
             n_rejected += usize::from(state == REJECTED);
         }
         n_rejected
     }
 
-    /// Draws for the cell at `home`, by its mark: from the residual distribution after a byte, from the whole
-    /// after a rejection.
+    /// Draws an outcome for the cell at `home`. The cell's mark chooses the distribution: the residual one after a
+    /// byte, the whole after a rejection.
     #[inline]
     fn outcome(&self, mixture: usize, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
         let table = (mixture << 1 | usize::from(mark & 1)) << self.log_n_slots;
@@ -174,7 +175,7 @@ impl Parents {
     }
 }
 
-/// The distribution of tap and outcome as rules, less `taken[t] / 256` of "tap `t`, likeliest outcome".
+/// Returns the rules of a mixture with their lengths, without `taken[t] / 256` of "tap `t`, most likely outcome".
 fn rules(
     mixture: &Mixture,
     offsets: &[usize],
@@ -191,12 +192,12 @@ fn rules(
     rules
 }
 
-/// Room for an outcome of each state and of no parent.
+/// Returns the length of a row, with an outcome for each state and one for a parent off the grid.
 fn row_length(n_states: usize) -> usize {
     (n_states + 1).next_power_of_two()
 }
 
-/// Cuts a tap's interval into rules with their lengths; appends their rows of outcomes.
+/// Cuts a tap's interval into rules and appends them with their lengths. Appends their rows to `outcomes`.
 fn add_rules(
     ends: &[Vec<f64>],
     length: f64,
@@ -227,8 +228,8 @@ fn add_rules(
     }
 }
 
-/// An alias table of the rules, which need not sum to one (Vose, IEEE TSE 17(9), 1991). If there are
-/// none, it must not be drawn from.
+/// Makes an alias table of the rules, whose lengths need not sum to one (Vose, IEEE TSE 17(9), 1991). A table without
+/// rules must not be drawn from.
 fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
     let per_slot = rules.iter().map(|(mass, _)| mass).sum::<f64>() / n_slots as f64;
     let mut left: Vec<f64> = rules.iter().map(|(mass, _)| mass / per_slot).collect();
@@ -256,6 +257,6 @@ fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
             small.push(over);
         }
     }
-    // The slots left on either list have a share of one but for rounding: they stay whole.
+    // Slots that remain in either list have a share of one, up to rounding. They keep a single rule.
     slots
 }

@@ -1,13 +1,14 @@
-//! The work space of [`super::Dynamics`]: states with a margin around the grid, so that no cell is special.
+//! The buffers of [`super::Dynamics`]: states with a margin around the grid, so that cells at the edge are no special
+//! case.
 //!
-//! It has a place for every cell and for a margin of half a kernel. A cell's *home* is the place under the upper left
+//! There is a place for every cell and for a margin of half a kernel. A cell's *home* is the place at the upper left
 //! tap of its kernel; every tap reads at a fixed offset from there.
 
 use super::super::grid::Shape;
 use super::super::parameters::Model;
 use super::lanes::LANES;
 
-/// Marks places outside the grid that add no weight.
+/// The value of places outside the grid, which add no weight.
 pub(super) const OFF_GRID: u8 = 255;
 
 #[derive(Debug, Clone)]
@@ -15,9 +16,9 @@ pub(super) struct Places {
     width: usize,
     pub(super) stride: usize,
     margins: [usize; 2],
-    /// `X_k`. The margin has the model's edge state, or [`OFF_GRID`].
+    /// `X_k`. The margin holds the model's edge state, or [`OFF_GRID`].
     pub(super) states: Vec<u8>,
-    /// By home: random bytes, then states and marks of undecided cells, then `X_{k+1}`.
+    /// By home: first random bytes, then next states and the marks of undecided cells, finally `X_{k+1}`.
     pub(super) next: Vec<u8>,
 }
 
@@ -43,14 +44,14 @@ impl Places {
         (n_places, n_homes)
     }
 
-    /// Where each tap of a model's kernel reads, relative to a cell's home.
+    /// Returns the offset from a cell's home that each tap of a model's kernel reads.
     pub(super) fn offsets(&self, model: &Model) -> Vec<usize> {
         let (_, _, kernel_height, kernel_width) = model.kernel().dim();
         let taps = ndarray::indices((kernel_height, kernel_width)).into_iter();
         taps.map(|(row, col)| row * self.stride + col).collect()
     }
 
-    /// The zone of each home, where zones differ; 0 in the margin.
+    /// Returns the zone of each home, if the model has several zones. The margin has zone 0.
     pub(super) fn zones(&self, model: &Model) -> Option<Vec<u8>> {
         let map = model.zone_map().filter(|_| model.n_zones() > 1)?;
         let mut zones = vec![0; self.next.len()];
@@ -60,7 +61,7 @@ impl Places {
         Some(zones)
     }
 
-    /// Copies the states inside the margins.
+    /// Copies the states of the grid's cells into the places between the margins.
     #[inline(always)]
     pub(super) fn load(&mut self, cells: &[u8]) {
         let ([above, left], width) = (self.margins, self.width);
@@ -70,7 +71,7 @@ impl Places {
         }
     }
 
-    /// Copies the next states out.
+    /// Copies the next states to the grid's cells.
     #[inline(always)]
     pub(super) fn store(&self, cells: &mut [u8]) {
         let rows = self.next.chunks(self.stride);
@@ -80,7 +81,7 @@ impl Places {
     }
 }
 
-/// Where the cell itself lies, relative to its home.
+/// Returns the offset of a cell from its home.
 pub(super) fn centre(offsets: &[usize]) -> usize {
     offsets[offsets.len() / 2]
 }

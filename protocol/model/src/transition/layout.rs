@@ -1,10 +1,10 @@
-//! Where beliefs lie while [`super::Transition`] works on them.
+//! The memory layout of beliefs in [`super::Transition`].
 
 use super::super::grid::Shape;
 use super::super::vectors::LANES;
 
-/// Where a cell of a state lies in the planes: half a kernel of margin on each side, and on the
-/// right up to a whole number of [`LANES`].
+/// The layout of a belief in planes, one per state. Each plane has a margin of half a kernel on each side. On the right
+/// it extends to a whole number of [`LANES`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layout {
     pub(super) above: usize,

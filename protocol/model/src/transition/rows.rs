@@ -1,51 +1,51 @@
-//! Eq. 2 with taps added up before they are multiplied.
+//! Eq. 2, with the beliefs at taps of equal weight added before they are multiplied.
 //!
-//! Why it is fast: taps of one state that weigh alike (the eight neighbours in most of the wildfire kernel) are added
-//! up once for all next states: 35 additions and 16 multiplications a cell where the formula has 54 of each.
+//! Why it is fast: taps of one state with equal weights (the eight neighbours in most of the wildfire kernel) are added
+//! once for all next states. A cell takes 35 additions and 16 multiplications instead of the formula's 54 of each.
 //!
-//! Why it is the same: `w x + w y = w (x + y)`. The sums of the formula, in double precision, are in
-//! `tests/model/models.rs`; `transition.rs` there compares them for any models and grids.
+//! Why the result is the same: `w x + w y = w (x + y)`. `tests/model/models.rs` computes the formula's sums in double
+//! precision, and `transition.rs` there compares them for random models and grids.
 //!
-//! A weight that differs between zones has a *slot*: a number for each lane, by the zones of the cells there. Most
-//! weights of a land do not differ.
+//! A weight that differs between zones has a *slot*: one number per lane, according to the zone of the lane's cell.
+//! Most weights are the same in all zones.
 
 use super::super::vectors::LANES;
 use super::layout::Layout;
 use ndarray::{Array4, NdFloat, s};
 
-/// For each next state its bias and its weight for some of the groups.
+/// For each next state, its bias and its weights for groups of taps.
 pub(super) type Rows<T> = Vec<Row<T>>;
 
 #[derive(Debug, Clone)]
 pub(super) enum Kernels<T> {
-    /// Of every cell.
+    /// The same for every cell.
     Alike(Rows<T>),
-    /// By the cell's own state.
+    /// One per own state of the cell.
     Own(Vec<Own<T>>),
 }
 
-/// What a cell in one state itself turns into.
+/// The distribution of the next state of cells in one own state.
 #[derive(Debug, Clone)]
 pub(super) enum Own<T> {
-    /// Whatever its neighbours, the probability of each next state that is possible.
+    /// The probability of each possible next state, which does not depend on neighbours.
     Fixed(Vec<(usize, T)>),
-    /// The rows of the next states that are possible.
+    /// The rows of the possible next states.
     Weighed(Vec<(usize, Row<T>)>),
 }
 
-/// One next state's part of eq. 2.
+/// Eq. 2 for one next state.
 #[derive(Debug, Clone)]
 pub(super) struct Row<T> {
     bias: T,
-    /// The slot that the bias has, where zones differ in it.
+    /// The slot of the bias, if it differs between zones.
     bias_slot: Option<usize>,
-    /// Group and weight.
+    /// Groups with their weights.
     terms: Vec<(usize, T)>,
-    /// Group and slot, where zones differ in the weight.
+    /// Groups with their slots, for weights that differ between zones.
     zoned_terms: Vec<(usize, usize)>,
 }
 
-/// The weights that differ between zones: of each slot, one for each zone.
+/// The weights that differ between zones, as `[slot][zone]`.
 pub(super) type Slots<T> = Vec<Vec<T>>;
 
 impl<T: NdFloat> Own<T> {
@@ -62,7 +62,7 @@ impl<T: NdFloat> Own<T> {
         }
     }
 
-    /// Adds what becomes of the cells that are in this state with probability `p`; `slots` are those of the lanes.
+    /// Adds the next states of cells that are in this state with probability `p`. `slots` has the lanes' zoned weights.
     #[inline(always)]
     pub(super) fn add(
         &self,
@@ -103,7 +103,7 @@ impl<T: NdFloat> Own<T> {
 }
 
 impl<T: NdFloat> Row<T> {
-    /// Whether anything but a bias that is alike everywhere weighs.
+    /// Returns whether the row has a weight, or a bias that differs between zones.
     fn is_weighed(&self) -> bool {
         self.bias_slot.is_some() || !self.terms.is_empty() || !self.zoned_terms.is_empty()
     }
@@ -129,8 +129,8 @@ impl<T: NdFloat> Row<T> {
     }
 }
 
-/// Eq. 2 for the cells in state `own`, or for all: `kernels` are those of each zone, `columns` the weights of the groups.
-/// Weights that differ between zones are added to the slots.
+/// Returns eq. 2 for cells in state `own`, or for all cells. `kernels` has one kernel per zone, and `columns` the
+/// weights of the groups. Appends weights that differ between zones to `slots`.
 pub(super) fn kernel_rows<T: NdFloat>(
     own: usize,
     kernels: &[&Array4<f64>],
@@ -139,7 +139,7 @@ pub(super) fn kernel_rows<T: NdFloat>(
     columns: &[Vec<f64>],
     slots: &mut Slots<T>,
 ) -> Rows<T> {
-    // Eq. 3 cancels a common factor; taken out, no weight overflows T.
+    // Eq. 3 cancels a common factor. Dividing by the largest weight keeps the weights in the range of `T`.
     let weights = kernels.iter().flat_map(|kernel| kernel.iter());
     let largest = weights.chain(bias).copied().fold(0.0, f64::max);
     let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
@@ -175,9 +175,9 @@ pub(super) fn kernel_rows<T: NdFloat>(
     (0..n_states).map(&mut row).collect()
 }
 
-/// The taps of each state, or of all, by the column of weights `w[.., n, a, c]` they share, one kernel's after the
-/// other's: `(column, offsets)`. Taps without weight are left out, as is the centre where it sees the
-/// cell's own state.
+/// Groups the taps that have equal columns of weights `w[.., n, a, c]`, over all kernels in turn. Returns the column
+/// and the offsets of each group. Leaves out taps without weight, and the centre tap if kernels depend on the own
+/// state.
 pub(super) fn taps_that_weigh_alike(
     kernels: &[Array4<f64>],
     sees_own_state: bool,
@@ -187,7 +187,7 @@ pub(super) fn taps_that_weigh_alike(
     let is_own = |tap| sees_own_state && tap == (kernel_height / 2, kernel_width / 2);
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
-        // If all kernels are alike, sums are taken within one state alone: another order would change the last bits.
+        // With a single kernel, a group stays within one state: another order of additions would change the last bits.
         let first = if kernels.len() > 1 { 0 } else { groups.len() };
         for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
             let columns = kernels

@@ -1,4 +1,4 @@
-//! Where robots may fly and what they see, against plain loops over all cells of the grid.
+//! Where robots may fly and what they see, compared with plain loops over all cells of the grid.
 
 use super::models::{shape, unit};
 use super::refusals::LAND;
@@ -13,7 +13,7 @@ fn random_map(key: u64, (height, width): (usize, usize)) -> Grid<bool> {
 }
 
 proptest! {
-    // No file of failures: tests leave the source tree alone.
+    // Write no file of failures: tests leave the source tree alone.
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]
@@ -67,7 +67,7 @@ proptest! {
 
 #[test]
 fn random_starts_are_the_largest_connected_part() {
-    // No-fly cells, random starts, and elsewhere how many cells are connected.
+    // `#`: no-fly cells; `*`: random starts; digits: the size of the part around other cells.
     for picture in [
         "33#** 3##** ##1#*",
         "*#2 *#2",
@@ -117,7 +117,7 @@ fn each_ring_has_its_own_observations() {
         assert_eq!((air.radius(), air.n_rings()), (radius, n_rings));
     }
     assert_eq!(Model::wildfire().with_radius(0), Ok(Model::wildfire()));
-    // Maps and sensors that change nothing are none.
+    // Maps and sensors without effect make an open airspace.
     let nowhere = Some(Arc::new(Grid::from_elem((2, 3), false)));
     let air = Airspace::new(shape(2, 3), nowhere, 0, 1, Pays::Seen);
     assert_eq!(air, Airspace::open(shape(2, 3)));
@@ -147,7 +147,7 @@ fn maps_are_read_beside_the_model() {
     let words = "expected an array [H, W] of uint8 or bool";
     ndarray_npy::write_npy(&place, &bytes.mapv(f64::from)).expect("f64");
     check(words);
-    // What a header claims takes no memory before it is checked.
+    // The size that a header claims is checked before memory is allocated.
     ndarray_npy::write_npy(&place, &Grid::from_elem((1, 1), 0_u8)).expect("a map");
     let whole = std::fs::read(&place).expect("the map");
     let (header, numbers) = whole.split_at(whole.len() - 1);

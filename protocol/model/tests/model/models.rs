@@ -1,10 +1,10 @@
-//! Models other than the wildfire, random states and beliefs, and the formula that all of them follow.
+//! Models other than the wildfire, random states and beliefs, and the formula that all models follow.
 
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{CellMap, Grid, KernelEntry, Model, ModelFile, Shape, ZoneEntry};
 use ndarray::{Array3, Axis};
 
-/// A model with weights `weight(to, from, row, col)` and biases `bias(to)`.
+/// Makes a model with weights `weight(to, from, row, col)` and biases `bias(to)`.
 pub fn model(
     n_states: usize,
     kernel_size: [usize; 2],
@@ -44,14 +44,14 @@ pub fn checked(file: ModelFile) -> Model {
     Model::new(file).expect("test models are valid")
 }
 
-/// The same with cells outside the grid that are always in a state.
+/// Adds an edge state, chosen by `key`, to a model.
 pub fn with_edge(model: &Model, key: u64) -> Model {
     let mut file = model.file().clone();
     file.edge = Some(file.states[key as usize % model.n_states()].name.clone());
     checked(file)
 }
 
-/// Random weights, a third of them zero, and random biases.
+/// Makes a model with random weights, a third of them zero, and random biases.
 pub fn random_model(key: u64, n_states: usize, [height, width]: [usize; 2]) -> Model {
     let weight = |to, from, row, col| {
         let index = ((to * n_states + from) * height + row) * width + col;
@@ -61,7 +61,7 @@ pub fn random_model(key: u64, n_states: usize, [height, width]: [usize; 2]) -> M
     model(n_states, [height, width], weight, |to| unit(key + 2, to))
 }
 
-/// The same with a kernel for each state that a cell itself is in; in some of them neighbours don't count.
+/// Makes a random model with one kernel per own state. In some kernels neighbours have no weight.
 pub fn random_own_model(key: u64, n_states: usize, kernel_size: [usize; 2]) -> Model {
     let mut file = random_model(key, n_states, kernel_size).file().clone();
     file.kernel.clear();
@@ -75,7 +75,7 @@ pub fn random_own_model(key: u64, n_states: usize, kernel_size: [usize; 2]) -> M
                 entry.weights.iter_mut().for_each(|row| row.fill(0.0));
             }
             entry.own = Some(format!("s{own}"));
-            // What is said of another state in the centre means nothing.
+            // Weights of other states at the centre have no effect.
             let is_void = entry.own.as_ref() != Some(&entry.from);
             entry.weights[row][col] = if is_void { 1e60 } else { centre };
             file.kernel.push(entry);
@@ -84,7 +84,7 @@ pub fn random_own_model(key: u64, n_states: usize, kernel_size: [usize; 2]) -> M
     checked(file)
 }
 
-/// A land: kernels of other models in zones that are scattered over a grid.
+/// Makes a land: zones scattered over a grid, each with the kernels of another model.
 pub fn zoned(models: &[Model], key: u64, (height, width): (usize, usize)) -> Model {
     let mut file = models[0].file().clone();
     let (name, n_zones) = (|zone: usize| format!("z{zone}"), models.len());
@@ -108,7 +108,7 @@ pub fn zoned(models: &[Model], key: u64, (height, width): (usize, usize)) -> Mod
     checked(file)
 }
 
-/// A land of random models; some weights are the same in all zones.
+/// Makes a land of random models, with some weights that are the same in all zones.
 pub fn random_land(key: u64, models: &[Model], side: (usize, usize)) -> Model {
     let mut file = zoned(models, key, side).file().clone();
     let n_entries = models[0].file().kernel.len();
@@ -118,8 +118,8 @@ pub fn random_land(key: u64, models: &[Model], side: (usize, usize)) -> Model {
     checked(file)
 }
 
-/// Each state's probability in each cell after a step (paper eqs. 2-4), from the entries of the model's file as
-/// docs/model-file.md explains them.
+/// Computes each state's probability in each cell after a step (paper eqs. 2 to 4), directly from the entries of the
+/// model's file, as docs/model-file.md explains them.
 pub fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
     let file = model.file();
     let (n_states, height, width) = p.dim();
@@ -164,7 +164,7 @@ pub fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
     next
 }
 
-/// A number in `[0, 1)`.
+/// Returns a random number in `[0, 1)`.
 pub fn unit(key: u64, index: usize) -> f64 {
     (split_mix(key, index as u64) >> 11) as f64 / 2f64.powi(53)
 }
@@ -179,7 +179,7 @@ pub fn random_states(key: u64, n_states: usize, (height, width): (usize, usize))
     })
 }
 
-/// A random belief, each cell's summing to one.
+/// Makes a random belief, in which each cell sums to one.
 pub fn random_belief(key: u64, n_states: usize, (height, width): (usize, usize)) -> Array3<f64> {
     let mut belief = Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
         unit(key, (state * height + row) * width + col)

@@ -1,9 +1,9 @@
-//! Invalid entries of a model file are refused by name; valid ones are kept as they are written.
+//! Invalid entries of a model file are refused by name; valid ones are kept as they were written.
 
 use super::models::{checked, shape};
 use emberwatch_model::{KernelEntry, Model, ModelError, StateEntry, ZoneEntry};
 
-/// A model with every key: two zones and an edge, a sensor, no-fly cells, a kernel for each own state.
+/// A model with every key: two zones and an edge, a sensor, no-fly cells, and own-state kernels.
 pub const LAND: &str = r##"
 name = "land"
 kernel_size = [1, 1]
@@ -27,11 +27,11 @@ kernel = [
 ]
 "##;
 
-/// What replaces a part of it, and what is said then.
+/// Part of [`LAND`] => its replacement => part of the error.
 const WRONG: &str = r##"
 name = "land" => name = 3 => model file: 
 states = [ => states = [], no = [ => model file: 
-"b", color => "a", color => state name "a" stands twice
+"b", color => "a", color => state name "a" appears twice
 "a", color => "explore", color => state name: expected letters, digits, '-' and '_', and none of
 "a", color => "a b", color => state name: expected letters, digits, '-' and '_', and none of
 "a", color => "", color => state name: expected letters, digits, '-' and '_', and none of
@@ -39,10 +39,10 @@ states = [ => states = [], no = [ => model file:
 #ff0000 => #+1+2+3 => got #+1+2+3
 bias = 0.0 => bias = -1.0 => state "a": bias: expected a finite number >= 0, got -1
 bias = 0.0 => bias = nan => state "a": bias: expected a finite number >= 0, got NaN
-bias = 0.0 => bias = 1e101 => bias: expected 0, or a size of 1e-100 to 1e100, got 1e101
-bias = 0.0 => bias = 1e-320 => bias: expected 0, or a size of 1e-100 to 1e100, got
-reward = 1.0 => reward = -1e101 => reward: expected 0, or a size of 1e-100 to 1e100, got -1e101
-reward = 1.0 => reward = -1e-320 => reward: expected 0, or a size of 1e-100 to 1e100, got
+bias = 0.0 => bias = 1e101 => bias: expected 0, or a magnitude of 1e-100 to 1e100, got 1e101
+bias = 0.0 => bias = 1e-320 => bias: expected 0, or a magnitude of 1e-100 to 1e100, got
+reward = 1.0 => reward = -1e101 => reward: expected 0, or a magnitude of 1e-100 to 1e100, got -1e101
+reward = 1.0 => reward = -1e-320 => reward: expected 0, or a magnitude of 1e-100 to 1e100, got
 reward = 1.0 => reward = inf => reward: expected a finite number, got inf
 initial = 0.75 => initial = 0.5 => initial: expected a sum of 1, got 0.75
 observed_as = [0.0, 1.0] => observed_as = [0.5, 0.4] => state "b": observed_as: expected a sum of 1, got 0.9
@@ -57,8 +57,8 @@ kernel_size = [1, 1] => kernel_size = [15, 99999999] => kernel_size: expected tw
 kernel_size = [1, 1] => kernel_size = [9223372036854775807, 9223372036854775807] => kernel_size: expected two odd numbers
 kernel_size = [1, 1] => kernel_size = [-1, 3] => model file: 
 [[0.5]] => [[-0.1]] => kernel in zone "z0" of "a" from "a" to "a": expected finite weights >= 0, got -0.1
-[[0.5]] => [[1e101]] => to "a": expected 0, or a size of 1e-100 to 1e100, got 1e101
-scale = 1.0, weights = [[1.0]] => scale = 1e-99, weights = [[1e-99]] => expected 0, or a size of 1e-100 to 1e100, got
+[[0.5]] => [[1e101]] => to "a": expected 0, or a magnitude of 1e-100 to 1e100, got 1e101
+scale = 1.0, weights = [[1.0]] => scale = 1e-99, weights = [[1e-99]] => expected 0, or a magnitude of 1e-100 to 1e100, got
 scale = 1.0 => scale = nan => expected finite weights >= 0, got NaN
 scale = 1.0 => scale = -1.0 => expected finite weights >= 0, got -1
 scale = 1.0 => scale = 0.0 => transition weights of cell (0, 0) can sum to zero
@@ -71,11 +71,11 @@ own = "b", from = "b", to = "a" => own = "a", from = "a", to = "b" => of "a" fro
 zone = "z1", own = "b" => own = "b" => to "a": zone: expected the name of one of `zones`, got none
 zone = "z1", own = "b" => zone = "z9", own = "b" => to "a": zone: expected the name of one of `zones`, got "z9"
 zones = [ => zones = [{ name = "z2", color = "#000000" },  => zone "z2": expected kernel entries with its name
-"z1", color => "z0", color => zone name "z0" stands twice
+"z1", color => "z0", color => zone name "z0" appears twice
 #808080 => grey => zone "z1": color: expected #rrggbb, got grey
 zone_map = [[0, 1, 1]] =>  => zone_map: expected the zone of each cell, got none
 [[0, 1, 1]] => [[0, 1]] => zone_map: expected a map of the 1 x 3 grid, got 1 x 2
-[[0, 1, 1]] => [[0, 1, 2]] => zone_map: expected zones below 2, as `zones` has, got 2
+[[0, 1, 1]] => [[0, 1, 2]] => zone_map: expected zones below 2, the number of `zones`, got 2
 [[0, 1, 1]] => [[0, 1, 1], [0]] => zone_map: expected rows of 3 numbers, got 1
 [[0, 1, 1]] => [] => zone_map: expected a map of a grid, got
 [[0, 1, 1]] => -1 => expected rows of numbers from 0 to 255, or the name of a .npy file
@@ -84,7 +84,7 @@ zone_map = [[0, 1, 1]] =>  => zone_map: expected the zone of each cell, got none
 [[0, 0, 1]] => [[0, 0, 2]] => no_fly: expected 0 or 1 for each cell, got 2
 [[0, 0, 1]] => [[1, 1, 1]] => no_fly: expected a cell where robots may be, got none
 radius = 3 => radius = 9 => sensor: radius: expected 0 to 8 cells, got 9
-radius = 3 => radius = 1 => sensor: rings: expected at most 1 rings, as the radius is, got 2
+radius = 3 => radius = 1 => sensor: rings: expected at most 1 rings, the sensor's radius, got 2
 [[0.7, 0.3], [0.5, 0.5]] => [[0.7, 0.3]] => sensor: ring 2: observed_as: expected 2 rows, one per state, got 1
 [0.5, 0.5] => [1.0] => sensor: ring 2: observed_as of state "b": expected 2 probabilities
 [0.5, 0.5] => [0.0, 0.0] => sensor: ring 2: observed_as of state "b": expected a sum of 1, got 0

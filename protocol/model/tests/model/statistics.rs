@@ -1,8 +1,8 @@
-//! Statistics of wildfire worlds by the names of `tests/data/b_world_stats.json`, with mean and standard
-//! error over independent runs.
+//! Statistics of wildfire worlds, named as in `tests/data/b_world_stats.json`, with mean and standard error over
+//! independent runs.
 //!
-//! Definitions, with `X` the states at a step and `X'` one step later; all are averages over steps
-//! 15,000 to 35,000 of one 64 x 64 run, ratios are ratios of counts over the whole run:
+//! Definitions, with `X` the states at a step and `X'` one step later. All are averages over steps 15,000 to 35,000 of
+//! one 64 x 64 run; ratios are ratios of counts over the whole run.
 //! - `mean_fraction_s`, `within_run_sd_fraction_s`: fraction of cells in state s, mean and standard
 //!   deviation over time
 //! - `transitions_per_step_atob`, `cond_prob_atob`, `changes_per_step`: cells with `X = a`, `X' = b`
@@ -17,7 +17,7 @@ const SIDE: usize = 64;
 const FIRST_STEP: u64 = 15_000;
 const LAST_STEP: u64 = 35_000;
 
-/// Every tenth step is counted: states are correlated over thousands of steps.
+/// Only every tenth step is counted: states are correlated over thousands of steps.
 const EVERY: u64 = 10;
 
 const LATENT: usize = 1;
@@ -29,7 +29,7 @@ const DIRECTIONS: [(&str, isize, isize); 4] = [
     ("right", 0, 1),
 ];
 
-/// Value of each statistic in one run.
+/// The value of each statistic in one run.
 type Statistics = BTreeMap<String, f64>;
 
 /// A mean over runs.
@@ -40,13 +40,13 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// The difference to another estimate in combined standard errors.
+    /// Returns the difference to another estimate in combined standard errors.
     pub fn deviation(self, other: Self) -> f64 {
         (self.mean - other.mean) / self.se.hypot(other.se)
     }
 }
 
-/// The authors' simulator.
+/// Returns the statistics of the authors' simulator.
 pub fn reference() -> BTreeMap<String, Estimate> {
     let json: serde_json::Value =
         serde_json::from_str(include_str!("../data/b_world_stats.json")).expect("JSON");
@@ -58,7 +58,7 @@ pub fn reference() -> BTreeMap<String, Estimate> {
     statistics.expect("an object").iter().map(entry).collect()
 }
 
-/// Our simulator, one run for each seed, each on its own thread.
+/// Simulates one run for each seed, each on a separate thread.
 pub fn simulate(seeds: std::ops::Range<u64>) -> BTreeMap<String, Estimate> {
     let runs: Vec<Statistics> = std::thread::scope(|scope| {
         let runs: Vec<_> = seeds.map(|seed| scope.spawn(move || run(seed))).collect();
@@ -94,11 +94,11 @@ fn run(seed: u64) -> Statistics {
 struct Counts {
     /// Fraction of each state at each counted step.
     fractions: [Vec<f64>; 3],
-    /// Cells in state `from` that turn into `to`: `[from][to]`.
+    /// Number of cells in state `from` that turn into `to`: `[from][to]`.
     transitions: [[f64; 3]; 3],
-    /// The same of cells with a neighbour in a direction in a state: `[direction][neighbour][from][to]`.
+    /// Number of cells with a neighbour in some direction and state: `[direction][neighbour][from][to]`.
     neighbours: [[[[f64; 3]; 3]; 3]; 4],
-    /// Fires by quarter of the grid: `[lower half][right half]`.
+    /// Number of fires by quarter of the grid: `[lower half][right half]`.
     fires: [[f64; 2]; 2],
 }
 
@@ -157,7 +157,8 @@ impl Counts {
 
     fn insert_neighbours(&self, all: &mut Statistics) {
         for (seen, (name, ..)) in self.neighbours.iter().zip(DIRECTIONS) {
-            // The share of the cells of some states, before and after, whose neighbour is in a state.
+            // The share of cells, selected by their states before and after the step, whose neighbour is in a given
+            // state.
             let share = |neighbour: usize, is_counted: &dyn Fn(usize, usize) -> bool| {
                 let mut counts = [0.0; 3];
                 for (neighbour, from, to) in ndarray::indices((3, 3, 3)) {
@@ -185,7 +186,7 @@ impl Counts {
     }
 }
 
-/// Mean and standard deviation.
+/// Returns the mean and the standard deviation.
 fn moments(values: &[f64]) -> (f64, f64) {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;

@@ -1,6 +1,6 @@
 //! Computes the next-state distributions of a chunk of cells from the beliefs about their neighbours.
 //!
-//! The symbols have the meanings that the [module](super) gives them.
+//! The [parent module](super) defines the symbols.
 
 use super::kernels::{Group, OwnKernel, Source};
 use super::lanes::{
@@ -14,10 +14,10 @@ const NODES: [(f32, f32); 2] = [(0.585_786_46, 0.853_553_4), (3.414_213_7, 0.146
 /// A single node at 0, where the quadrature is the mean field. Exact if the total `D` is certain.
 const MEAN_FIELD: [(f32, f32); 1] = [(0.0, 1.0)];
 
-/// A smaller total of weights is a rounding error of 0.
+/// A total of weights up to this value counts as 0 with rounding errors.
 const MIN_TOTAL: f32 = 1e-30;
 
-/// Work space and results for one chunk of cells.
+/// Work space and results of the prediction of one chunk of cells.
 #[derive(Debug, Clone)]
 pub struct ChunkPredictor {
     /// For each kernel, the probability of each of its next states.
@@ -39,7 +39,7 @@ pub struct ChunkPredictor {
     inverse_factors: Vec<Lanes>,
 }
 
-/// The numbers from which a chunk is predicted.
+/// Input of the prediction of one chunk.
 #[derive(Clone, Copy)]
 pub struct ChunkInputs<'a> {
     /// The number in each slot of the layout.
@@ -83,7 +83,7 @@ impl ChunkPredictor {
     }
 
     /// Computes the next-state distribution of a kernel, and if `has_cavities` its cavity distributions.
-    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
+    #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     pub fn predict(
         &mut self,
         index: usize,
@@ -227,7 +227,7 @@ impl ChunkPredictor {
                 ratio_sums: &mut self.ratio_sums[at..at + n_sources],
             };
             at += n_sources;
-            // With a constant number of sources the sums stay in registers.
+            // With a constant number of sources, the sums stay in registers.
             match n_sources {
                 1 => multiply_few::<1>(group, inputs, complements, products),
                 2 => multiply_few::<2>(group, inputs, complements, products),
@@ -284,9 +284,9 @@ impl ChunkPredictor {
     }
 }
 
-/// Where a group's neighbours leave their results.
+/// Results for the neighbours of a group.
 struct GroupProducts<'a> {
-    /// Is multiplied by each `f_k`.
+    /// The product that is multiplied by each `f_k`.
     factor: &'a mut Lanes,
     inverse_factors: &'a mut [Lanes],
     ratio_sums: &'a mut [Lanes],
@@ -316,7 +316,7 @@ fn multiply_few<const N: usize>(
 /// Computes `f_k` for each neighbour of a group, and sums the neighbours' beliefs divided by it.
 ///
 /// `f_k = 1 - sum_n p_k[n] (1 - exp(-t d[n]))`, where `p_k[n]` is the belief that the neighbour is in state `n`. So
-/// `f_k` is 1 for a neighbour outside the grid whose beliefs are all 0. `complements` has `1 - exp(-t d)` of each
+/// `f_k` is 1 for a neighbour outside the grid, whose beliefs are all 0. `complements` has `1 - exp(-t d)` for each
 /// source.
 #[inline(always)]
 fn multiply_factors(

@@ -3,7 +3,7 @@
 use emberwatch_model::{Grid, Model};
 use ndarray::Array4;
 
-/// Transition weights of eq. 2, of a model or learned.
+/// Transition weights of eq. 2, from a model or learned.
 #[derive(Debug, Clone, Copy)]
 pub struct Weights<'a> {
     /// Kernels `w[m, n, a, c]`, shape `[S, S, KH, KW]`. Each zone has one kernel, or one per own state of the cell.

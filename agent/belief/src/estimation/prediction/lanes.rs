@@ -8,11 +8,11 @@ pub use emberwatch_model::vectors::LANES;
 /// One number for each cell of a chunk.
 pub type Lanes = [f32; LANES];
 
-/// Returns the [`LANES`] numbers from an index on.
+/// Returns the [`LANES`] numbers that start at an index.
 #[inline(always)]
 pub fn lanes_from(numbers: &[f32], at: usize) -> &Lanes {
     let lanes = numbers[at..].first_chunk();
-    lanes.expect("invariant: planes hold LANES numbers from every neighbour on")
+    lanes.expect("invariant: planes hold LANES numbers after every neighbour")
 }
 
 /// Computes `to += a b`.
@@ -65,7 +65,7 @@ pub fn sum(all: &[Lanes]) -> Lanes {
 /// polynomial of degree 6.
 #[inline(always)]
 pub fn exponential(a: &Lanes, b: &Lanes) -> Lanes {
-    // 1.5 * 2^23: a sum with it is rounded to an integer, which stands in its lowest bits.
+    // 1.5 * 2^23: adding it rounds to an integer, which the lowest bits of the sum hold.
     const ROUNDING: f32 = 12_582_912.0;
     let mut to = [0.0; LANES];
     for lane in 0..LANES {

@@ -4,7 +4,7 @@ use super::kernels::{FixedTransition, Group, OwnKernel, Source, Weights};
 use emberwatch_model::zoned::ZonedNumbers;
 use ndarray::Array4;
 
-/// Totals of scaled weights that differ by less are equal: above the rounding errors of summing them in another order.
+/// Totals of scaled weights that differ by less count as equal. The tolerance exceeds rounding errors of the summation.
 const TOTAL_TOLERANCE: f64 = 1e-9;
 
 /// All weights of a model, arranged for predictions.
@@ -56,7 +56,8 @@ struct Builder<'a> {
     /// Row and column of each neighbour in the kernel.
     taps: Vec<[usize; 2]>,
     centre: [usize; 2],
-    /// For each own state, the power of two that brings its largest weight to 1 or a little more, so that all fit in `f32`.
+    /// For each own state, the power of two that scales its largest weight to at least 1 and below 2, so that all
+    /// weights fit in `f32`.
     scales: Vec<f64>,
     /// The number in each slot, by zone.
     slots: Vec<Vec<f32>>,
@@ -135,13 +136,13 @@ impl<'a> Builder<'a> {
         kernels.step_by(self.n_kernels)
     }
 
-    /// Evaluates a sum of weights, `f`, on each zone's kernel of an own state, and scales it.
+    /// Evaluates `f`, a sum of weights, on each zone's kernel of an own state. Returns the scaled sums.
     fn by_zone(&self, own: usize, f: impl Fn(&Array4<f64>) -> f64) -> Vec<f64> {
         let scale = self.scales[own];
         self.zones(own).map(|kernel| scale * f(kernel)).collect()
     }
 
-    /// Returns the slot with the given numbers, a new one if there is none.
+    /// Returns the slot with the given numbers. Adds a slot if there is none.
     fn slot(&mut self, by_zone: &[f64]) -> usize {
         let by_zone: Vec<f32> = by_zone.iter().map(|number| *number as f32).collect();
         let known = self.slots.iter().position(|known| *known == by_zone);
@@ -151,7 +152,7 @@ impl<'a> Builder<'a> {
         })
     }
 
-    /// The weight of a next state for a neighbour's state, by zone.
+    /// Returns the weight of a next state for a neighbour's state, by zone.
     fn weight(&self, own: usize, next: usize, state: usize, [row, col]: [usize; 2]) -> Vec<f64> {
         self.by_zone(own, |kernel| kernel[[next, state, row, col]])
     }
@@ -160,7 +161,7 @@ impl<'a> Builder<'a> {
         self.weight(own, next, state, tap).iter().any(|w| *w > 0.0)
     }
 
-    /// The weight of a next state without neighbours, by zone.
+    /// Returns the weight of a next state without neighbours, by zone.
     fn bias(&self, own: usize, next: usize) -> Vec<f64> {
         let [row, col] = self.centre;
         let bias = self.weights.bias[next];
@@ -168,7 +169,7 @@ impl<'a> Builder<'a> {
         self.by_zone(own, |kernel| bias + centre * kernel[[next, own, row, col]])
     }
 
-    /// The total `d` of a neighbour's weights in one of its states, by zone.
+    /// Returns the total `d` of a neighbour's weights in one of its states, by zone.
     fn total(&self, own: usize, state: usize, [row, col]: [usize; 2]) -> Vec<f64> {
         self.by_zone(own, |kernel| {
             let weights = (0..self.n_states).map(|m| kernel[[m, state, row, col]]);

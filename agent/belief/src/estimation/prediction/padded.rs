@@ -6,7 +6,7 @@ use crate::estimation::belief::Belief;
 use emberwatch_model::Shape;
 use emberwatch_model::vectors::vectorised;
 
-/// Maximum factor by which a correction multiplies a probability, so that sums of products stay finite.
+/// Maximum factor by which a correction multiplies a probability. It keeps sums of products finite.
 const MAX_FACTOR: f32 = 1e30;
 
 /// Beliefs about one grid: a cavity per neighbour, if there are cavities, then the belief itself.
@@ -50,7 +50,7 @@ impl PaddedBeliefs {
         }
     }
 
-    /// Returns where a cavity's first plane starts. The number `n_cavities` stands for the belief itself.
+    /// Returns the start of a cavity's first plane. The number `n_cavities` stands for the belief itself.
     #[inline(always)]
     pub fn start(&self, cavity: usize) -> usize {
         cavity * self.n_states * self.planes.length

@@ -18,7 +18,7 @@ fn shape(height: usize, width: usize) -> Shape {
     Shape::new(height, width).expect("test shape")
 }
 
-/// A number below 1.
+/// Returns a pseudo-random number in `0..1`.
 fn random(seed: u64, at: usize) -> f64 {
     (split_mix(seed, at as u64) >> 11) as f64 / (1_u64 << 53) as f64
 }
@@ -37,7 +37,7 @@ fn predict(prediction: &mut Prediction, belief: &mut Belief) {
     prediction.predict(&before, belief.as_mut_slice());
 }
 
-/// The largest difference of two beliefs.
+/// Returns the largest difference between two beliefs.
 fn off(got: &Probabilities, expected: &Probabilities) -> f32 {
     let differences = (got - expected).mapv(f32::abs);
     differences.fold(0.0, |worst, d| d.max(worst))
@@ -67,7 +67,7 @@ fn the_mean_field_is_the_transition() {
     }
 }
 
-/// A belief with a frame of cells around it that are certainly in state 1.
+/// Surrounds a belief with a border of cells that are certainly in state 1.
 fn framed(inner: &Belief) -> Belief {
     let (height, width) = inner.shape().dim();
     let mut framed = Array3::zeros((inner.n_states(), height + 2, width + 2));
@@ -121,7 +121,7 @@ fn weights_of_any_size_predict_alike() {
     }
 }
 
-/// The weights of a grid without zones or an edge state.
+/// Returns weights for a grid without zones or an edge state.
 fn weights<'a>(kernels: &'a [Array4<f64>], bias: &'a [f64]) -> Weights<'a> {
     Weights {
         kernels,
@@ -131,7 +131,8 @@ fn weights<'a>(kernels: &'a [Array4<f64>], bias: &'a [f64]) -> Weights<'a> {
     }
 }
 
-/// A fire: a cell with `f` burning neighbours of four ignites with probability `f / (a f + b)`, and burns out with 0.1.
+/// Returns the kernels of a fire. A cell with `f` burning neighbours of four ignites with probability `f / (a f + b)`,
+/// and a burning cell burns out with probability 0.1.
 fn fire() -> Vec<Array4<f64>> {
     let (a, b) = (0.7, 1.8);
     let mut kernels = vec![Array4::zeros((3, 3, 3, 3)); 3];
@@ -141,7 +142,7 @@ fn fire() -> Vec<Array4<f64>> {
             kernels[0][[0, n, row, col]] = 1.0 - a;
         }
     }
-    // The centre makes up for the weights of neighbours that do not burn.
+    // The centre compensates for the weights of neighbours that do not burn.
     kernels[0][[0, 0, 1, 1]] = b - 4.0 * (1.0 - a);
     for (m, p) in [(1, 0.9), (2, 0.1)] {
         kernels[1][[m, 1, 1, 1]] = p;
@@ -150,7 +151,7 @@ fn fire() -> Vec<Array4<f64>> {
     kernels
 }
 
-/// Kernels like the paper's, which do not depend on the own state.
+/// Returns a kernel like the paper's, which does not depend on the own state.
 fn paper() -> Vec<Array4<f64>> {
     let mut kernel = Array4::zeros((3, 3, 3, 3));
     for (m, n, weight) in [
@@ -168,7 +169,7 @@ fn paper() -> Vec<Array4<f64>> {
 
 #[test]
 fn each_kind_is_closer_to_the_exact_filter_than_the_one_before() {
-    // Bounds: a tenth above measured values. Without own kernels there are no cavities.
+    // Bounds are a tenth above the measured values. Without own-state kernels there are no cavities.
     for (kernels, bias, dim, one_in, n_worlds, bounds) in [
         (fire(), [0.0; 3], (2, 3), 0, 1, [0.134, 0.098, 0.076]),
         (fire(), [0.0; 3], (2, 3), 5, 40, [0.170, 0.128, 0.082]),
@@ -193,7 +194,7 @@ const BIAS: [f64; 3] = [0.01, 0.001, 0.001];
 
 #[test]
 fn cavities_stay_distributions_where_several_own_states_act() {
-    // Own-state kernels like learned ones: neighbours influence each own state, and state 1 most.
+    // Own-state kernels like learned kernels: neighbours influence every own state, and state 1 the most.
     let kernel = |own: usize| {
         Array4::from_shape_fn((3, 3, 3, 3), |(m, n, row, col)| {
             let scale = if own == 1 { 1.0 } else { 0.05 };
@@ -243,7 +244,7 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
 
 #[test]
 fn unseen_cells_stay_distributions_for_ever() {
-    // The rounded probabilities of its fixed transitions do not sum to 1.
+    // The rounded probabilities of this model's fixed transitions do not sum to 1.
     let model = Model::built_in("wildfire-burnout").expect("built in");
     let mut belief = belief(model.n_states(), shape(3, 5));
     let mut prediction = Prediction::new((&model).into(), PredictionKind::Cavities, &belief);
@@ -267,7 +268,7 @@ fn only_bytes_of_cavities_are_restored() {
     let (mut first, mut second) = (new(PredictionKind::Cavities), new(PredictionKind::Cavities));
     predict(&mut first, &mut first_belief);
     let (bytes, unchanged) = (first.to_bytes(), second.beliefs.probabilities.clone());
-    // Eight neighbours.
+    // Eight cavities per cell, each with three `f32`.
     assert_eq!(bytes.len(), 4 * 8 * 3 * 3 * 35);
     let with = |number: usize, p: f32| {
         let mut bytes = bytes.clone();

@@ -1,10 +1,11 @@
-//! Vectors of an independent implementation (numpy, 64 bits), which spreads with a given table:
+//! Tests of the spatial filter. The test vectors come from an independent implementation (NumPy, 64-bit) with a given
+//! table of correlations:
 //!
 //! ```python
 //! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors[2::3])  # 32 bits
 //! ```
 //!
-//! Cells are in order of their first visit, -1 where a path visits fewer.
+//! Cells are listed in order of first visit, and padded with -1 where a path visits fewer.
 
 use super::*;
 use crate::estimation::correlations::N_AGES;
@@ -17,7 +18,7 @@ use std::fs::File;
 
 const FIRE: usize = 2;
 
-/// The wildfire model with a changed file.
+/// Returns the wildfire model with a change to its file.
 fn wildfire(change: impl FnOnce(&mut ModelFile)) -> Model {
     let mut file = Model::wildfire().file().clone();
     change(&mut file);
@@ -42,7 +43,7 @@ fn corrections_are_those_of_an_independent_implementation() {
         let prior = Belief::from_probabilities(first).expect("a belief");
         let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
         let mut filter = SpatialFilter::new(filter, FIRE, Correlations::of_table(&table));
-        // The first prediction was made already.
+        // The vectors start after the first prediction.
         filter.ages.grow();
         for (step, (cells, seen)) in cells.outer_iter().zip(observed.outer_iter()).enumerate() {
             let seen = cells.iter().zip(seen).filter(|(cell, _)| **cell >= 0);
@@ -63,7 +64,7 @@ fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
     let model = wildfire(|file| file.states[0].observed_as = vec![1.0, 0.0, 0.0]);
     let states = ndarray::arr2(&[[2, 2], [0, 2]]);
     let prior = Belief::from_states(&states, 3).expect("states");
-    // Cell 0 could be corrected, cell 2 is certainly normal and never looks like fire.
+    // Cell 0 could be corrected. Cell 2 is certainly normal, and this model never shows a normal cell as fire.
     let frame = Frame::from_bytes(shape(2, 2), 3, &[2, 255, 2, 2]).expect("a frame");
     let filter = BayesFilter::known(&model, prior).expect("valid");
     for neighbours in [None, Some((FIRE, Correlations::default()))] {
@@ -89,7 +90,7 @@ fn a_tiny_probability_is_evidence_with_neighbours_too() {
     assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
 }
 
-/// A model of three or four states, any of which can pay.
+/// Returns a model of three or four states, in which any state can be the paying one.
 fn model(paying: usize) -> Model {
     let (name, paying) = match paying.checked_sub(3) {
         Some(paying) => ("road-ice", paying),

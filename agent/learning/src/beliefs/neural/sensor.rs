@@ -8,8 +8,8 @@ const MIN_PROBABILITY: f64 = 1e-6;
 
 /// Replaces each cell's distribution over observations, `[O, H, W]`, by its distribution over states.
 ///
-/// `inverse` is the inverse of `P(y | x)`. A network's prediction may correspond to no distribution over states. So
-/// negative values are raised to a small minimum, and all are normalised.
+/// `inverse` is the inverse of `P(y | x)`. A network's prediction may not correspond to any distribution over states.
+/// Therefore, negative values are raised to a small minimum, and the result is normalised.
 pub fn states_from_observations(probabilities: &mut Probabilities, inverse: &Array2<f64>) {
     let (n, height, width) = probabilities.dim();
     let mut states = vec![0.0; n];

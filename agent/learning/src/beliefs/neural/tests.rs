@@ -29,7 +29,7 @@ fn visited_cells_are_certain_until_the_next_step() {
     check(&estimator, 1, [0.0, 0.0, 1.0]);
     check(&estimator, 0, [1.0 / 3.0; 3]);
     estimator.predict();
-    // Nothing is learned.
+    // An untrained network predicts uniform distributions.
     check(&estimator, 1, [1.0 / 3.0; 3]);
 }
 
@@ -73,7 +73,7 @@ fn many_of_several_networks_predict_together_as_each_alone() {
     });
     let estimators = || -> Vec<Box<dyn Estimator>> {
         let mut all = vec![filter()];
-        // Networks in turn, with a filter below and without.
+        // The networks alternate, with and without a corrected filter.
         for index in 0..8 {
             let below = (index % 4 > 1).then(filter);
             let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());

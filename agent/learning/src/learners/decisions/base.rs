@@ -1,4 +1,4 @@
-//! What keeps the beliefs that decisions are made on.
+//! The source of the beliefs that decisions are based on.
 
 use crate::beliefs::first_belief::first_belief;
 use crate::beliefs::{self, BeliefKind, Conditions};
@@ -9,40 +9,40 @@ use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
 
-/// The belief that decisions are made on, by the setting `decisions.estimator`.
+/// Finds the belief that decisions are based on, by the setting `decisions.estimator`.
 ///
 /// # Errors
-/// Names them all.
+/// If there is no such belief. The error lists all valid names.
 pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
     let kind = beliefs::of_options(name);
     kind.map_err(|problem| anyhow::anyhow!("decisions.estimator: {problem}"))
 }
 
-/// As [`belief_of`], by the name in a checkpoint: earlier releases named filters by what their kernels see, too.
+/// Finds a belief by its name in a checkpoint. Earlier releases had other names for filters with own-state kernels.
 ///
 /// # Errors
-/// As [`belief_of`].
+/// Like [`belief_of`].
 pub fn belief_of_saved(name: &str) -> Result<&'static BeliefKind> {
     belief_of(&name.replace("learned_own_", "learned_"))
 }
 
-/// A kind of belief with all that it is built from, before a world's first frame.
+/// A kind of belief with everything needed to build it.
 pub struct Base {
     pub kind: &'static BeliefKind,
     shape: Shape,
-    /// Of kinds that know the model: that, and the first belief.
+    /// The model and the first belief, for kinds that know the model.
     known: Option<(Model, Belief)>,
     pub(super) learned: Learned,
-    /// The state that pays most.
+    /// The state with the highest reward.
     pub(super) target: usize,
     pub(super) state_names: Vec<String>,
 }
 
 impl Base {
-    /// `known`: the model and the first belief, for kinds that know the model.
+    /// Creates the base of a belief. `known` is the model and the first belief, for kinds that know the model.
     ///
     /// # Errors
-    /// If what the kind acts on is missing.
+    /// If the model or the learned value that the kind uses is missing.
     pub fn new(
         kind: &'static BeliefKind,
         known: Option<(Model, Belief)>,
@@ -62,7 +62,7 @@ impl Base {
         Ok(base)
     }
 
-    /// What the settings ask for: what was learned, or the filter of the server's model.
+    /// Creates the base for `decisions.estimator`: a learned belief, or a filter with the server's model.
     pub(super) fn of_settings(on: &Beginning<'_>) -> Result<Self> {
         let (config, shape) = (on.config, on.worlds.shape());
         let kind = belief_of(&config.decisions.estimator)?;
@@ -70,7 +70,7 @@ impl Base {
         if kind.knows_model {
             let model = on.info.model.as_deref().with_context(|| {
                 format!(
-                    "decisions on the belief {} need the server's model: start it with --reveal-model true, not with \
+                    "decisions on the belief {} need the server's model: start it with --reveal-model true and without \
                      --states",
                     kind.name
                 )

@@ -1,7 +1,7 @@
-//! A robot that flies options: its agent, and what the last option led to.
+//! A robot that flies options: its agent, and its unfinished transitions.
 
 use super::saved::{Held, SavedRun};
-use crate::learners::left::Left;
+use crate::learners::resume_point::ResumePoint;
 use crate::rollout::Rollout;
 use anyhow::Result;
 use emberwatch_belief::planning::Proposal;
@@ -10,16 +10,16 @@ use emberwatch_network::{Dqn, Track, Transition};
 
 pub(super) struct Run {
     pub(super) rollout: Rollout,
-    /// The features of the option flown last and its reward, until what follows is known.
+    /// Features and reward of the last option, until the next features complete the transition.
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
     pub(super) held: Held,
-    /// What is flown next.
+    /// The option that is flown next, with its plan.
     pub(super) next: Option<(usize, Proposal)>,
 }
 
 impl Run {
-    /// Where an agent has taken in what its world shows.
+    /// Creates a run. The agent has been corrected by the first observation.
     pub(super) fn begun(rollout: Rollout, dqn: &Dqn) -> Self {
         Self {
             rollout,
@@ -35,7 +35,7 @@ impl Run {
         self.rollout.agent.propose(cell)
     }
 
-    /// The path of the option that was chosen.
+    /// Returns the path of the chosen option.
     pub(super) fn take_up(&mut self) -> Vec<Move> {
         let next = self.next.take();
         let (option, proposal) = next.expect("invariant: an option was chosen");
@@ -43,7 +43,7 @@ impl Run {
         self.rollout.agent.take_up(option, proposal).moves
     }
 
-    /// Adds the step that led to these features of all options; returns the transition that it completes.
+    /// Adds the step that led to the given features of all options. Returns the transition that it completes, if any.
     pub(super) fn led_to(&mut self, features: &[f32], dqn: &Dqn) -> Option<Transition> {
         let (input, reward) = self.last.take()?;
         let is_terminated = self.rollout.observation().world.terminated != 0;
@@ -56,7 +56,7 @@ impl Run {
         })
     }
 
-    /// Ends the episode; returns the transitions of its last steps, up to the options of its last state.
+    /// Ends the episode. Returns the transitions of its last steps, which lead to the options of the last state.
     pub(super) fn end(&mut self, dqn: &Dqn) -> Vec<Transition> {
         let features = features(&self.propose());
         let full = self.led_to(&features, dqn);
@@ -65,7 +65,7 @@ impl Run {
 
     pub(super) fn saved(&self) -> SavedRun {
         SavedRun {
-            left: Left::of(&self.rollout),
+            resume_point: ResumePoint::of(&self.rollout),
             memory: self.rollout.agent.memory.clone(),
             last: self.last.clone(),
             track: self.track.clone(),
@@ -73,9 +73,9 @@ impl Run {
         }
     }
 
-    /// Goes on from where a checkpoint left it, with an agent that has not yet taken in what its world shows.
+    /// Restores a run from a checkpoint. The agent has not been corrected yet.
     pub(super) fn restore(saved: SavedRun, mut rollout: Rollout, dqn: &Dqn) -> Result<Self> {
-        saved.left.restore(&mut rollout.agent)?;
+        saved.resume_point.restore(&mut rollout.agent)?;
         rollout.agent.memory = saved.memory;
         Ok(Self {
             rollout,
@@ -87,7 +87,7 @@ impl Run {
     }
 }
 
-/// The features of all options, one after the other.
+/// Concatenates the features of all options.
 pub(super) fn features(proposals: &[Proposal]) -> Vec<f32> {
     proposals.iter().flat_map(|it| it.features).collect()
 }

@@ -1,4 +1,4 @@
-//! Decisions in a checkpoint: the DQN, the belief that they were learned on, and where the robots are.
+//! Checkpoints of decisions: the DQN, the belief that it was trained on, and the state of the robots.
 
 use super::base::{Base, belief_of_saved};
 use crate::beliefs::learned::{LearnedModel, SavedModel};
@@ -6,7 +6,7 @@ use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
 use crate::beliefs::{BeliefKind, NEURAL};
 use crate::checkpoint::{Contents, check, check_counts, check_numbers};
 use crate::learned::Learned;
-use crate::learners::left::Left;
+use crate::learners::resume_point::ResumePoint;
 use crate::policy::LearnedDecisions;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::planning::options::N_FEATURES;
@@ -17,32 +17,32 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What a decision is made on, and among.
+/// The shape of the DQN: features per option, and number of options.
 pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
-/// More updates than a step of all worlds earns.
-const MOST_EARNED: f64 = 2e6;
+/// Upper limit of due updates, above the number that a step of all worlds can add.
+const MAX_EARNED: f64 = 2e6;
 
-/// Longest time for which an option is held, steps.
+/// Maximum number of steps for which an option is held.
 const LONGEST_HOLD: u64 = 1000;
 
-const NOTHING: &str = "decisions: expected a checkpoint of a belief, got none";
+const NOTHING: &str = "decisions: expected a checkpoint of a learned belief, got none";
 
-/// Before the names of the belief's tensors.
+/// Prefix of the names of the belief's tensors.
 pub(super) const BELIEF: &str = "belief.";
 
-/// A random option that is flown for some steps in a row.
+/// A random option that is flown for several steps in a row, and the remaining steps.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Held {
     pub(super) option: usize,
     pub(super) n_steps: u64,
 }
 
-/// All of a checkpoint of decisions but the tensors.
+/// A checkpoint of decisions, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDecisions {
     pub options: Vec<String>,
-    /// The label of the belief that they are made on.
+    /// The label of the belief that the decisions are based on.
     pub estimator: String,
     pub(super) belief: Option<SavedBelief>,
     pub world_steps: u64,
@@ -51,17 +51,17 @@ pub struct SavedDecisions {
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
-/// Where a world was left.
+/// The saved state of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedRun {
-    pub(super) left: Left,
+    pub(super) resume_point: ResumePoint,
     pub(super) memory: Memory,
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
     pub(super) held: Held,
 }
 
-/// A belief that was learned, without its tensors.
+/// A learned belief, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum SavedBelief {
     Filter(Box<SavedModel>),
@@ -69,7 +69,7 @@ pub(super) enum SavedBelief {
 }
 
 impl SavedBelief {
-    /// What was learned for a kind of belief, and its tensors; `None` if nothing was.
+    /// Returns the learned model of a kind of belief, and its tensors. `None` if the kind needs no learned model.
     pub(super) fn of(
         kind: &BeliefKind,
         learned: &Learned,
@@ -83,7 +83,7 @@ impl SavedBelief {
         } else {
             ensure!(
                 by.learner == "filter",
-                "decisions: expected the belief of a filter or a neural one, got {}",
+                "decisions: expected a filter or a neural belief, got {}",
                 kind.name
             );
             let model = learned.get::<LearnedModel>().context(NOTHING)?;
@@ -97,8 +97,8 @@ impl SavedBelief {
     }
 }
 
-/// What policies act on: the decisions, and the belief that was learned for them, if it was. A network computes on
-/// `device`. Returns whether there were others before.
+/// Loads the values for policies: the decisions, and their belief if it was learned. Networks compute on `device`.
+/// Returns whether it replaced different decisions.
 pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) -> Result<bool> {
     let config = contents.settings()?;
     let saved: SavedDecisions = contents.state()?;
@@ -112,18 +112,18 @@ pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) 
     };
     ensure!(
         !saved.read_belief(contents, device, learned)?,
-        "expected one belief of a kind, got two: that of the decisions, and another"
+        "expected one belief of each kind, got two: the belief of the decisions, and another"
     );
     Ok(learned.put(decisions))
 }
 
 impl SavedDecisions {
-    /// The belief that they are made on.
+    /// Returns the kind of belief that the decisions are based on.
     pub fn kind(&self) -> Result<&'static BeliefKind> {
         belief_of_saved(&self.estimator)
     }
 
-    /// What the decisions are made on, if that was learned; a network computes on `device`.
+    /// Returns the belief that the decisions are based on, if it was learned. Networks compute on `device`.
     pub fn base(&self, contents: &Contents, shape: Shape, device: &Device) -> Result<Option<Base>> {
         let (kind, mut learned) = (self.kind()?, Learned::default());
         self.read_belief(contents, device, &mut learned)?;
@@ -132,7 +132,7 @@ impl SavedDecisions {
         base.transpose()
     }
 
-    /// The belief that was learned, if it was; a network computes on `device`. Returns whether there was another before.
+    /// Loads the learned belief, if any. Networks compute on `device`. Returns whether it replaced a different one.
     pub(super) fn read_belief(
         &self,
         contents: &Contents,
@@ -162,8 +162,8 @@ impl SavedDecisions {
             ("dqn.n_updates", self.dqn.n_updates),
             ("world_steps", self.world_steps),
         ])?;
-        let fits = (0.0..MOST_EARNED).contains(&self.earned);
-        check(fits, "earned", format!("0 to {MOST_EARNED}"), self.earned)?;
+        let fits = (0.0..MAX_EARNED).contains(&self.earned);
+        check(fits, "earned", format!("0 to {MAX_EARNED}"), self.earned)?;
         contents.check_squares()?;
         dqn.load(|name, shape| contents.tensor(name, shape), &self.dqn)
     }
@@ -171,8 +171,8 @@ impl SavedDecisions {
 
 impl SavedRun {
     pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
-        self.left.check(n_states, shape)?;
-        let expected = format!("that of a {shape} grid");
+        self.resume_point.check(n_states, shape)?;
+        let expected = format!("a memory of a {shape} grid");
         check(
             self.memory.is_of(shape),
             "worlds.memory",
@@ -251,7 +251,7 @@ mod tests {
         let dqn = Dqn::new(AgentConfig::default().decisions.settings(), SHAPE, 3);
         let held = |option, n_steps| {
             let run = SavedRun {
-                left: Left::blank(&observation),
+                resume_point: ResumePoint::blank(&observation),
                 memory: Memory::new(shape),
                 last: None,
                 track: dqn.track(),

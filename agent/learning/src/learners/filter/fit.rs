@@ -1,4 +1,4 @@
-//! What learns a model while an agent acts: replay in, parameters out. Pure.
+//! The fit of a filter's parameters to the frames of acting robots. Pure.
 
 mod neighbours;
 
@@ -18,27 +18,27 @@ use emberwatch_model::{Frame, Shape};
 use emberwatch_network::NamedTensor;
 use serde::{Deserialize, Serialize};
 
-/// Names of tensors end so: parameters, means and means of squares.
+/// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
-/// More updates than a step of all worlds earns.
+/// Upper limit of due updates, above the number that a step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
-/// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
+/// Learns from frames as they arrive. A checkpoint stores this value, and the tensors separately.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FilterFit {
     pub optimiser: Optimiser,
     pub reward: RewardEstimate,
-    /// World steps seen, of all worlds together.
+    /// Number of world steps, for all worlds together.
     pub world_steps: u64,
-    /// Updates that steps have earned and that are not made yet.
+    /// Updates that are due but not made yet.
     pub earned: f64,
     replay: BlockReplay,
     neighbours: Neighbours,
 }
 
 impl FilterFit {
-    /// Before the first frame.
+    /// Creates a fit before the first frame.
     pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
         let parameters = Parameters::first(dimensions, config.seed);
         Self {
@@ -51,7 +51,7 @@ impl FilterFit {
         }
     }
 
-    /// A robot's track begins, for the first time or again.
+    /// Begins a new track of a robot.
     pub fn begin(&mut self, robot: u32) {
         self.replay.begin(robot);
         self.neighbours
@@ -62,7 +62,7 @@ impl FilterFit {
         self.replay.has_track(robot)
     }
 
-    /// A robot's next frame, the belief before it unless it is the first, and what was known then.
+    /// Adds a robot's next frame. `predictor` is the belief before it (not for the first), `learned` the present model.
     pub fn see(
         &mut self,
         robot: u32,
@@ -75,7 +75,7 @@ impl FilterFit {
         self.neighbours.see(robot, frame, predictor, tables, target);
     }
 
-    /// Notes the reward of a path on which these cells paid; the belief is that after its frame.
+    /// Records the reward of a path. `posterior` is the belief after its frame, and `paying` has the rewarded cells.
     pub fn earn(&mut self, posterior: &Belief, paying: &[usize], reward: f64) {
         let met = met(posterior, paying.iter().copied());
         self.reward.add(&met, reward);
@@ -83,10 +83,10 @@ impl FilterFit {
         self.earned += self.optimiser.config().updates_per_step;
     }
 
-    /// Makes the updates that the steps since the last call have earned.
+    /// Makes the updates that are due after the steps since the last call.
     ///
     /// # Errors
-    /// For numbers that are not finite; the parameters are those before.
+    /// If a number is not finite. The parameters then remain those of the last successful update.
     pub fn learn(&mut self) -> Result<Vec<Update>> {
         let mut updates = Vec::new();
         let target = self.reward.target();
@@ -97,7 +97,7 @@ impl FilterFit {
         Ok(updates)
     }
 
-    /// Forgets all frames, and every robot's track; what was learned from them stays.
+    /// Drops all frames and tracks. The learned parameters remain.
     pub fn forget(&mut self) {
         self.replay = replay(self.optimiser.config());
         self.optimiser.leave_replay();
@@ -113,7 +113,7 @@ impl FilterFit {
         LearnedModel::new(parameters.clone(), target, correlations)
     }
 
-    /// Why a run of that many steps made no update, and what to do.
+    /// Explains why a run with this number of steps made no update, and what to do.
     pub fn lacks(&self, steps: u64) -> String {
         let config = self.optimiser.config();
         let (expected, got) = (config.streams, self.replay.n_blocks());
@@ -134,7 +134,7 @@ impl FilterFit {
         self.optimiser.adam.n_steps
     }
 
-    /// Parameters and moments by name.
+    /// Returns the parameters and moments as named tensors.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         let adam = &self.optimiser.adam;
         let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
@@ -144,10 +144,10 @@ impl FilterFit {
             .collect()
     }
 
-    /// Loads its tensors from a checkpoint with these dimensions, see [`dimensions_of`].
+    /// Loads the tensors from a checkpoint with the given dimensions, see [`dimensions_of`].
     ///
     /// # Errors
-    /// Names what is missing or of another form.
+    /// If a tensor is missing or has another form. The error names it.
     pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
         let counts = [
             ("n_updates", self.n_updates()),
@@ -163,11 +163,11 @@ impl FilterFit {
         self.reward.check(dimensions.n_states)
     }
 
-    /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
-    /// than the settings say.
+    /// Resumes from a checkpoint. The replay buffer is empty if the checkpoint has another grid or other windows than
+    /// the settings.
     ///
     /// # Errors
-    /// Names what is missing or of another form.
+    /// If a value is missing or does not fit. The error names it.
     pub fn resume(
         mut saved: Self,
         contents: &Contents,
@@ -190,7 +190,7 @@ impl FilterFit {
             let replay = &mut fit.replay;
             replay.resume(saved.replay, shape, n_states, n_observations)?;
             let n_cells = shape.n_cells();
-            let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+            let (name, expected) = ("neighbours.ages", format!("ages of {n_cells} cells"));
             check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
         } else {
             saved.neighbours.forget_robots();
@@ -342,14 +342,14 @@ mod tests {
         );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
-            "initial.first_moment: expected shape [3], got none",
+            "initial.first_moment: expected a tensor [3], got none",
         );
         forged(
             |contents, _| {
                 let tensor = contents.tensors.get_mut("kernel.second_moment");
                 tensor.expect("a moment").numbers[2] = -0.5;
             },
-            "kernel.second_moment: expected numbers from 0 on, got -0.5",
+            "kernel.second_moment: expected no negative numbers, got -0.5",
         );
         let words = "earned: expected 0 to 2000000, got 1";
         forged(|_, saved| saved.earned = 1e300, words);

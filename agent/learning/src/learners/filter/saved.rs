@@ -1,4 +1,4 @@
-//! A learned filter in a checkpoint: the learner, and where its robots are.
+//! Checkpoints of learned filters: the learner, and the state of its robots.
 
 use crate::checkpoint::check_belief;
 use crate::learners::base::{Place, place};
@@ -13,15 +13,15 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// All of a learned filter's checkpoint but the tensors.
+/// A checkpoint of a learned filter, without its tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedFilter {
     pub fit: FilterFit,
     pub worlds: BTreeMap<u32, SavedRobot>,
 }
 
-/// Where a checkpoint left a robot: what it showed, the belief about what comes next, and the estimate
-/// behind it, where paths are planned on that.
+/// The saved state of a robot: its last observation, the belief about the next step, and the estimate if paths are
+/// planned on it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedRobot {
     place: Place,
@@ -41,13 +41,13 @@ impl SavedRobot {
         }
     }
 
-    /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
-    /// and noise of sensors would all have to be the same.
+    /// Whether a world's observation equals the saved one. The world may belong to another server, if its seeds, step,
+    /// flights and sensor noise are the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    /// Whether the world of any of these robots shows what it showed then.
+    /// Whether any robot's observation equals its saved one.
     pub fn any_is_of(
         all: &BTreeMap<u32, Self>,
         robots: Range<u32>,
@@ -59,7 +59,7 @@ impl SavedRobot {
         })
     }
 
-    /// Gives an agent the belief, and the estimate if its paths are planned on that.
+    /// Restores an agent's belief, and its estimate if paths are planned on it.
     pub fn restore(&self, agent: &mut Agent) {
         let filter = agent.estimator_mut().handover_mut();
         let is_taken = filter.is_some_and(|filter| filter.restore(&self.belief.to_bytes()));
@@ -67,7 +67,7 @@ impl SavedRobot {
         agent.remember_estimate(self.estimate.as_ref());
     }
 
-    /// Refuses beliefs of another grid or about other states.
+    /// Checks the grid and the number of states of the beliefs.
     pub fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         check_belief("worlds.belief", &self.belief, n_states, shape)?;
         self.estimate

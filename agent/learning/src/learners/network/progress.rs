@@ -1,4 +1,4 @@
-//! What Algorithm 1 has learned, and where it stands: as a checkpoint, and from one.
+//! The progress of Algorithm 1, which can be saved to a checkpoint and loaded again.
 
 use crate::beliefs::autoencoder::{AutoencoderModel, Follower};
 use crate::checkpoint::{Contents, check, check_belief, check_counts, check_numbers, wrong};
@@ -17,50 +17,50 @@ use emberwatch_network::{
 };
 use serde::{Deserialize, Serialize};
 
-/// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
+/// The learned networks and the state of learning. Estimators hold copies of the autoencoder.
 #[derive(Debug)]
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
-    /// What the paths are planned on that the DQN values.
+    /// The belief that paths are planned on while the DQN learns.
     pub basis: BasisKind,
-    /// The frames that are learned from.
+    /// The frames for training.
     pub replay: FrameReplay,
     pub position: Position,
 }
 
-/// Where Algorithm 1 stands in its world.
+/// The state of Algorithm 1 in its world.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Position {
     pub follower: Follower,
-    /// The estimate where paths are planned on it, as a checkpoint left it.
+    /// The saved estimate, if paths are planned on it.
     pub estimate: Option<Belief>,
-    /// The world's latest steps, for the DQN's replay.
+    /// The latest steps, for the DQN's replay buffer.
     pub track: Track,
     pub reward: RewardEstimate,
     pub iterations: u64,
-    /// Where the world is that the hidden vector knows, if any.
+    /// The place of the last frame that the hidden vector depends on, if any.
     pub place: Option<Place>,
 }
 
-/// All of a checkpoint of Algorithm 1 but the tensors.
+/// A checkpoint of Algorithm 1, without its tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedNetwork {
     pub shape: Shape,
-    /// Number of values that an observed cell may show.
+    /// Number of observation values.
     pub n_observations: usize,
-    /// Steps of the autoencoder's Adam, and its updates.
+    /// Number of the autoencoder's Adam steps and of its updates.
     pub counters: [u64; 2],
     pub dqn: SavedDqn,
-    /// The replay, the oldest frame first.
+    /// The frames of the replay buffer, oldest first.
     pub frames: Vec<Vec<u8>>,
-    /// The places of frames with which tracks begin.
+    /// Indices of the frames with which tracks begin.
     pub tracks: Vec<u64>,
     pub position: Position,
 }
 
 impl Progress {
-    /// Before the first frame; the autoencoder computes on `device`.
+    /// Creates the progress before the first frame. The autoencoder computes on `device`.
     pub fn first(
         worlds: &Worlds,
         config: &AgentConfig,
@@ -89,13 +89,13 @@ impl Progress {
         })
     }
 
-    /// The state that pays most, as far as rewards tell by now.
+    /// Returns the state with the highest estimated reward, or the last state before any reward.
     pub fn target(&self) -> usize {
         let reward = &self.position.reward;
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// As a checkpoint, without the settings: an agent stands in its world.
+    /// Returns the contents of a checkpoint without its settings. `rollout` has the present follower and place.
     pub fn to_contents(&self, rollout: &Rollout) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
@@ -118,7 +118,7 @@ impl Progress {
         Ok(Contents::new(tensors, &state))
     }
 
-    /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
+    /// Loads a checkpoint with the settings stored in it. The autoencoder computes on `device`.
     pub fn read(contents: &Contents, device: &Device) -> Result<Self> {
         let config = contents.settings()?;
         let saved: SavedNetwork = contents.state()?;
@@ -141,7 +141,7 @@ impl Progress {
         Ok(progress)
     }
 
-    /// What policies act on.
+    /// Extracts the model that policies use.
     pub fn into_model(self) -> AutoencoderModel {
         AutoencoderModel {
             target: self.target(),
@@ -151,7 +151,7 @@ impl Progress {
         }
     }
 
-    /// Takes over a checkpoint of the same sizes.
+    /// Loads a checkpoint with the same sizes.
     pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedNetwork = contents.state()?;
         let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
@@ -198,7 +198,7 @@ impl Progress {
     }
 }
 
-/// What the network of an agent knows of its world, after a prediction.
+/// Returns the follower of an agent's network after a prediction.
 pub(super) fn follower(rollout: &Rollout) -> Follower {
     let (agent, hidden) = (&rollout.agent, rollout.agent.estimator().hidden());
     let hidden = hidden.expect("invariant: its estimator is an autoencoder");
@@ -219,13 +219,13 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
     }
 }
 
-/// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
+/// Checks that the file is large enough for the sizes in it. Otherwise, a small file could request all memory.
 fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
     let expected = shape.n_numbers();
     let tensors = contents.tensors.values();
     let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
     let words = format!(
-        "the {expected} numbers or more of a network on a {} grid",
+        "at least {expected} numbers for a network on a {} grid",
         shape.grid
     );
     check(got >= expected, "tensors", words, got)

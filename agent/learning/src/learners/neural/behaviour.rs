@@ -1,4 +1,4 @@
-//! How a robot flies for some steps while a belief is learned: what is worth seeing to it.
+//! Behaviours of robots while a belief is learned. A behaviour assigns values to cells, and lasts for several steps.
 
 use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::planning::{CellValues, Objective};
@@ -8,13 +8,13 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 
-/// Chance of another behaviour at a step: one in so many.
+/// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
 
-/// Steps in which a seen cell becomes as good as new to a robot that covers the grid, and in which it forgets what it saw.
+/// Time constants in steps: of the value of revisiting a cell with `Cover`, and of the value of a sighting with `Last`.
 const FADING_STEPS: [f32; 2] = [300.0, 100.0];
 
-/// What a robot flies for, and where it flies if that is far.
+/// An aim, and the goal cell of the aim `Far`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Behaviour {
     aim: Aim,
@@ -25,17 +25,17 @@ pub struct Behaviour {
 enum Aim {
     /// Random moves.
     Walk,
-    /// What was not seen for long.
+    /// Cells that were not seen for long.
     Cover,
-    /// A cell.
+    /// The goal cell.
     Far,
-    /// Where what pays was seen last.
+    /// The latest sightings of the observation with the highest reward.
     Last,
-    /// What is believed to pay, and so many tenths of the belief's entropy.
+    /// The policy's objective on the belief, plus `entropy` tenths of the belief's entropy.
     Exploit { entropy: u8 },
 }
 
-/// Aims with their chances in per cent: while exploring, and later.
+/// Aims with their probabilities in per cent, while exploring and later.
 const AIMS: [(Aim, [u64; 2]); 8] = [
     (Aim::Walk, [20, 4]),
     (Aim::Cover, [30, 8]),
@@ -48,7 +48,7 @@ const AIMS: [(Aim, [u64; 2]); 8] = [
 ];
 
 impl Behaviour {
-    /// The one before, or another one.
+    /// Returns the previous behaviour, or a random one with probability 1 / `STEPS` or if there is none.
     pub fn next(
         before: Option<Self>,
         is_exploring: bool,
@@ -71,8 +71,8 @@ impl Behaviour {
         Self { aim, goal }
     }
 
-    /// What each cell is worth in an airspace; `None` for random moves. `target`: the value that pays most; `seen`: what was
-    /// seen by now.
+    /// Returns the value of each cell in an airspace. `None` means random moves. `target` is the observation with the
+    /// highest reward, and `seen` returns all previous sightings.
     pub fn values(
         &self,
         objective: Objective,
@@ -103,7 +103,7 @@ impl Behaviour {
         }
     }
 
-    /// Without a belief.
+    /// Computes the values of aims that ignore the belief.
     fn value(&self, seen: &Sightings, target: usize, rng: &mut ChaCha8Rng) -> Grid<f32> {
         let shape = seen.shape();
         let (height, width) = shape.dim();
@@ -130,7 +130,7 @@ impl Behaviour {
         Grid::from_shape_vec(shape.dim(), values).expect("invariant: one value per cell")
     }
 
-    /// In a word, for observers.
+    /// Returns a short description for observers.
     pub fn label(&self) -> &'static str {
         match self.aim {
             Aim::Walk => "random moves",
@@ -142,7 +142,7 @@ impl Behaviour {
         }
     }
 
-    /// Whether its goal lies on a grid.
+    /// Whether the goal cell is on a grid.
     pub fn is_of(&self, shape: Shape) -> bool {
         self.goal < shape.n_cells()
     }
@@ -173,10 +173,10 @@ mod tests {
             counts[aim.expect("an aim")] += 1;
             behaviour = Some(next);
         }
-        // A thousand draws, some the same as before: 8 in 100 keep aim and goal.
+        // There are 1,000 draws, of which 8 % repeat the previous aim and goal.
         assert!((850..1050).contains(&n_changes), "{n_changes}");
         for (count, (aim, chances)) in counts.iter().zip(AIMS) {
-            // Shares of 1,000 draws: three standard deviations are .045 at most, lengths vary too.
+            // Three standard deviations of a share of 1,000 draws are at most .045. Durations vary as well.
             let off = f64::from(*count) / 20_000.0 - chances[1] as f64 / 100.0;
             assert!(off.abs() < 0.08, "{aim:?} {off}");
         }
@@ -208,7 +208,7 @@ mod tests {
             let got = values(Aim::Exploit { entropy }, &open).value()[[0, 0]];
             assert!((got - expected).abs() < 1e-6, "{entropy}: {got}");
         }
-        // With a wider sensor, covering and entropy are of what is seen.
+        // With a wider sensor, coverage and entropy count for all cells in sight.
         let model = Model::wildfire().with_radius(1).expect("a radius");
         let wide = model.airspace(shape()).expect("an airspace");
         for (aim, in_sight) in [

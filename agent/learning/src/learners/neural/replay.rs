@@ -1,7 +1,7 @@
-//! Recent frames of several robots, with what each had seen before.
+//! A replay buffer for the neural belief: recent frames of several robots, each with all earlier sightings.
 //!
-//! A *block* is what one robot saw in some steps in a row. It keeps what had been seen before its first frame, so that all
-//! that was known before any of its frames is found by going through those before it.
+//! A *block* contains consecutive frames of one robot. It stores the sightings before its first frame. The sightings
+//! before a later frame are computed from these and the frames in between.
 
 use crate::checkpoint::{check, check_numbers};
 use anyhow::Result;
@@ -15,11 +15,11 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
 
-/// Frames of a block, at most.
+/// Maximum number of frames per block.
 const BLOCK_FRAMES: usize = 256;
 
-/// A frame: the cells that it shows, by row-major index, with their values, and what the filter that the network corrects
-/// predicted of each, if there is one, `[cells, O]`.
+/// A frame: its observed cells (row-major index and value), and the corrected filter's predictions for these cells,
+/// `[cells, O]`, if there is a filter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct SeenFrame {
     cells: Vec<(usize, u8)>,
@@ -37,12 +37,12 @@ pub struct LessonReplay {
     max_frames: usize,
     /// Blocks that are full or whose track has ended, oldest first.
     full: VecDeque<Block>,
-    /// The block of each robot's frames.
+    /// The block that receives each robot's frames.
     open: BTreeMap<u32, Block>,
 }
 
 impl LessonReplay {
-    /// Keeps `max_frames` frames beside those of the last blocks.
+    /// Creates a buffer for `max_frames` frames, not counting the open blocks.
     pub fn new(max_frames: usize) -> Self {
         Self {
             max_frames,
@@ -51,7 +51,7 @@ impl LessonReplay {
         }
     }
 
-    /// Begins a new track of a robot, on a world of which nothing was seen.
+    /// Begins a new track of a robot, without sightings.
     pub fn begin(&mut self, robot: u32, shape: Shape) {
         self.open(robot, Sightings::new(shape));
     }
@@ -67,7 +67,7 @@ impl LessonReplay {
         }
     }
 
-    /// Ends the tracks of all robots but these.
+    /// Ends the tracks of all robots except the given ones.
     pub fn end_others(&mut self, robots: &Range<u32>) {
         let open = std::mem::take(&mut self.open);
         let (own, ended): (_, BTreeMap<_, _>) = open
@@ -77,10 +77,10 @@ impl LessonReplay {
         self.full.extend(ended.into_values());
     }
 
-    /// Adds the next frame of a robot. `base`: what the filter that the network corrects predicted, `[O, H, W]`.
+    /// Adds a robot's next frame. `base` has the observations that the corrected filter predicted, `[O, H, W]`.
     ///
     /// # Panics
-    /// If its track was not begun.
+    /// If the robot has no track.
     pub fn push(&mut self, robot: u32, frame: &Frame, base: Option<&Probabilities>) {
         let block = self.open.get_mut(&robot).expect("a track that was begun");
         let shape = block.before.shape();
@@ -99,16 +99,16 @@ impl LessonReplay {
         }
     }
 
-    /// All that a robot has seen by now.
+    /// Returns a robot's sightings until now.
     ///
     /// # Panics
-    /// If its track was not begun.
+    /// If the robot has no track.
     pub fn present(&self, robot: u32) -> Sightings {
         let block = &self.open[&robot];
         block.before_frame(block.frames.len())
     }
 
-    /// Frames drawn from all alike, but those that show nothing; fewer than `n` where there are such.
+    /// Draws `n` frames uniformly. Frames without observed cells are skipped, so that the result may be shorter.
     pub fn lessons(&self, n: usize, rng: &mut ChaCha8Rng) -> Vec<Lesson> {
         let blocks = || self.full.iter().chain(self.open.values());
         let n_frames: usize = blocks().map(|block| block.frames.len()).sum();
@@ -132,18 +132,18 @@ impl LessonReplay {
         (0..n).filter_map(|_| lesson()).collect()
     }
 
-    /// Forgets all frames.
+    /// Drops all frames and tracks.
     pub fn forget(&mut self) {
         *self = Self::new(self.max_frames);
     }
 
-    /// Goes on from another replay, with room of its own.
+    /// Loads the contents of another buffer. The capacity remains.
     pub fn resume(&mut self, other: Self) {
         (self.full, self.open) = (other.full, other.open);
     }
 
-    /// Refuses one that is not of a grid and of so many observations, or lacks a robot. `has_base`: whether a filter's
-    /// predictions belong to the frames.
+    /// Checks a buffer from a checkpoint: its grid, its observations, and that each robot has a track. `has_base` is
+    /// whether each frame needs a filter's predictions.
     pub fn check(
         &self,
         shape: Shape,
@@ -157,7 +157,7 @@ impl LessonReplay {
         );
         for block in self.full.iter().chain(self.open.values()) {
             let fits = block.before.are_of(shape, n_observations);
-            check(fits, name, &expected, "others")?;
+            check(fits, name, &expected, "other sightings")?;
             for seen in &block.frames {
                 for &(cell, value) in &seen.cells {
                     let fits = cell < shape.n_cells() && usize::from(value) < n_observations;
@@ -172,13 +172,13 @@ impl LessonReplay {
             }
         }
         let lacking = robots.find(|robot| !self.open.contains_key(robot));
-        let got = lacking.map_or(String::new(), |robot| format!("none of robot {robot}"));
-        check(lacking.is_none(), name, "a track of each robot", got)
+        let got = lacking.map_or(String::new(), |robot| format!("none for robot {robot}"));
+        check(lacking.is_none(), name, "a track for each robot", got)
     }
 }
 
 impl Block {
-    /// What had been seen before one of its frames.
+    /// Returns the sightings before one of the block's frames.
     fn before_frame(&self, at: usize) -> Sightings {
         let mut sightings = self.before.clone();
         for frame in &self.frames[..at] {
@@ -200,7 +200,7 @@ mod tests {
         Shape::new(2, 2).expect("test shape")
     }
 
-    /// Robots 3 and 4 see the steps' numbers, in cells of their own.
+    /// Robots 3 and 4 observe the step number, each in a different cell.
     fn replay(n_steps: usize, max_frames: usize) -> LessonReplay {
         let mut replay = LessonReplay::new(max_frames);
         (3..5).for_each(|robot| replay.begin(robot, shape()));
@@ -251,7 +251,7 @@ mod tests {
             (
                 100,
                 [4, 5],
-                "replay: expected a track of each robot, got none of robot 5",
+                "replay: expected a track for each robot, got none for robot 5",
             ),
         ] {
             let error = check(n_observations, robots).expect_err(words);

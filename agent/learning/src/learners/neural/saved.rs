@@ -1,11 +1,11 @@
-//! A neural belief in a checkpoint: what policies act on, and what learning goes on from.
+//! Checkpoints of neural beliefs: the model for policies, and the state from which learning resumes.
 
 use super::behaviour::Behaviour;
 use super::replay::LessonReplay;
 use crate::beliefs::learned::{LearnedModel, SavedModel};
 use crate::beliefs::neural::{NeuralModel, new_network, read_corrected};
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::learners::left::Left;
+use crate::learners::resume_point::ResumePoint;
 use crate::reward::RewardEstimate;
 use anyhow::Result;
 use emberwatch_model::Shape;
@@ -14,17 +14,17 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-/// More updates than a step of all worlds earns.
-const MOST_EARNED: f64 = 2e6;
+/// Upper limit of due updates, above the number that a step of all worlds can add.
+const MAX_EARNED: f64 = 2e6;
 
-/// All of a checkpoint of a neural belief but the tensors.
+/// A checkpoint of a neural belief, without its tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedNeural<'a> {
     pub shape: Shape,
-    /// Number of values that an observed cell may show.
+    /// Number of observation values.
     pub n_observations: usize,
     pub n_updates: u64,
-    /// World steps seen, of all worlds together.
+    /// Number of world steps, for all worlds together.
     pub world_steps: u64,
     pub(super) earned: f64,
     pub(super) filter: Option<SavedModel>,
@@ -33,14 +33,14 @@ pub struct SavedNeural<'a> {
     pub(super) worlds: BTreeMap<u32, SavedRun>,
 }
 
-/// Where a robot was left.
+/// The saved state of a robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedRun {
-    pub(super) left: Left,
+    pub(super) resume_point: ResumePoint,
     pub(super) behaviour: Option<Behaviour>,
 }
 
-/// What policies act on; the network computes on `device`.
+/// Loads the model for policies. The network computes on `device`.
 pub(super) fn read(contents: &Contents, device: &Device) -> Result<NeuralModel> {
     let saved: SavedNeural = contents.state()?;
     let mut network = new_network(saved.n_observations, device)?;
@@ -54,14 +54,14 @@ pub(super) fn read(contents: &Contents, device: &Device) -> Result<NeuralModel> 
 }
 
 impl SavedNeural<'_> {
-    /// The filter that it corrects.
+    /// Loads the filter whose prediction the network corrects, if any.
     pub(super) fn filter(&self, contents: &Contents) -> Result<Option<Box<LearnedModel>>> {
         let filter = self.filter.as_ref();
         let filter = filter.map(|it| read_corrected(it, self.n_observations, &contents.part("")));
         Ok(filter.transpose()?.map(Box::new))
     }
 
-    /// Loads the network; refuses what does not fit.
+    /// Loads the network, and checks the counts and the reward estimate.
     pub(super) fn load_into(&self, network: &mut NeuralBelief, contents: &Contents) -> Result<()> {
         check_counts(&[
             ("n_updates", self.n_updates),
@@ -73,22 +73,20 @@ impl SavedNeural<'_> {
         self.reward.check(self.n_observations)
     }
 
-    /// Refuses worlds and frames that do not fit.
+    /// Checks that the saved runs and frames fit the grid and the observations.
     pub(super) fn check_worlds(&self) -> Result<()> {
-        let fits = (0.0..MOST_EARNED).contains(&self.earned);
-        check(fits, "earned", format!("0 to {MOST_EARNED}"), self.earned)?;
+        let fits = (0.0..MAX_EARNED).contains(&self.earned);
+        check(fits, "earned", format!("0 to {MAX_EARNED}"), self.earned)?;
         let (shape, n) = (self.shape, self.n_observations);
         let robots = self.worlds.keys().copied();
         self.replay.check(shape, n, self.filter.is_some(), robots)?;
-        self.worlds.values().try_for_each(|left| {
-            left.left.check(n, shape)?;
-            let fits = left
-                .behaviour
-                .is_none_or(|behaviour| behaviour.is_of(shape));
+        self.worlds.values().try_for_each(|run| {
+            run.resume_point.check(n, shape)?;
+            let fits = run.behaviour.is_none_or(|behaviour| behaviour.is_of(shape));
             check(
                 fits,
                 "worlds.behaviour",
-                format!("a cell of {shape}"),
+                format!("a goal on a {shape} grid"),
                 "another",
             )
         })

@@ -1,4 +1,4 @@
-//! Which belief an agent plans on, and what its decisions go by.
+//! The belief that an agent plans on, and the inputs of its decisions.
 
 use super::*;
 use crate::beliefs::autoencoder::AutoencoderEstimator;
@@ -22,7 +22,7 @@ fn shape() -> Shape {
     worlds().shape()
 }
 
-/// Hidden states, and what some cells show of them.
+/// Hidden states, and a frame with the states of some cells.
 fn world(step: u64) -> (Grid<u8>, Frame) {
     let states = Grid::from_shape_fn(shape().dim(), |(row, col)| {
         (split_mix(step / 3, (row / 3 * 3 + col / 3) as u64) % 3) as u8
@@ -36,7 +36,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
     (states, frame)
 }
 
-/// A network that never learned, with the first seed whose DQN suits.
+/// An untrained network with the first DQN, by seed, that satisfies a condition.
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
     let mut config = config(basis);
     config.seed = 1;
@@ -59,8 +59,8 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
     super::agent(&policy, config, &conditions, worlds().n_moves, 7)
 }
 
-/// Whether all plans of some steps are those on an estimate, a predictor: `on` plans with another agent of the policy
-/// whose belief is given.
+/// Returns whether the plans of some steps equal the plans on the estimate, and whether they equal the plans on the
+/// predictor.
 fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
     let mut agent = agent(policy, config, learned).expect("an agent");
     let mut all = [true; 2];
@@ -103,7 +103,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
             .map(|belief| plans(policy, &config(belief), &learned));
         assert_eq!(plans, [[true, false], [false, true]], "{policy}");
     }
-    // The state that the path will meet is no prediction.
+    // A clairvoyant always plans on the states that its path will meet.
     let clairvoyant = plans("clairvoyant_beam", &config(BasisKind::Estimate), &learned);
     assert_eq!(clairvoyant, [false, true]);
 }
@@ -133,7 +133,7 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         }
         let error = agent("known+spatial/options/learned", &other, &learned).err();
         let error = format!("{:#}", error.expect("decisions on another belief"));
-        let words = "on the belief known+spatial, got some on known";
+        let words = "on the belief known+spatial, got decisions on known";
         assert!(error.contains(words), "{error}");
     }
 }

@@ -116,7 +116,7 @@ class Transition:
 def entropy(belief: NDArray[np.floating]) -> NDArray[np.float64]:
     """Returns the Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; (H, W)."""
     total = np.zeros(belief.shape[1:])
-    # State by state: allocating temporary arrays for all states takes longer than the arithmetic.
+    # One state at a time: temporary arrays for all states at once would take longer to allocate.
     for probability in belief:
         total += probability * np.log(np.where(probability > 0.0, probability, 1.0))
     return np.maximum(0.0, 0.0 - total)

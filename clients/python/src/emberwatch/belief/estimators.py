@@ -1,4 +1,4 @@
-"""Every kind of belief that the Rust agent has, equal to the agent's in every bit.
+"""Every kind of belief that the Rust agent has, with bit-identical numbers.
 
 `known` makes a `Belief` from a model, `load` from a checkpoint.
 """
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
 from emberwatch.belief.prior import distribution
-from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer, told
+from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer, repr_of
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 from emberwatch.model import Model
@@ -49,9 +49,9 @@ def known(
             for worlds.
 
     Raises:
-        InvalidArgumentError: If the prior does not have the model's states or a cell of it is no
-            distribution; if the kind does not exist or was learned; or if all weights of the model
-            can be 0.
+        InvalidArgumentError: If the prior does not have the model's states, or is not a
+            distribution in some cell; if the kind does not exist or is a learned one; or if all
+            weights of the model can be 0.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     model = model if isinstance(model, Model) else Model.named(model)
@@ -72,7 +72,7 @@ def load(
 ) -> "Belief":
     """Loads a learned belief from a checkpoint of `emberwatch-agent train`.
 
-    A learner numbers its states itself: `Belief.state_names` are ``"state 0"`` and so on, and
+    A learner chooses the order of its states: `Belief.state_names` are ``"state 0"`` and so on, and
     `Belief.target_state` is the number of the state that pays most. A neural belief predicts
     observed values instead of states, so S = O. ``"neural+sensor"`` infers the states from them
     with the observation matrix of `model`.
@@ -85,7 +85,7 @@ def load(
         kind: A learned kind of `kinds`, such as ``"learned+spatial"``. None: the kind that the
             checkpoint was trained for.
         model: The model of the worlds, required by ``"neural+sensor"``. If given, the checkpoint
-            must have as many observed values and observation matrices.
+            must have the same number of observed values and observation matrices.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.
 
@@ -114,7 +114,7 @@ class Belief:
     - Frames have shape (H, W), beliefs (S, H, W). With `n_worlds`, frames have shape
       (n_worlds, H, W) and beliefs (S, n_worlds, H, W). Methods then accept `worlds`: a mask,
       indices, or a slice. None selects all worlds.
-    - Numbers are single precision, and equal the Rust agent's in every bit. Those of networks may
+    - Numbers are single precision, bit-identical to the Rust agent's. Outputs of networks may
       differ between processors.
     - Kinds with `+spatial` learn how cells vary together while they run, for each world
       separately, so that earlier frames improve later corrections. `reset` discards this, except
@@ -242,11 +242,11 @@ class Belief:
             if not index.size and not is_mask:
                 index = index.astype(np.intp)  # NumPy reads [] as float64
             if index.ndim > 1 or (is_mask and index.shape != chosen.shape):
-                raise invalid("worlds", expected, told(worlds))
+                raise invalid("worlds", expected, repr_of(worlds))
         try:
             chosen[index] = True
         except (IndexError, TypeError, ValueError):
-            raise invalid("worlds", expected, told(worlds)) from None
+            raise invalid("worlds", expected, repr_of(worlds)) from None
         return chosen
 
     def _of_worlds(self, values: NDArray[_Number]) -> NDArray[_Number]:
@@ -260,7 +260,7 @@ def target_of(belief: Belief, target: int | None) -> int:
     if number is not None and not isinstance(target, bool) and 0 <= number < len(names):
         return number
     expected = f"an integer within 0 to {len(names) - 1} ({', '.join(names)})"
-    raise invalid("target", expected, told(target))
+    raise invalid("target", expected, repr_of(target))
 
 
 def _n_worlds(n_worlds: int | None) -> int:

@@ -7,14 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import as_array, as_count, told
+from emberwatch.common.arguments import as_array, as_count, repr_of
 from emberwatch.errors import invalid
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
-"""A prior by name, see `wrappers.BeliefObservation`."""
+"""The name of a prior, see `wrappers.BeliefObservation`."""
 
-_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
+# Tolerance of the sum of a cell's probabilities: 400 float32 roundings, as in the Rust agent.
+_SUM_TOLERANCE = 5e-5
 
 
 def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
@@ -36,7 +37,7 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
     given = as_array(prior, "prior", expected)
     fits = given.ndim == 3 and given.shape[0] == n_states and given.size > 0
     if not fits or given.dtype.kind not in "fiu":
-        got = told(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
+        got = repr_of(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
         raise invalid("prior", expected, got)
     with np.errstate(all="ignore"):  # an overflow is refused below
         belief = np.array(given, np.float64, order="C")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.belief.estimators import Belief, target_of
-from emberwatch.common.arguments import as_array, told
+from emberwatch.common.arguments import as_array, repr_of
 from emberwatch.common.codes import UNOBSERVED
 from emberwatch.errors import invalid
 
@@ -57,12 +57,12 @@ def score(
     with this frame, scores the posterior against state k, and predicts step k + 1. The posterior is
     scored in all cells, observed or not.
 
-    A learned belief numbers its states itself. Its `log_loss` and `accuracy` are meaningful only if
-    these numbers agree with `states`. `brier` compares the probability of the belief's own target
-    state with the cells where `states` equals `target`.
+    A learner chooses the order of its states. The `log_loss` and `accuracy` of its belief are
+    meaningful only if this order agrees with `states`. `brier` compares the probability of the
+    belief's own target state with the cells where `states` equals `target`.
 
     Args:
-        belief: Made by `known` or `load`, for one world, or for as many as there are sequences.
+        belief: A belief of `known` or `load`, for one world, or for one world per sequence.
         observations: Frames, type uint8, shape (K, H, W) or (K, n_worlds, H, W), 255 in unobserved
             cells. K is at least 1.
         states: Hidden states of the same shape and type, below S.
@@ -72,15 +72,15 @@ def score(
 
     Raises:
         InvalidArgumentError: If an array does not have the belief's shape, type or values, or
-            `target` is no state. The belief does not change.
+            `target` is not a state. The belief does not change.
         EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the belief.
     """
     if not isinstance(cast("object", belief), Belief):
-        raise invalid("belief", "a Belief of `known` or `load`", told(belief))
+        raise invalid("belief", "a Belief of `known` or `load`", repr_of(belief))
     frames = _sequence(observations, "observations", belief, belief.n_observations)
     truths = _sequence(states, "states", belief, len(belief.state_names))
     if len(truths) != len(frames):
-        raise invalid("states", f"{len(frames)} steps, as observations", len(truths))
+        raise invalid("states", f"{len(frames)} steps, as in observations", len(truths))
     target = target_of(belief, target)
     belief.reset(keep_correlations=keep_correlations)
     rows = list[tuple[Any, ...]]()

@@ -1,9 +1,9 @@
-"""A policy in Python on the benchmark's worlds, for the table of `emberwatch-agent compare`.
+"""Evaluation of Python policies on the benchmark's worlds.
 
     rows = evaluate(policy, name="ppo", seeds=range(32), csv="ppo.csv", model="wildfire-small", ...)
 
-`emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, adds them to its table,
-paired by world.
+`emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, adds the rows to its
+table, paired by world.
 """
 
 from emberwatch._native import FIRST_TRAINING_SEED as FIRST_TRAINING_SEED

@@ -1,7 +1,7 @@
-"""Digests of policies: whether rows in a file are of the same policy, as far as can be seen.
+"""Digests of policies, which detect whether the rows in a file come from the same policy.
 
-Nothing is pickled, nothing is changed, and whatever cannot be read counts by its type's name alone.
-What a function reads from elsewhere, such as a file, cannot be seen.
+A digest pickles and changes nothing. Of a value that cannot be read, only the name of its type
+counts. Data that a function reads at run time, such as a file, is not part of the digest.
 """
 
 from __future__ import annotations
@@ -19,43 +19,44 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-#: Values within values, and in all, beyond which types' names alone count.
+#: Maximum depth of nested values, and number of values. Beyond these, only names of types count.
 _DEPTH: Final = 24
 _PARTS: Final = 50_000
 
 _SIMPLE: Final = (bool, int, float, complex, str, bytes, range, type(None), type(...), PurePath)
 _SEQUENCES: Final = (list, tuple)
 
-#: Methods that return all weights of a model: of Stable-Baselines3, PyTorch, Keras.
+#: Methods that return all weights of a model, in Stable-Baselines3, PyTorch and Keras.
 _WEIGHTS: Final = ("get_parameters", "state_dict", "get_weights")
 
-#: What a class has besides what its author wrote.
+#: Class attributes that Python adds to what the author wrote.
 _OF_CLASSES: Final = frozenset(
     ("__annotations__", "__dict__", "__doc__", "__firstlineno__", "__module__", "__qualname__")
     + ("__static_attributes__", "__weakref__", "_abc_impl")
 )
 
-#: Where libraries are.
+#: Folders of installed libraries.
 _STANDARD: Final = sysconfig.get_path("stdlib") + "/"
 _PACKAGES: Final = frozenset(("site-packages", "dist-packages"))
 
 
 def digest(value: object) -> str:
-    """Returns 16 hexadecimal digits that differ where two values can be seen to differ.
+    """Returns 16 hexadecimal digits that differ if two values differ visibly.
 
-    Of a model they cover its weights, of a function its code, defaults, closure and the globals
-    that it names, of another object its attributes: numbers, strings, arrays and what has these.
+    The digest of a model covers its weights. The digest of a function covers its code, defaults,
+    closure, and the globals that it names. The digest of another object covers its attributes:
+    numbers, strings, arrays and objects that contain these.
     """
     return _Walk().of(value, 0).hex()[:16]
 
 
 class _Walk:
-    """One walk over a value and what it refers to."""
+    """A walk over a value and the values that it refers to."""
 
     def __init__(self) -> None:
-        #: Digests of the objects met so far; of those still open, how deep they are.
+        #: Digests of the visited objects by `id`; for objects in progress, a digest of their depth.
         self._known: dict[int, bytes] = {}
-        #: Keeps objects, so that no two have one identity.
+        #: Keeps the visited objects alive, so that no `id` is reused.
         self._met: list[object] = []
 
     def of(self, value: object, depth: int) -> bytes:
@@ -70,7 +71,7 @@ class _Walk:
         if depth < _DEPTH and len(self._met) < _PARTS:
             try:
                 found = self._look(value, depth + 1)
-            except Exception:  # of any kind: it is whatever the object's own code raises
+            except Exception:  # any type, as the object's own code may raise anything
                 pass
         self._known[id(value)] = found
         return found
@@ -108,7 +109,7 @@ class _Walk:
             return self._all("partial", (given.func, given.args, given.keywords), depth)
         if isinstance(value, type):
             return self._all(_name(value), (_of_class(value), value.__bases__), depth)
-        # What a decorator has made, such as one that compiles or caches.
+        # The result of a decorator, for example one that compiles or caches.
         wrapped = getattr(value, "__wrapped__", None)
         return self._all("object", (kind, wrapped, _of_object(value)), depth)
 
@@ -124,7 +125,7 @@ class _Walk:
 
 
 def _array(value: Any) -> NDArray[Any] | None:
-    """Returns the array that a value of any library is; None: it is none."""
+    """Converts an array of any library to a NumPy array; None if the value is not an array."""
     kind = cast("type[Any]", type(value))
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(cast("Any", value))
@@ -138,7 +139,7 @@ def _array(value: Any) -> NDArray[Any] | None:
 
 
 def _of_function(function: FunctionType) -> Iterable[object]:
-    """What a function does and reads."""
+    """Yields the parts of a function that its result depends on."""
     yield function.__defaults__
     yield function.__kwdefaults__
     for cell in function.__closure__ or ():
@@ -155,18 +156,18 @@ def _of_function(function: FunctionType) -> Iterable[object]:
 def _cell(cell: Any) -> object:
     try:
         return cell.cell_contents
-    except ValueError:  # nothing is assigned yet
+    except ValueError:  # the variable is not assigned yet
         return None
 
 
 def _names(code: CodeType) -> set[str]:
-    """Returns the names that some code and the functions in it look up."""
+    """Returns the names that code and its nested functions look up."""
     inner = (_names(each) for each in code.co_consts if isinstance(each, CodeType))
     return set(code.co_names).union(*inner)
 
 
 def _of_class(kind: type) -> dict[str, object]:
-    """What the author of a class wrote; of an installed one its name says enough."""
+    """Returns the attributes that the author of a class wrote; none for an installed class."""
     if _is_installed(kind.__module__):
         return {}
     written = {name: part for name, part in vars(kind).items() if name not in _OF_CLASSES}
@@ -181,23 +182,23 @@ def _plain(part: Any) -> object:
 
 
 def _of_object(value: Any) -> object:
-    """What makes one object different from another of its type."""
+    """Returns the state that distinguishes an object from others of its type."""
     kind = cast("type[Any]", type(value))
     for method in _WEIGHTS:
         if callable(getattr(kind, method, None)):
             return _weights(method, getattr(value, method)()), _settings(value)
-    # Not what a method of its own returns: it may do anything.
+    # A `__getstate__` of the class itself is not called, as it may have side effects.
     default: Callable[[Any], object] = object.__getstate__
     is_plain = kind.__getstate__ is default
     state: object = default(value) if is_plain else getattr(value, "__dict__", None)
     if not _is_installed(kind.__module__):
         return state
-    # Objects of libraries refer to much that is none of the policy's, such as loggers to others.
+    # Objects of libraries also refer to things that are not part of the policy, such as loggers.
     return {name: part for name, part in _attributes(state) if _is_data(part)}
 
 
 def _weights(method: str, weights: object) -> object:
-    """The weights without an optimizer's state, which no action depends on."""
+    """Returns the weights without an optimizer's state, which actions do not depend on."""
     if method != "get_parameters" or not isinstance(weights, Mapping):
         return weights
     given = cast("Mapping[object, object]", weights)
@@ -205,7 +206,7 @@ def _weights(method: str, weights: object) -> object:
 
 
 def _settings(model: Any) -> object:
-    """What the actions of a model depend on besides its weights."""
+    """Returns the settings of a model that its actions depend on, besides its weights."""
     modules: Any = getattr(model, "modules", None)
     parts = cast("Iterable[object]", modules() if callable(modules) else ())
     rate = getattr(model, "exploration_rate", None)
@@ -213,7 +214,7 @@ def _settings(model: Any) -> object:
 
 
 def _numbers(module: object) -> dict[str, object]:
-    """The settings of one module of PyTorch; predictions themselves switch `training`."""
+    """Returns the settings of a PyTorch module, except `training`, which predictions change."""
     return {
         name: value
         for name, value in vars(module).items()
@@ -222,7 +223,7 @@ def _numbers(module: object) -> dict[str, object]:
 
 
 def _attributes(state: object) -> Iterable[tuple[str, object]]:
-    """The attributes in a state of `object.__getstate__`: of the dictionary and of slots."""
+    """Yields the attributes in a state of `object.__getstate__`, from `__dict__` and slots."""
     parts = cast("tuple[object, ...]", state) if isinstance(state, tuple) else (state,)
     for part in parts:
         if isinstance(part, dict):
@@ -235,7 +236,7 @@ def _is_data(value: object) -> bool:
 
 
 def _is_installed(module: object) -> bool:
-    """Whether code is of a library or of this package: then its name stands for it."""
+    """Returns whether a module is in a library or this package, whose names identify the code."""
     root = str(module).partition(".")[0]
     file = getattr(sys.modules.get(str(module)), "__file__", None)
     if not isinstance(file, str):
@@ -249,7 +250,7 @@ def _name(value: Any) -> str:
 
 
 def _sha(*parts: str | bytes | memoryview) -> bytes:
-    """The hash of some parts, each with its length."""
+    """Returns the hash of some parts, each preceded by its length."""
     whole = hashlib.sha256()
     for part in parts:
         bytes_ = part.encode("utf-8", "surrogatepass") if isinstance(part, str) else part

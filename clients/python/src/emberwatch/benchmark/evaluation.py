@@ -1,4 +1,4 @@
-"""Policies in Python on the benchmark's worlds."""
+"""Evaluation of Python policies on the benchmark's worlds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from emberwatch.benchmark.tally import Tally
 from emberwatch.client import wire
 from emberwatch.client.client import Client
 from emberwatch.client.replies import ServerInfo
-from emberwatch.common.arguments import as_integer, as_seed, told
+from emberwatch.common.arguments import as_integer, as_seed, repr_of
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
 from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid
@@ -40,12 +40,12 @@ from emberwatch.model.tasks import Task, built_in_tasks
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
 
-#: Of `emberwatch-agent compare`.
+#: Defaults of `emberwatch-agent compare`.
 _BURN_IN: Final = 25_000
 _SEEDS: Final = range(8)
 _STEPS: Final = 1500
 
-#: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
+#: Default timeout, seconds. Longer than a learner's, as a busy machine may delay hidden states.
 _TIMEOUT: Final = 30.0
 
 #: Keywords of the environment that an evaluation sets itself.
@@ -69,46 +69,47 @@ def evaluate(
     progress: TextIO | None = sys.stderr,
     **keywords: Any,
 ) -> list[Row]:
-    """Scores a policy; defaults are those of `emberwatch-agent compare`.
+    """Scores a policy on several worlds. Defaults are those of `emberwatch-agent compare`.
 
     Args:
-        policy: A function from the stacked observations of some worlds to their actions, or a model
-            of Stable-Baselines3 or another object with its `predict`. Models with a memory get
-            their state back; `episode_start` is true in the first step of a world only. A function
-            or `predict` with a parameter `action_masks` gets the masks of the worlds,
-            `(n_worlds, 4)` booleans. Observations are normalized for a model that was trained
-            behind `VecNormalize` and still has it (`get_vec_normalize_env`). If the policy has a
-            method `begin(n_worlds)`, that is called whenever other worlds begin.
-        name: What the table calls it.
-        seeds: The worlds; None: those to test the task on, or 0 to 7. Those below 1000 are test
-            worlds.
-        steps: Scored steps, thus paths, of each world; None: those of the task, or 1,500.
-        burn_in: Steps before the first scored one; None: 25,000, or as the task or the running
-            server has it. Recorded worlds have none.
-        env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
-        estimator: What the table says of its belief; None: `known_model` where `observation` has
-            a belief, else `none`.
-        deterministic: Passed on to `predict`.
-        batch: Worlds at a time, in the order of the seeds.
-        recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
-            Those that need the hidden states are None with `truth=False`, and where a running
-            server does not publish them, or hides its model or the description of recorded
-            worlds.
-        wrap: Wraps the worlds, a `VecEnv` of Stable-Baselines3, as the training of the policy did:
-            `lambda worlds: VecFrameStack(worlds, 4)`, or for a saved model
-            `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`, of which the statistics
-            stay as they are.
-        csv: A file to write rows to; several processes may. Rows of this policy that it has
-            already are kept, and not run again, if the worlds, the settings and, as far as can be
-            seen, the policy are the same: the weights of a model, the code and the values that
-            functions refer to. Otherwise they are run again and replaced. Rows of other policies
+        policy: A function that maps stacked observations of several worlds to their actions, or a
+            model of Stable-Baselines3 or another object with the same `predict`. Recurrent models
+            get their state back, and `episode_start` is true in the first step of each world. A
+            function or `predict` with a parameter `action_masks` gets the masks of the worlds,
+            `(n_worlds, 4)` booleans. If a model was trained behind `VecNormalize` and still has it
+            (`get_vec_normalize_env`), its observations are normalized. If the policy has a method
+            `begin(n_worlds)`, it is called before each batch of worlds.
+        name: The policy's name in the table.
+        seeds: The seeds of the worlds; None: the test seeds of the task, or 0 to 7. Seeds below
+            1000 are test worlds.
+        steps: Number of scored steps, each a path, in each world; None: the task's, or 1,500.
+        burn_in: Number of steps before the first scored one; None: the value of the task or the
+            running server, or 25,000. Recorded worlds have no burn-in.
+        env: The environment: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
+        estimator: The name of the policy's belief in the table; None: `known_model` if
+            `observation` has a belief, otherwise `none`.
+        deterministic: Argument of `predict`.
+        batch: Number of worlds at a time, in the order of the seeds.
+        recent_steps: Number of steps for which a cell counts as seen after a visit, in the figures
+            of merit. Figures that need the hidden states are None with `truth=False`, or if a
+            running server does not publish the states, or hides its model or the description of
+            recorded worlds.
+        wrap: A function that wraps the worlds, a `VecEnv` of Stable-Baselines3, as in the policy's
+            training: `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
+            observations: `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`. The
+            evaluation does not change the statistics.
+        csv: A file to write rows to. Several processes may write to it. Rows of this policy in the
+            file are reused instead of run again if worlds, settings and policy are the same. Of
+            the policy, this compares the weights of a model, or the code and the values that
+            functions refer to. Rows that differ are run again and replaced. Rows of other policies
             are kept. A file with rows of other worlds is refused.
-        progress: Where to write how far it is, and which rows are kept; None: nowhere.
-        keywords: Of the environment: `task`, `model`, `height`, `n_moves`, `observation`, ...
-            With `robots` the policy acts for all robots of each world: rows are robots.
+        progress: The stream for progress and for notes on reused rows; None: none.
+        keywords: Keywords of the environment, such as `task`, `model`, `height`, `n_moves` and
+            `observation`. With `robots`, the policy acts for all robots of each world, and rows of
+            its observations and actions are robots.
 
     Returns:
-        A row for each seed, in order.
+        One row for each seed, in order.
     """
     task = None if keywords.get("task") is None else Task.named(keywords["task"])
     seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
@@ -120,7 +121,7 @@ def evaluate(
     keywords["burn_in"] = burn_in
     keywords.setdefault("timeout", _TIMEOUT)
     served = _served(keywords.get("instance"))
-    # Worlds of this process can reveal hidden states.
+    # Worlds in this process can always reveal their hidden states.
     if keywords.setdefault("truth", served is None or served.publish_truth):
         batch = min(batch, wire.TRUTH_BUFFER)
     parts = set(names_of(keywords.get("observation")))
@@ -128,7 +129,7 @@ def evaluate(
         estimator = "known_model" if OF_BELIEF & parts else "none"
     robots = task.robots if task else keywords.get("robots") or 1
     if served is not None and served.n_robots != robots:
-        raise invalid("robots", f"{served.n_robots}, as the server's worlds have", robots)
+        raise invalid("robots", f"the server's {served.n_robots}", robots)
     setting = _Setting(env, keywords, robots, wrap)
     normalizers = _check_policy(setting, actor)
     fingerprint = _policy_fingerprint(setting, policy, estimator, deterministic, normalizers)
@@ -165,29 +166,31 @@ def suite(
     """Scores a policy on the test worlds of tasks, for `emberwatch-agent suite --out FOLDER`.
 
     Args:
-        policy: As of `evaluate`, for all tasks; or a mapping from the name of each task to one.
-        name: What tables call it.
-        folder: Where rows are kept, a CSV file a task. Rows of this policy that are there are kept
-            and not run again, as by `evaluate`; rows of worlds that the task has no longer are run
-            again. Such rows of other policies stay there and do not count; a warning names them.
-        tasks: Names of tasks or task files; None: all that have names, or those of the mapping.
-        worlds: Worlds of each task, the first of its test seeds; None: all of them.
-        keywords: As of `evaluate`, but for `task`, `seeds`, `steps` and `csv`.
+        policy: A policy of `evaluate` for all tasks, or a mapping from the name of each task to its
+            policy.
+        name: The policy's name in tables.
+        folder: The folder of the rows, with a CSV file for each task. Rows of this policy are
+            reused as in `evaluate`. If the worlds of a task have changed, this policy's rows of
+            the old worlds are replaced. Rows of other policies on the old worlds stay in the file,
+            but do not count; a warning names them.
+        tasks: Names of tasks or task files; None: all built-in tasks, or the tasks of the mapping.
+        worlds: Number of worlds of each task, from its first test seed on; None: all of them.
+        keywords: Keywords of `evaluate`, except `task`, `seeds`, `steps` and `csv`.
 
     Returns:
-        A row for each world, by the name of its task.
+        The rows of each task, one for each world, by the task's name.
     """
     for keyword in ("task", "seeds", "steps", "csv"):
         if keyword in keywords:
             raise InvalidArgumentError(f"{keyword}: expected to be left out, as suite sets it")
     if worlds is not None and (as_integer(worlds) or 0) < 1:
-        raise invalid("worlds", "at least 1", told(worlds))
+        raise invalid("worlds", "at least 1", repr_of(worlds))
     by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
     sources = list(tasks or by_task or built_in_tasks())
     chosen = [(source, Task.named(source)) for source in sources]
     names = [task.name for _, task in chosen]
     if len(set(names)) < len(names):
-        raise invalid("tasks", "tasks of different names", ", ".join(names))
+        raise invalid("tasks", "tasks with different names", ", ".join(names))
     for task_name in names:
         if by_task is not None and task_name not in by_task:
             raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
@@ -206,18 +209,18 @@ def suite(
 
 @dataclass(frozen=True, slots=True)
 class _Setting:
-    """The worlds that a policy acts in, and what is around them."""
+    """The worlds that a policy acts in, and their wrappers."""
 
     env: str
     keywords: dict[str, Any]
     n_robots: int
     wrap: Callable[[Any], Any] | None
-    #: Identifies the worlds; None: not known before they are there.
+    #: Identifies the worlds; None: unknown, as rows are not written to a file.
     fingerprint: str | None = None
 
     @contextmanager
     def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
-        """The worlds as they are, and as the policy sees them."""
+        """Makes the worlds; yields the plain worlds, and the wrapped ones that the policy sees."""
         worlds = _make(self.env, self.keywords, self.n_robots, n_worlds)
         worlds.unwrapped.allow_test_worlds()
         try:
@@ -241,7 +244,7 @@ def _wrapped(worlds: Any, wrap: Callable[[Any], Any]) -> Any:
 
 
 def _served(instance: str | None) -> ServerInfo | None:
-    """What a running server says of itself."""
+    """Returns the description of a running server."""
     if instance is None:
         return None
     with Client(instance) as client:
@@ -249,38 +252,40 @@ def _served(instance: str | None) -> ServerInfo | None:
 
 
 def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
-    """Refuses worlds that a policy cannot act in; starts no server.
+    """Refuses worlds that a policy cannot act in, without a reset.
 
     Returns:
-        The statistics with which observations are normalized.
+        The statistics of the normalizations of observations.
     """
     with setting.made(1) as (worlds, shown):
         normalizers = actor.normalizers if setting.wrap is None else shown.normalizers
         if actor.normalizers and not normalizers:
             raise InvalidArgumentError(
-                "wrap: expected VecNormalize in it, as the policy was trained behind one, got none"
+                "wrap: expected a VecNormalize among the wrappers, as the policy was trained "
+                "behind one, got none"
             )
         actor.check(worlds, shown.single_observation_space)
         return [statistics(normalizer) for normalizer in normalizers]
 
 
 def _policy_fingerprint(setting: _Setting, *acts_on: object) -> str:
-    """Identifies all that the actions depend on besides the worlds."""
+    """Returns a hash of everything that the actions depend on, except the worlds."""
     keywords = setting.keywords
     others = {it: keywords[it] for it in keywords if it not in WorldArguments.__annotations__}
-    # The model of the belief, where a running server hides its own.
+    # With a server that hides its model, `model` is the model of the belief.
     model = keywords.get("model") if keywords.get("instance") is not None else None
     known = None if model is None else Model.named(model).toml
     return digest((VERSION, setting.env, others, known, setting.wrap, acts_on))
 
 
 def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:
-    """Identifies the worlds, whatever their seed; none is simulated for it."""
+    """Returns the fingerprint of the worlds, which does not depend on seeds; simulates nothing."""
     if served is None:
         world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
         return _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
     if served.worlds_fingerprint is None:
-        raise invalid("instance", "a server of this release, for csv", f"one of {served.build}")
+        got = f"release {served.build}"
+        raise invalid("instance", f"a server of release {VERSION} for csv", got)
     return served.worlds_fingerprint
 
 
@@ -291,7 +296,7 @@ def _kept(
     chosen: Sequence[int],
     report: Progress,
 ) -> dict[int, Row]:
-    """The rows of a file that need not be made again, by seed."""
+    """Returns the rows of a file that can be reused, by seed."""
     mark = Mark(
         setting.fingerprint or "",
         common["policy_fingerprint"],
@@ -302,8 +307,9 @@ def _kept(
     found = file.find(kind, mark)
     if found.elsewhere:
         warnings.warn(
-            f"{file.path} has rows of {', '.join(found.elsewhere)} on other worlds, or of an older "
-            "release, which does not say on which: they stay there, and do not count",
+            f"{file.path} has rows of {', '.join(found.elsewhere)} on other worlds, or from an "
+            "older release, which did not identify the worlds: they stay in the file, but do not "
+            "count",
             stacklevel=4,
         )
     kept = {seed: row for seed, row in found.kept.items() if seed in chosen}
@@ -322,7 +328,7 @@ def _score(
     report: Progress,
     file: RowFile | None = None,
 ) -> list[Row]:
-    """Scores a policy on the worlds of these seeds, and writes their rows to a file."""
+    """Scores a policy on the worlds of some seeds, and adds their rows to a file."""
     report.begin(len(seeds) * common["steps"])
     rows: list[Row] = []
     for first in range(0, len(seeds), batch):
@@ -342,7 +348,7 @@ def _play(
     common: Mapping[str, Any],
     report: Progress,
 ) -> list[Row]:
-    """Flies the paths of all steps in the worlds of these seeds, at the same time."""
+    """Scores a policy on the worlds of some seeds, all at the same time."""
     steps, n_robots = common["steps"], setting.n_robots
     with setting.made(len(seeds)) as (worlds, shown):
         tally = Tally(worlds.world_spec, len(seeds), common["recent_steps"])
@@ -351,8 +357,8 @@ def _play(
         fingerprint = worlds.lease.client.info.worlds_fingerprint
         if setting.fingerprint not in (None, fingerprint):
             raise InvalidArgumentError(
-                "worlds: they have changed since the evaluation began: did the file of their task, "
-                "model or states change, or another server take the instance?"
+                "worlds: changed since the evaluation began; either the file of their task, model "
+                "or states has changed, or another server uses the instance"
             )
         n_actions = tally.n_moves if setting.env == _MOVES else 1
         truncated = np.zeros(worlds.num_envs, np.bool_)
@@ -364,7 +370,7 @@ def _play(
                 tally.seconds += time.perf_counter() - begin
                 seen, _, _, truncated, _ = shown.step(flown[-1])
             if truncated.any() and step < steps:
-                raise invalid("steps", f"at most {step}, as episodes of these worlds have", steps)
+                raise invalid("steps", f"at most {step}, the length of these episodes", steps)
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
             tally.add(worlds.results, paths, worlds.truths)
             report.add(len(seeds))
@@ -401,11 +407,11 @@ def _check(
     env: str,
     keywords: dict[str, Any],
 ) -> list[int]:
-    """The seeds as a list; refuses what no worlds can be made of."""
+    """Checks the arguments of an evaluation; returns the seeds as a list."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise invalid("name", "a name for the table", repr(name))
+        raise invalid("name", "a name for the table: printable text", repr(name))
     if estimator is not None and (not isinstance(estimator, str) or not estimator.isprintable()):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise invalid("estimator", "a word for the table, or None", repr(estimator))
+        raise invalid("estimator", "a name for the table, or None", repr(estimator))
     if env not in (_MOVES, _PATHS):
         raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr(env))
     numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
@@ -416,8 +422,8 @@ def _check(
         if what in keywords:
             raise InvalidArgumentError(f"{what}: expected to be left out, as evaluate sets it")
     if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise invalid("seeds", "some, such as range(8)", repr(seeds))
+        raise invalid("seeds", "several seeds, such as range(8)", repr(seeds))
     chosen = [as_seed(seed) for seed in seeds]
     if not chosen or len(set(chosen)) < len(chosen):
-        raise invalid("seeds", "some, each once", chosen)
+        raise invalid("seeds", "at least one seed, without duplicates", chosen)
     return chosen

@@ -1,4 +1,4 @@
-"""Whether the observations of worlds are those that a model was trained on."""
+"""Checks that worlds have the observations that a model was trained on."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from emberwatch.errors import InvalidArgumentError
 
 
 def fits(expected: Any, seen: Any) -> bool:
-    """Whether a model of Stable-Baselines3 that expects one space takes observations of another.
+    """Returns whether a Stable-Baselines3 model for the space `expected` accepts the space `seen`.
 
-    The model itself puts the channels of images first.
+    Images may have their channels last in `seen`, as the model itself moves them first.
     """
     if isinstance(expected, spaces.Dict) and isinstance(seen, spaces.Dict):
         parts, others = _parts(expected), _parts(seen)
@@ -23,20 +23,21 @@ def fits(expected: Any, seen: Any) -> bool:
 
 
 def shapes(space: Any) -> Any:
-    """Returns the shape of a space, or those of its parts by name."""
+    """Returns the shape of a space, or the shapes of its parts by name."""
     if isinstance(space, spaces.Dict):
         return {name: shapes(part) for name, part in _parts(space).items()}
     return space.shape
 
 
 def misfit(expected: Any, seen: Any) -> InvalidArgumentError:
-    """Returns the error of a model that was trained on other observations."""
+    """Returns the error for a model that was trained on other observations."""
     wrap = "lambda worlds: VecFrameStack(worlds, 4)"
     if shapes(expected) == shapes(seen):
         wrap = "lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
     return InvalidArgumentError(
-        f"policy: expected observations {expected}, on which it was trained, got {seen}: pass the "
-        f"observation= of its training, and if that wrapped its worlds, wrap=, such as {wrap}"
+        f"policy: expected the observations that it was trained on, {expected}, got {seen}: pass "
+        f"the observation= of its training, and if the training wrapped its worlds, wrap=, such as "
+        f"{wrap}"
     )
 
 

@@ -1,7 +1,7 @@
-"""How a policy acts: functions of observations, and models with the `predict` of SB3.
+"""Calls of policies: functions of observations, and models with the `predict` of SB3.
 
-SB3 is Stable-Baselines3. Its models may have a memory (RecurrentPPO), take action masks
-(MaskablePPO), and expect observations as the wrappers of their training made them.
+SB3 is Stable-Baselines3. Its models may be recurrent (RecurrentPPO), take action masks
+(MaskablePPO), and expect observations that passed through the wrappers of their training.
 """
 
 from __future__ import annotations
@@ -15,48 +15,48 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.benchmark.fitting import fits, misfit, shapes
-from emberwatch.common.arguments import as_array, told
+from emberwatch.common.arguments import as_array, repr_of
 from emberwatch.errors import InvalidArgumentError, invalid
 
-#: Returns the actions of some worlds for their stacked observations, or is a model of SB3.
+#: A function from stacked observations to actions, or a model of SB3.
 Policy: TypeAlias = Callable[..., Any]
 
-#: Parameters that a policy is given if it has them.
+#: Arguments that a policy gets if it has parameters of these names.
 _STATE: Final = "state"
 _STARTS: Final = "episode_start"
 _DETERMINISTIC: Final = "deterministic"
 _MASKS: Final = "action_masks"
 
-#: What SB3 before 1.4 called `episode_start`, and what its `predict` has; elsewhere the word may
-#: mean anything.
+#: The name of `episode_start` in SB3 before 1.4. It has this meaning only together with the other
+#: parameters of SB3's `predict`.
 _OLD_STARTS: Final = "mask"
 _OLD: Final = frozenset((_STATE, _OLD_STARTS, _DETERMINISTIC))
 
 
 class Normalizer(Protocol):
-    """What is used of SB3's `VecNormalize`."""
+    """The method of SB3's `VecNormalize` that is used here."""
 
     def normalize_obs(self, obs: Any) -> Any: ...
 
 
 class Actor:
-    """A policy in one batch of worlds after the other, with its memory of the present ones."""
+    """A policy that acts in one batch of worlds after another, and its state in the current one."""
 
     def __init__(self, policy: object, *, deterministic: bool, is_wrapped: bool) -> None:
-        """Finds out what the policy takes.
+        """Determines the parameters of the policy.
 
         Args:
             policy: A function, or an object with `predict`.
-            deterministic: For `predict`.
-            is_wrapped: Whether observations come as the wrappers of the policy's training make
-                them. Otherwise they are normalized here if the model knows how.
+            deterministic: Argument of `predict`.
+            is_wrapped: Whether observations pass through the wrappers of the policy's training.
+                If not, they are normalized here if the model has a `VecNormalize`.
         """
         predict = getattr(policy, "predict", None)
         self._call: Any = policy if predict is None else predict
         if not callable(self._call):
             expected = "a function of observations, or a model of Stable-Baselines3"
-            raise invalid("policy", expected, told(policy))
-        # The model, also where the policy is a method of it.
+            raise invalid("policy", expected, repr_of(policy))
+        # The model, also if the policy is one of its methods.
         self._model: Any = getattr(policy, "__self__", policy)
         self._begin: Any = getattr(policy, "begin", None)
         self._deterministic: Final = deterministic
@@ -64,7 +64,7 @@ class Actor:
         known = getattr(self._model, "get_vec_normalize_env", None)
         normalizer: Any = known() if callable(known) else None
         has_one = normalizer is not None and getattr(normalizer, "norm_obs", True)
-        #: What the model's training normalized observations with, if anything.
+        #: The `VecNormalize` of the model's training, if it normalized observations.
         self.normalizers = cast("list[Normalizer]", [normalizer] if has_one else [])
         self._normalizer: Final = normalizer if has_one and not is_wrapped else None
         self._state: Any = None
@@ -75,10 +75,11 @@ class Actor:
 
         Args:
             worlds: A vector environment.
-            seen: The space of the observations that it, or a wrapper around it, gives.
+            seen: The observation space of the environment, or of its wrappers.
         """
         if _MASKS in self._needs and not hasattr(worlds, _MASKS):
-            raise invalid("env", "one with action masks, which the policy takes", "one without")
+            expected = "an environment with action masks, which the policy needs"
+            raise invalid("env", expected, "one without")
         if self._normalizer is not None:
             inner = getattr(getattr(self._normalizer, "venv", None), "observation_space", seen)
             if shapes(inner) != shapes(seen):
@@ -89,18 +90,18 @@ class Actor:
             raise misfit(expected, seen)
 
     def begin(self, n_worlds: int, n_rows: int) -> None:
-        """Forgets all, as other worlds begin, and tells a policy with a method `begin`."""
+        """Resets the state for a new batch of worlds, and calls the policy's `begin`, if any."""
         if self._begin is not None:
             self._begin(n_worlds)
         self._state, self._starts = None, np.ones(n_rows, np.bool_)
 
     def act(self, seen: Any, worlds: Any) -> NDArray[Any]:
-        """Returns the actions for the observations of some worlds, a new array."""
+        """Returns the actions for the observations of some worlds as a new array."""
         if self._normalizer is not None:
             seen = self._normalizer.normalize_obs(seen)
         outcome = self._call(seen, **self._given(worlds)) if self._takes else self._call(seen)
         actions = self._actions(outcome, worlds)
-        return np.array(as_array(actions, "policy", "actions"))  # a policy may use its array again
+        return np.array(as_array(actions, "policy", "actions"))  # a policy may reuse its array
 
     def _given(self, worlds: Any) -> dict[str, Any]:
         given: dict[str, Any] = {}
@@ -115,7 +116,7 @@ class Actor:
         return given
 
     def _actions(self, outcome: Any, worlds: Any) -> Any:
-        """The actions of what a policy returned: these, or as `predict` a pair with a state."""
+        """Extracts the actions from a policy's result: actions, or a pair of actions and state."""
         parts = cast("tuple[Any, ...]", outcome) if isinstance(outcome, tuple) else ()
         if len(parts) != 2 or _shape(parts[0]) != worlds.action_space.shape:
             self._state = None
@@ -123,25 +124,25 @@ class Actor:
         actions, self._state = parts
         if self._state is not None and _STATE not in self._takes:
             raise InvalidArgumentError(
-                "policy: it returns a state with its actions, but has no parameter `state` to get "
-                "it back: pass the model itself, or return the actions alone"
+                "policy: it returns a state with its actions, but has no parameter `state` for the "
+                "next call: pass the model itself, or return only the actions"
             )
         return actions
 
 
 def statistics(normalizer: Normalizer) -> dict[str, Any]:
-    """Returns all that a normalization depends on."""
+    """Returns the statistics and settings of a normalization."""
     names = ("obs_rms", "clip_obs", "epsilon", "norm_obs", "norm_obs_keys")
     return {name: getattr(normalizer, name, None) for name in names}
 
 
 def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
-    """Returns the known parameters that a policy has, and those without a default."""
+    """Returns a policy's parameters that are known here, and the ones without a default."""
     try:
         parameters = list(inspect.signature(call).parameters.values())
     except (TypeError, ValueError):  # written in C
         return set(), set()
-    # The first one is the observation, whatever its name.
+    # The first parameter is the observation, whatever its name.
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     known = {each.name: each for each in parameters[1:] if each.kind in kinds}
     takes = known.keys() & {_STATE, _STARTS, _DETERMINISTIC, _MASKS}
@@ -156,5 +157,5 @@ def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], 
 def _shape(actions: Any) -> tuple[int, ...] | None:
     try:
         return tuple(np.shape(actions))
-    except Exception:  # of any kind, such as of lists of different lengths
+    except Exception:  # any type, for example for lists of different lengths
         return None

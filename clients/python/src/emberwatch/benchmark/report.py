@@ -1,4 +1,4 @@
-"""What an evaluation says: its progress, and a summary of its rows."""
+"""Reports of an evaluation: its progress, and a summary of its rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from emberwatch.errors import invalid
 
 
 class Progress:
-    """Says how far an evaluation is: each second on a terminal, otherwise once at its end."""
+    """The progress of an evaluation, printed each second on a terminal, otherwise at the end."""
 
     def __init__(self, out: TextIO | None, name: str, seeds: Sequence[int]) -> None:
         n_test = sum(seed < FIRST_TRAINING_SEED for seed in seeds)
@@ -27,22 +27,22 @@ class Progress:
         self._begin = self._last = time.monotonic()
 
     def begin(self, n_steps: int) -> None:
-        """Before so many steps, of all worlds together."""
+        """Starts the clock; `n_steps`: number of steps of all worlds together."""
         self._n_steps, self._n_done = n_steps, 0
         self._begin = self._last = time.monotonic()
 
     def found(self, file: Path, *, n_kept: int, n_again: int, n_dropped: int) -> None:
-        """Says what becomes of the rows that the file has of the policy's name."""
+        """Reports how many rows of this policy's name in the file are reused, rerun or removed."""
         if n_kept:
             self._say(
-                f"{n_kept} {_plural('row', n_kept)} kept in {file}, not run again. What a policy "
-                "reads from elsewhere, such as files, is not compared: if that has changed, "
+                f"{n_kept} {_plural('row', n_kept)} kept in {file}, not run again. Data that the "
+                "policy reads at run time, such as files, is not compared: if it has changed, "
                 "choose another name"
             )
         if n_again + n_dropped:
             dropped = f", {n_dropped} removed" if n_dropped else ""
             self._say(
-                f"{n_again} {_plural('row', n_again)} already in {file} run again{dropped}: of "
+                f"{n_again} {_plural('row', n_again)} already in {file} run again{dropped}: from "
                 "another policy or other settings"
             )
 
@@ -67,9 +67,12 @@ class Progress:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Returns each policy's mean reward of a step and its standard error, a line each.
+    """Returns each policy's mean reward per step and its standard error, one line per policy.
 
-    The standard error is that of a mean over worlds; one world has none.
+    The standard error is over worlds, so it needs at least two worlds.
+
+    Raises:
+        InvalidArgumentError: If there are no rows.
     """
     if not rows:
         raise invalid("rows", "at least one", "none")
@@ -80,7 +83,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def _line(rows: Sequence[Row]) -> str:
-    """The summary of one policy."""
+    """Returns the summary of one policy."""
     rewards = np.array([row.mean_reward for row in rows])
     n_test = sum(row.world_seed < FIRST_TRAINING_SEED for row in rows)
     sort = "test " if n_test == len(rows) else "" if n_test == 0 else f"({n_test} test) "

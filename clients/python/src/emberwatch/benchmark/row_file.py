@@ -1,4 +1,4 @@
-"""A CSV file of rows that several processes may write to at once, Python's and the agent's."""
+"""A CSV file of rows that several processes, of Python and of the agent, may write to at once."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 from emberwatch.benchmark.rows import Row, read, write
-from emberwatch.common.arguments import told
+from emberwatch.common.arguments import repr_of
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 
-#: How long to wait for another writer, and how often to look, seconds. Writers hold the lock for
+#: Seconds to wait for another writer, and between two attempts. Writers hold the lock for
 #: milliseconds, but `emberwatch-agent compare --csv` holds it until it ends.
 _PATIENCE: Final = 60.0
 _INTERVAL: Final = 0.02
 
 
 class Mark(NamedTuple):
-    """What decides whether a row of a policy is one that an evaluation would make again."""
+    """The properties of a row that decide whether an evaluation can reuse it."""
 
     worlds_fingerprint: str
     policy_fingerprint: str
@@ -39,7 +39,7 @@ class Mark(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A policy in one kind of team, of which a file has one row for each world."""
+    """A policy in one kind of team. A file has at most one row of each kind for each world."""
 
     policy: str
     robots: int
@@ -53,51 +53,51 @@ class Kind(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a file has of a policy."""
+    """The rows of a policy that are in a file."""
 
-    #: Rows of the same worlds, policy and settings, by seed.
+    #: Rows with the same worlds, policy and settings, by seed.
     kept: dict[int, Row]
-    #: Rows of the policy's name that are of another policy, other settings or worlds.
+    #: Rows of the policy's name, but from another policy, other settings or other worlds.
     stale: tuple[Row, ...]
-    #: In a cache: other policies with rows of other worlds, or of unknown ones.
+    #: In a cache: other policies with rows on other worlds, or on unknown worlds.
     elsewhere: tuple[str, ...]
 
 
 class RowFile:
-    """Rows in a CSV file. Each change locks the file, reads it again, and replaces it whole.
+    """Rows in a CSV file. Each change locks the file, rereads it, and replaces it as a whole.
 
-    The lock is `flock` on the file itself, so that no writer loses the rows of another.
+    The lock is `flock` on the file itself, so that no writer loses the rows of another one.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, is_cache: bool = False) -> None:
-        """Opens nothing.
+        """Stores the path; does not open the file.
 
         Args:
             path: The file, which may be missing or empty.
-            is_cache: Rows of the policy on other worlds are replaced, and those of other policies
-                on other worlds left alone. Otherwise both are refused.
+            is_cache: Whether to accept rows on other worlds: rows of the policy are replaced, and
+                rows of other policies are left alone. Without it, both are refused.
         """
         if not isinstance(path, str | os.PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise invalid("csv", "the path of a file", told(path))
-        # Links are followed, as a renamed file would replace the link.
+            raise invalid("csv", "the path of a file", repr_of(path))
+        # Links are resolved, as renaming a file onto a link would replace the link.
         self.path: Final = Path(os.path.realpath(utf8("csv", path)))
         self._is_cache: Final = is_cache
         self._kind: Kind | None = None
         self._mark: Mark | None = None
-        #: Marks of rows of the policy that its new ones replace.
+        #: Marks of the policy's rows that new rows replace.
         self._stale: set[Mark] = set()
         self._rows: list[Row] = []
         self._is_new = False
 
     def __enter__(self) -> Self:
-        """Reads the rows, and makes sure that the file can be replaced."""
+        """Reads the rows, and checks that the file can be replaced."""
         with self._problems():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._is_new = not self.path.exists()
             try:
                 with self._locked():
                     self._rows = read(self.path)
-                    # What the folder refuses is found now, not after the work.
+                    # A folder that refuses new files is found before the work, not after it.
                     self._temporary.touch()
                     self._temporary.unlink()
             except OSError:
@@ -111,16 +111,16 @@ class RowFile:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Removes the file if it was made here and has no rows."""
+        """Removes the file if it was created here and has no rows."""
         with self._problems():
             self._remove_empty()
 
     def find(self, kind: Kind, mark: Mark) -> Found:
-        """Looks for rows of a policy, which `add` will add to.
+        """Finds the rows of a policy, to which `add` adds more.
 
         Raises:
-            InvalidArgumentError: If the file is no cache, and has rows of other worlds, or of the
-                policy for other numbers of steps.
+            InvalidArgumentError: If the file is not a cache, and has rows of other worlds, or rows
+                of the policy with other numbers of steps.
         """
         self._kind, self._mark = kind, mark
         own = [row for row in self._rows if self._is_own(row)]
@@ -138,8 +138,8 @@ class RowFile:
         """Adds rows, and drops all rows of the policy with another mark.
 
         Raises:
-            InvalidArgumentError: If another process has written rows meanwhile that do not go
-                with these, or the file cannot be written.
+            InvalidArgumentError: If another process has meanwhile written conflicting rows, or if
+                the file cannot be written.
         """
         seeds = {row.world_seed for row in rows}
         with self._problems(), self._locked() as descriptor:
@@ -159,7 +159,7 @@ class RowFile:
 
     @property
     def _temporary(self) -> Path:
-        """A name that only the holder of the lock uses."""
+        """The path of the temporary file, which only the holder of the lock uses."""
         return self.path.with_name(f".{self.path.name}.tmp")
 
     def _remove_empty(self) -> None:
@@ -185,20 +185,20 @@ class RowFile:
         return self._mark is not None and row.worlds_fingerprint == self._mark.worlds_fingerprint
 
     def _check_worlds(self, rows: Sequence[Row]) -> None:
-        """Refuses rows of other worlds, and rows of the policy that do not say of which."""
+        """Refuses rows of other worlds, and rows of the policy without a fingerprint of worlds."""
         wrong = [row for row in rows if row.worlds_fingerprint and not self._is_of_worlds(row)]
         if wrong:
             names = ", ".join(sorted({repr(row.policy) for row in wrong}))
             raise InvalidArgumentError(
                 f"csv: {self.path} has {len(wrong)} rows of other worlds, of the policies "
-                f"{names}: another model, grid, start, sensor or burn-in, or other moves or "
-                "robots; choose another file"
+                f"{names}: their model, grid, start, sensor, burn-in, moves or robots differ; "
+                "choose another file"
             )
         old = [row.policy for row in rows if self._is_own(row) and not row.worlds_fingerprint]
         if old:
             raise InvalidArgumentError(
-                f"csv: {self.path} has rows of {old[0]!r} without a fingerprint of their "
-                "worlds, as older releases wrote them: choose another file or name"
+                f"csv: {self.path} has rows of {old[0]!r} from an older release, without a "
+                "fingerprint of their worlds: choose another file or name"
             )
 
     def _check_steps(self, own: Sequence[Row], mark: Mark) -> None:
@@ -212,36 +212,36 @@ class RowFile:
                     )
 
     def _check_meanwhile(self, present: Sequence[Row], rows: Sequence[Row]) -> None:
-        """Refuses to mix new rows with what other processes have written since `find`."""
+        """Refuses conflicting rows that other processes have written since `find`."""
         own = {Mark.of(row) for row in present if self._is_own(row)}
         if self._mark is not None and own - self._stale - {self._mark}:
             raise InvalidArgumentError(
-                f"csv: another process has written rows of {rows[0].policy!r} to {self.path}, of "
-                "another policy or other settings: choose another file or name"
+                f"csv: another process has written rows of {rows[0].policy!r} to {self.path}, from "
+                "another policy or with other settings: choose another file or name"
             )
         if self._is_cache:
             return
         self._check_worlds(present)
         fire = {(row.world_seed, row.steps): row.mean_fire_cells for row in rows}
-        for row in present:  # those of old files have no fingerprint
+        for row in present:  # rows of older releases have no fingerprint
             expected = fire.get((row.world_seed, row.steps), row.mean_fire_cells)
             if not row.worlds_fingerprint and row.mean_fire_cells != expected:
                 raise InvalidArgumentError(
-                    f"csv: {self.path} has {row.mean_fire_cells} burning cells of world "
-                    f"{row.world_seed} ({row.policy!r}), got {expected} (another model, grid or "
-                    "burn-in): choose another file"
+                    f"csv: {self.path} has {row.mean_fire_cells} burning cells in world "
+                    f"{row.world_seed} ({row.policy!r}), got {expected}: another model, grid or "
+                    "burn-in; choose another file"
                 )
 
     @contextmanager
     def _locked(self) -> Generator[int]:
-        """Holds the lock on the file, which is made if it is missing; gives its descriptor."""
+        """Locks the file, which is created if it is missing; yields its descriptor."""
         deadline = time.monotonic() + _PATIENCE
         if sys.platform == "win32":
             raise InvalidArgumentError(
-                "csv: expected a system with flock, such as Linux; got Windows"
+                "csv: writing needs a system with flock, such as Linux, got Windows"
             )
         while True:
-            # Without O_NONBLOCK a pipe would block.
+            # Without O_NONBLOCK, opening a pipe would block.
             flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
             descriptor = os.open(self.path, flags, 0o666)
             try:
@@ -263,12 +263,13 @@ class RowFile:
                 if time.monotonic() > deadline:
                     raise InvalidArgumentError(
                         f"csv: another process has held {self.path} for {_PATIENCE:g} s, such as "
-                        "`emberwatch-agent compare --csv`: wait for its end, or choose another file"
+                        "`emberwatch-agent compare --csv`: wait until it ends, or choose another "
+                        "file"
                     ) from None
             time.sleep(_INTERVAL)
 
     def _is_named(self, descriptor: int) -> bool:
-        """Whether the path still names the open file: another writer may have replaced it."""
+        """Returns whether the path still names the open file, which a writer may have replaced."""
         try:
             return os.path.samestat(os.fstat(descriptor), os.stat(self.path))
         except FileNotFoundError:
@@ -276,11 +277,11 @@ class RowFile:
 
     def _check_regular(self, descriptor: int) -> None:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise invalid("csv", "a regular file", f"{self.path}, a device or a pipe")
+            raise invalid("csv", "a regular file", f"{self.path}, which is a device or a pipe")
 
     @contextmanager
     def _problems(self) -> Generator[None]:
-        """Says of which file an error of the system is."""
+        """Converts system errors to errors that name the file."""
         try:
             yield
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Rows of the benchmark, and their form in CSV files."""
+"""Rows of the benchmark, and their CSV format."""
 
 from __future__ import annotations
 
@@ -14,57 +14,64 @@ from emberwatch.errors import invalid
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A policy on one world: a line of the CSV file, as `emberwatch-agent compare` writes it."""
+    """The score of a policy on one world: a line of the CSV file of `emberwatch-agent compare`.
 
+    Means are over the scored steps.
+    """
+
+    #: Name of the policy.
     policy: str
-    #: Where its belief came from: `none`, `known_model`, or a name of your own.
+    #: Name of the estimator of its belief: `none`, `known_model`, or a name of your choice.
     estimator: str
     world_seed: int
-    #: Scored steps of the world.
+    #: Number of scored steps.
     steps: int
+    #: Mean reward of all robots together.
     mean_reward: float
+    #: Mean number of distinct visited cells.
     mean_distinct_cells: float
-    #: Distinct visited cells on target, as a share of the distinct visited cells.
+    #: Share of the distinct visited cells that were in the state that pays most.
     hit_rate: float
-    #: Of the whole world: the same for every policy.
+    #: Mean number of cells of the whole world in that state: the same for every policy.
     mean_fire_cells: float
+    #: Mean time that the policy took for the actions of a step, milliseconds.
     mean_plan_millis: float
-    #: Empty: only the agent program scores beliefs.
+    #: Brier score of the belief. Empty in rows of Python: only the agent program scores beliefs.
     brier: str
     #: Moves of a path.
     moves: int
-    #: Robots of the world; the numbers above are those of all of them together.
+    #: Robots of the world; the numbers above are for all of them together.
     robots: int = 1
-    #: What they share: `alone`, `shared` (what they see), or a word of your own.
+    #: What the robots share: `alone` (nothing), `shared` (what they see), or a word of your choice.
     team: str = "alone"
-    #: Share of their visits to cells that another robot visited in the same step.
+    #: Share of the visits that went to cells which another robot visited in the same step.
     mean_repeated: float = 0.0
-    #: The figures of merit (docs/figures-of-merit.md). Steps until a robot first visited a burning
-    #: cell; None: never, or a row of an old file.
+    #: The first of the figures of merit (docs/figures-of-merit.md): number of steps until a robot
+    #: first visited a burning cell. None: never, or a row of an old file.
     steps_to_detection: int | None = None
-    #: Burning cells of the world in that step.
+    #: Number of burning cells of the world in that step.
     burning_cells_at_detection: int | None = None
-    #: Steps for which a cell counts as seen after a visit.
+    #: Number of steps for which a cell counts as seen after a visit.
     recent_steps: int | None = None
-    #: Share of the burning cells that were seen in the last steps.
+    #: Mean share of the burning cells that count as seen.
     burning_seen_share: float | None = None
-    #: Moves from the nearest robot to the nearest burning cell that was not.
+    #: Mean of the smallest number of moves from a robot to a burning cell that does not.
     front_distance: float | None = None
-    #: Share of the grid that was ever seen.
+    #: Share of the grid that a robot visited at any time.
     grid_seen_share: float | None = None
-    #: Mean of ln P of a visited cell's observation; None: only the agent program scores beliefs.
+    #: Mean of ln P of a visited cell's observation. None in rows of Python.
     log_likelihood: float | None = None
-    #: Identifies the worlds, whatever their seed: equal for two rows if and only if model, grid,
-    #: moves, robots, sensor, start and burn-in are. Empty in rows of old files.
+    #: Identifies the worlds apart from their seeds. Equal for two rows if and only if model, grid,
+    #: moves, robots, sensor, start and burn-in are equal. Empty in rows of old files.
     worlds_fingerprint: str = ""
     #: Identifies the policy and all settings that its actions depend on. Empty in old files.
     policy_fingerprint: str = ""
-    #: Processor seconds of training for the world's task. None: only `emberwatch-agent suite` says.
+    #: Processor seconds of the training for the task. None except in `emberwatch-agent suite`.
     training_seconds: float | None = None
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: First columns that older files lack: training, fingerprints, likelihoods, merit, or teams.
+#: Each the first of the columns that files of an older release lack.
 _LATER: Final = (
     "training_seconds",
     "worlds_fingerprint",
@@ -76,9 +83,12 @@ _HEADERS: Final = [_HEADER, *(_HEADER[: _HEADER.index(column)] for column in _LA
 
 
 def read(path: str | os.PathLike[str]) -> list[Row]:
-    """Returns the rows of a CSV file of `evaluate` or `emberwatch-agent compare`.
+    """Reads the rows of a CSV file of `evaluate` or `emberwatch-agent compare`.
 
-    An empty file has none. A byte order mark, as spreadsheets write it, is skipped.
+    An empty file has no rows. A byte order mark, as spreadsheets write it, is skipped.
+
+    Raises:
+        InvalidArgumentError: If the file has other columns, or an invalid row.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -100,7 +110,7 @@ def write(file: TextIO, rows: Iterable[Row]) -> None:
 
 
 def _row(line: dict[Any, Any]) -> Row:
-    if None in line or None in line.values():  # under None are values without a column
+    if None in line or None in line.values():  # the key None has values without a column
         raise ValueError(f"a row with too many or too few values: {list(line.values())}")
     kinds: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
 

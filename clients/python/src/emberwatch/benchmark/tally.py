@@ -1,4 +1,4 @@
-"""What the steps of some worlds add up to."""
+"""Sums of an evaluation over the steps of several worlds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emberwatch.model.moves import fly
 
 
 class Tally:
-    """Sums over the steps of some worlds."""
+    """Sums of results over the steps of several worlds, one entry for each world."""
 
     def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
         self._spec: Final = spec
@@ -30,7 +30,7 @@ class Tally:
         )
         self.reward = np.zeros(n_worlds)
         self.n_visited, self.n_visits, self.n_hits, self.n_fire = np.zeros((4, n_worlds), np.int64)
-        #: What the policy has taken.
+        #: Seconds that the policy took for all actions.
         self.seconds = 0.0
 
     def add(
@@ -39,7 +39,7 @@ class Tally:
         paths: NDArray[np.integer],
         truths: NDArray[np.uint8] | None,
     ) -> None:
-        """One step of all robots, and the hidden states of their worlds, where these are known."""
+        """Adds a step of all robots; `truths`: hidden states of their worlds, if known."""
         worlds = results["world"][:: self.n_robots]
         self.reward += worlds["reward"]
         self.n_visited += worlds["n_visited"]
@@ -55,7 +55,7 @@ class Tally:
         )
 
     def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
+        """Returns the mask of the cells that robots of each world visited, `(n_worlds, H, W)`."""
         visited = np.zeros(self._shape, np.bool_)
         worlds = np.arange(len(robots))[:, np.newaxis] // self.n_robots
         cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)

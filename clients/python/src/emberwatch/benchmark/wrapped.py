@@ -1,4 +1,4 @@
-"""Worlds behind the wrappers of Stable-Baselines3, which is imported only here."""
+"""Worlds behind wrappers of Stable-Baselines3, which importing this needs."""
 
 # Stable-Baselines3 need not be installed where types are checked.
 # pyright: reportMissingImports=false, reportMissingModuleSource=false, reportUnknownMemberType=false
@@ -15,29 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from emberwatch.common.arguments import told
+from emberwatch.common.arguments import repr_of
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.sb3 import WildfireVecEnv
 
 
 class Wrapped:
-    """Worlds whose observations pass through wrappers. No episode ends before its last step."""
+    """Worlds whose observations pass through wrappers, which never see an episode end."""
 
     def __init__(self, worlds: Any, wrap: Callable[[VecEnv], VecEnv]) -> None:
-        """Wraps them; the statistics of a `VecNormalize` stay as they are.
+        """Wraps the worlds, and freezes the statistics of each `VecNormalize`.
 
         Raises:
-            InvalidArgumentError: If `wrap` returns something else, or statistics are missing.
+            InvalidArgumentError: If `wrap` does not return wrappers of its argument, or a
+                `VecNormalize` has no statistics.
         """
         self._base = _ScoredVecEnv(worlds)
         self._vector: Any = wrap(self._base)
-        #: Those that normalize, from the outermost one on.
+        #: The normalizing wrappers, from the outermost one inward.
         self.normalizers: list[VecNormalize] = []
         layer: Any = self._vector
         while layer is not self._base:
             if not isinstance(layer, VecEnvWrapper):
-                expected = "a function that returns its argument, a VecEnv of SB3, in wrappers"
-                raise invalid("wrap", expected, told(self._vector))
+                expected = "a function that returns its argument in VecEnvWrappers of SB3"
+                raise invalid("wrap", expected, repr_of(self._vector))
             if isinstance(layer, VecNormalize):
                 self.normalizers.append(layer)
                 _fix(layer)
@@ -45,26 +46,26 @@ class Wrapped:
         self.single_observation_space = self._vector.observation_space
 
     def reset(self, *, seed: list[int]) -> tuple[Any, dict[str, Any]]:
-        """Begins the worlds of these seeds, one for each row."""
+        """Begins episodes with these seeds, one for each row."""
         self._base.choose(seed)
         return self._vector.reset(), {}
 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Any, Any, Any, NDArray[np.bool_], dict[str, Any]]:
-        """Steps all rows; returns what a vector environment of Gymnasium does."""
+        """Steps all rows, with the return values of Gymnasium's vector environments."""
         seen, rewards, ends, _ = self._vector.step(actions)
         return seen, rewards, ends, self._base.truncated, {}
 
 
 class _ScoredVecEnv(WildfireVecEnv):
-    """Worlds that no step resets, as their last results are read."""
+    """Worlds that never reset by themselves, so that their last results can be read."""
 
     def __init__(self, worlds: Any) -> None:
         self._env, self._worlds, self._actions = worlds, worlds.unwrapped, None
         self.render_mode = None
         self.truncated = np.zeros(worlds.num_envs, np.bool_)
-        # A copy, as some wrappers write to it.
+        # A copy, as some wrappers change their space.
         space = deepcopy(worlds.single_observation_space)
         VecEnv.__init__(self, worlds.num_envs, space, worlds.single_action_space)
 
@@ -79,11 +80,11 @@ class _ScoredVecEnv(WildfireVecEnv):
 
 
 def _fix(normalize: VecNormalize) -> None:
-    """Keeps the statistics of a training, as its own evaluation must; refuses to do without."""
+    """Freezes the statistics of a training; refuses a `VecNormalize` without statistics."""
     normalize.training = normalize.norm_reward = False
     rms = normalize.obs_rms if normalize.norm_obs else {}
     parts = rms.values() if isinstance(rms, dict) else [rms]
-    # It begins with the weight of a small part of an observation.
+    # A new `VecNormalize` begins with a count far below 1.
     if any(part.count < 1.0 for part in parts):
         raise InvalidArgumentError(
             "wrap: VecNormalize has no statistics: save those of the training with its `save`, and "

@@ -1,4 +1,4 @@
-"""The client of a running server, or of worlds in this process: connect, lease, observe, record."""
+"""Clients of a running server or of worlds in this process, observers, and recordings."""
 
 from emberwatch.client.client import Client as Client
 from emberwatch.client.client import connect as connect

@@ -1,7 +1,7 @@
-"""A connection to a server: robots to fly, worlds to observe and to store.
+"""Clients: connections that fly robots, observe worlds and store them in files.
 
-`connect` gives a `Client`, its `acquire` a `Lease`, and that one's `step` a `StepAnswer`.
-Every call waits `timeout` seconds for its answer; everything returned is a copy.
+`connect` returns a `Client`, `Client.acquire` a `Lease`, and `Lease.step` a `StepAnswer`. Every
+call waits at most `timeout` seconds for its answer. All returned arrays are copies.
 """
 
 import json
@@ -36,18 +36,18 @@ _Connection = TypeVar("_Connection")
 
 _log: Final = logging.getLogger("emberwatch")
 
-#: Milliseconds without use after which leases of worlds in this process end.
+#: Milliseconds since its last use after which a lease on worlds in this process expires.
 _EMBEDDED_LEASE: Final = 86_400_000
 
-#: How long to sleep between two attempts to connect, at first and at most, seconds.
+#: Seconds to sleep between two attempts to connect: after the first attempt, and at most.
 _FIRST_RETRY: Final = 0.005
 _RETRY: Final = 0.2
 
 
 class Client(ServerConnection):
-    """A connection to one server, made with `connect`, or to worlds in this process, with `embed`.
+    """A connection to a server (see `connect`) or to worlds in this process (see `embed`).
 
-    Close it, or use it in a `with`.
+    Close it after use, or use it as a context manager.
     """
 
     def acquire(
@@ -59,18 +59,22 @@ class Client(ServerConnection):
         ttl: float | None = None,
         timeout: float = RESET_TIMEOUT,
     ) -> Lease:
-        """Gets the right to fly consecutive robots, once their worlds are out of their burn-in.
+        """Acquires the right to fly consecutive robots. Waits until their worlds end their burn-in.
 
-        Robot r of world w has number w R + r, with R = `info.n_robots`. To resume what another
-        agent left, continue from `lease.observe()`: it has k, the robot's cell and the last frame.
-        To start again, `lease.reset()`.
+        Robot r of world w has number w R + r, with R = `info.n_robots`. To resume an episode that
+        another agent left, continue from `lease.observe()`, which has k, the robot's cell and the
+        last frame. To begin a new episode, call `lease.reset()`.
 
         Args:
-            takeover: Take them from their holders.
-            ttl: The lease ends this long after its last use, seconds; None: the server's default.
+            first_robot: The number of the first robot.
+            n_robots: Number of robots.
+            takeover: Whether to take robots away from the clients that hold them.
+            ttl: Seconds since its last use after which the lease expires; None: the server's
+                default.
+            timeout: Seconds to wait for the answer.
 
         Raises:
-            EmberwatchError: With code `"busy"` if somebody else holds one of them, or
+            EmberwatchError: With code `"busy"` if another client holds one of the robots, or
                 `"no_such_robot"`.
         """
         request = {
@@ -93,10 +97,18 @@ class Client(ServerConnection):
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """The results and frames of an earlier step k of the episode, as `observe` has them.
+        """Returns the results and frames of an earlier step k of the episode, like `observe`.
 
-        If the server no longer keeps it, the error's `code` is `"not_kept"`, and its `detail` the
-        nearest step that it keeps.
+        Args:
+            step: The step k.
+            first_robot: The number of the first robot.
+            n_robots: Number of robots.
+            team: Whether to return one frame for each world's team instead of one for each robot.
+            timeout: Seconds to wait for the answer.
+
+        Raises:
+            EmberwatchError: With code `"not_kept"` if the server has discarded the step; `detail`
+                is the nearest step that it keeps.
         """
         if not 0 <= step < 2**64:
             raise invalid("step", "an integer within 0 to 2**64 - 1", repr(step))
@@ -112,14 +124,16 @@ class Client(ServerConnection):
         *,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Writes worlds to a file on the server's host; `Lease.restore` reads it. Needs no lease.
+        """Writes worlds to a file on the server's host, for `Lease.restore`. Needs no lease.
 
         Args:
-            path: The file; a relative path is one from this process's folder.
-            n_worlds: How many; None: all from the first.
+            path: The file. A relative path starts at this process's working directory.
+            first_world: The first world to write.
+            n_worlds: Number of worlds; None: all worlds from `first_world` on.
+            timeout: Seconds to wait for the answer.
 
         Returns:
-            The worlds in the file, as they were.
+            The state of each world in the file.
         """
         n_worlds = self.info.n_worlds - first_world if n_worlds is None else n_worlds
         place = {"first_world": first_world, "n_worlds": n_worlds}
@@ -127,7 +141,10 @@ class Client(ServerConnection):
         return records(WorldInfo, self.control(request, timeout=timeout))
 
     def belief(self, robot: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
-        """The belief that a robot's agent left about the present step; None if there is none."""
+        """Returns the belief about the current step that a robot's last agent left; None if none.
+
+        Another agent resumes with it; see `Lease.leave_belief`.
+        """
         data, first = b"", None
         while True:
             request = {"op": "belief", "robot": robot, "offset": len(data)}
@@ -145,7 +162,7 @@ class Client(ServerConnection):
             whole = (info.kind, info.episode, info.step, info.length)
             first = first or whole
             if whole != first:
-                data, first = b"", None  # another one was left meanwhile
+                data, first = b"", None  # another belief was left meanwhile: read from the start
                 continue
             data += part
             if len(data) == info.length:
@@ -154,6 +171,7 @@ class Client(ServerConnection):
                 raise bad_answer("answer to 'belief'", f"{info.length} bytes", len(data))
 
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
+        """Returns the server's load, and the state of each world."""
         reply = self.control({"op": "status"}, timeout=timeout)
         worlds = records(WorldStatus, reply)
         return record(ServerStatus, {**reply, "worlds": worlds})
@@ -166,42 +184,50 @@ class Client(ServerConnection):
 def connect(
     instance: str = "default", *, timeout: float = STEP_TIMEOUT, wait: float = 0.0
 ) -> Client:
-    """Connects to a running server, or with `wait` to one that is just starting.
+    """Connects to a running server.
 
     Args:
-        wait: How long to wait until there is a server, seconds; 0: fail at once.
+        instance: The server's instance name.
+        timeout: Seconds to wait for the server's answer.
+        wait: Seconds to wait for a server that is still starting; 0: fail at once.
 
     Raises:
-        NoServerError: If nobody serves the instance by then.
+        NoServerError: If no server runs under this name within `wait` seconds.
         RequestTimeoutError: If the server does not answer.
-        EmberwatchError: With code `"version_mismatch"` if it speaks another protocol version, or
-            `"channel"`, also when there are too many clients.
+        EmberwatchError: With code `"version_mismatch"` if the server has another protocol version,
+            or `"channel"` if the channels cannot be opened or the server has too many clients.
     """
     return connect_with_retry(wait, lambda: Client(instance, timeout=timeout))
 
 
 def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
-    """Worlds inside this process, with all that a `Client` can do, and without a server.
+    """Creates worlds inside this process, without a server, and returns a `Client` of them.
 
-    Nobody else can watch them or fly in them, and they end with the client. Wherever a server's
-    results would depend on seeds and actions alone, theirs are the same bytes. Leases end a day
-    after their last use. Ctrl-C ends the wait for a reset or a file, and comes after a step.
+    No other process can observe these worlds or fly in them, and they end with the client. Results
+    that depend only on seeds and actions are the same bytes as a server's. Leases expire a day
+    after their last use. Ctrl-C interrupts the wait for a reset or a file; during a step it takes
+    effect after the step.
 
     Args:
-        settings: Those of `config/server.toml`, such as `worlds=4`, `task="small"`, `seed=7`; None:
-            the default. Not `instance`, nor the server's own snapshots.
+        settings: Settings of `config/server.toml`, such as `worlds=4`, `task="small"`, `seed=7`;
+            None: the default. `instance` and the settings of the server's own snapshots do not
+            apply.
 
     Raises:
-        InvalidArgumentError: If a setting is unknown or wrong.
-        NotEnoughMemoryError: If they would take more than the machine, a cgroup or a `ulimit` has.
-        EmberwatchError: With code `"threads"` if the system starts none.
+        InvalidArgumentError: If a setting is unknown or invalid.
+        NotEnoughMemoryError: If the worlds need more memory than the machine, a cgroup or a
+            `ulimit` allows.
+        EmberwatchError: With code `"threads"` if the system cannot start threads.
     """
     return embed_settings(settings, warns=True)
 
 
 def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
-    """Like `embed`; `warns`: of starts that no-fly cells close in, unless a check has done so."""
-    # Nobody else waits for its robots.
+    """Like `embed`; `warns`: whether to warn about start cells that no-fly cells enclose.
+
+    Callers that have checked the settings pass False, as the check has warned.
+    """
+    # No other client waits for these robots.
     chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
     for name, given in settings.items():
         if given is not None:
@@ -210,18 +236,18 @@ def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:
-    """Connects as soon as somebody answers, within `wait` seconds; logs once that it waits."""
+    """Retries a connection for `wait` seconds until a server answers; logs once that it waits."""
     deadline, waits, pause = time.monotonic() + wait, False, _FIRST_RETRY
     while True:
         try:
             return connect()
         except NoServerError as error:
             left = deadline - time.monotonic()
-            # Not "<=": "not a number" would never end.
+            # Not `left <= 0`, which is false for NaN: the loop would never end.
             if not left > 0:
                 raise
             if not waits:
-                _log.warning(f"{error}; waiting up to {wait:g} s for it")
+                _log.warning(f"{error}; waiting up to {wait:g} s for a server")
             waits = True
             time.sleep(min(pause, left))
             pause = min(2 * pause, _RETRY)

@@ -1,4 +1,4 @@
-"""A connection to a process that answers: JSON requests, and steps of a server."""
+"""Connections to a server, or to worlds in this process: JSON requests and steps."""
 
 import json
 from collections.abc import Mapping
@@ -14,18 +14,18 @@ from emberwatch.errors import bad_answer
 #: Default timeout of a step, seconds.
 STEP_TIMEOUT: Final = 5.0
 
-#: Default timeout of what may wait for a burn-in, seconds.
+#: Default timeout of requests that may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 600.0
 
-#: How this program names itself in logs.
+#: Name of this program in the server's log.
 CLIENT: Final = f"emberwatch-python {VERSION}"
 
 
 class Closable:
-    """What `with` closes."""
+    """An object with `close`, which `with` calls."""
 
     def close(self) -> None:
-        """Closes it; may be called again."""
+        """Closes it. May be called again."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -36,25 +36,25 @@ class Closable:
 
 
 class Connection(Closable):
-    """A channel of JSON messages. Threads may share it: they take turns."""
+    """A channel of JSON messages. Threads may share it, and wait for each other."""
 
     def __init__(self, instance: str, native: _native.Server) -> None:
         self.instance: Final = instance
         self._native: Any = native
 
     def close(self) -> None:
-        """Closes the connection; its leases end. May be called again."""
+        """Closes the connection, which ends its leases. May be called again."""
         self._native.close()
 
     def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]:
-        """Sends one JSON request (PROTOCOL.md section 6) and returns the reply's keys."""
+        """Sends a JSON request (PROTOCOL.md section 6), and returns the reply's keys and values."""
         what = f"{request['op']!r}"
         answer = self._native.control(json.dumps(request).encode(), what, timeout)
         return decoded(f"answer to {what}", answer)
 
 
 class ServerConnection(Connection):
-    """A connection to a server, which also steps worlds."""
+    """A connection that also steps worlds."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class ServerConnection(Connection):
         timeout: float = STEP_TIMEOUT,
         embedded: _native.Server | None = None,
     ) -> None:
-        """Connects to a server, or to `embedded`, which are worlds in this process."""
+        """Connects to a server, or to `embedded` worlds in this process."""
         super().__init__(instance, embedded or _native.Server(instance, CLIENT, timeout))
         self.info: Final = record(ServerInfo, decoded("answer to 'hello'", self._native.info))
         self.shape: Final = self.info.shape
@@ -76,9 +76,13 @@ class ServerConnection(Connection):
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """The last results and frames again, or with `team` the frame of each world's team.
+        """Returns the results and frames of the last step again. Needs no lease, changes nothing.
 
-        Needs no lease and changes nothing.
+        Args:
+            first_robot: The number of the first robot.
+            n_robots: Number of robots.
+            team: Whether to return one frame for each world's team instead of one for each robot.
+            timeout: Seconds to wait for the answer.
         """
         flags = wire.TEAM_FRAMES if team else 0
         return self.exchange(wire.OBSERVE, 0, first_robot, n_robots, flags, b"", timeout=timeout)
@@ -94,23 +98,23 @@ class ServerConnection(Connection):
         *,
         timeout: float,
     ) -> StepAnswer:
-        """Sends one request on `step` as it is; `Lease.step` and `observe` are easier."""
+        """Sends a raw request on the channel `step`. Prefer `Lease.step` and `observe`."""
         n_moves = self.info.n_moves if operation == wire.STEP else 0
         place = first_robot, n_robots
         answer = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)
         return StepAnswer(answer)
 
     def truths(self, worlds: range) -> list[dict[str, Any]]:
-        """The hidden states of worlds in this process, as the fields of `Truth`."""
+        """Returns the hidden states of worlds in this process, as the fields of `Truth`."""
         return self._native.truths(worlds.start, len(worlds))
 
     def lease(self, number: int, robots: range) -> _native.Lease:
-        """Steps robots under a lease of this number."""
+        """Returns the native object that steps robots under the lease `number`."""
         return _native.Lease(self._native, number, robots.start, len(robots))
 
 
 def decoded(what: str, text: str) -> dict[str, Any]:
-    """The keys of a JSON object."""
+    """Parses a JSON object; `what` names it in errors."""
     try:
         reply = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""A lease: the right to fly some robots, and what may be done with it."""
+"""Leases: the right to fly some robots, and the requests that need it."""
 
 import os
 from base64 import b64encode
@@ -15,33 +15,33 @@ from emberwatch.common.arguments import as_moves, as_seeds
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 
-#: Maximum number of bytes of a belief in one message.
+#: Maximum number of bytes of a belief in one request.
 _BELIEF_PART: Final = 1 << 19
 
 
 class Lease:
-    """The right to fly consecutive robots. Ends by `release`, or leaving its `with`.
+    """The right to fly consecutive robots. It ends with `release`, or on leaving its `with` block.
 
-    A path is flown in the step k that it is meant for: of each world, the one after the last step
-    that this lease has stepped to, reset to or observed.
+    The lease keeps the step k of each world: the last one that it stepped to, reset to or observed.
+    A path is for the step after this one, and the server flies it in no other step.
     """
 
     def __init__(
         self, client: ServerConnection, grant: Grant, start: tuple[WorldInfo, ...], robots: range
     ) -> None:
         self.client: Final = client
-        #: The server's number for it.
+        #: The lease's number on the server.
         self.number: Final = grant.lease
-        #: It ends this many seconds after its last use.
+        #: Seconds since its last use after which the lease expires.
         self.ttl: Final = grant.ttl_millis / 1000
-        #: The numbers of the robots it covers.
+        #: The numbers of its robots.
         self.robots: Final = robots
         self._all = robots.start, len(robots)
-        #: The worlds that these robots are in.
+        #: The worlds of these robots.
         self.worlds: Final = self._worlds_of(robots)
-        #: Where these worlds stood when it was given.
+        #: The state of these worlds when the lease was granted.
         self.start: Final = start
-        #: It knows k of each world.
+        #: The native lease, which keeps the step k of each world.
         self.native = client.lease(grant.lease, robots)
         self._is_over = False
         self._note(start)
@@ -57,22 +57,24 @@ class Lease:
     ) -> StepAnswer:
         """Flies one path with each robot, and moves the worlds from k to k + 1.
 
-        Where others hold robots of the world, it waits for their paths too.
+        If other clients hold robots of the same world, the step waits for their paths, too.
 
         Args:
-            paths: Moves, integers: 0 up, 1 down, 2 left, 3 right; `(n_robots, T)`, or `(T,)` for
-                one robot.
-            robots: Only these, consecutive, and all of the lease in their worlds; None: all.
-            full: Observe every cell; needs a server with coverage "client" or "full".
-            team: Get the frame of each world's team instead of each robot's.
+            paths: Moves: 0 up, 1 down, 2 left, 3 right. Integers of shape (n_robots, T), or (T,)
+                for one robot.
+            robots: The numbers of consecutive robots to fly: all robots that the lease has in some
+                of its worlds. None: all robots of the lease.
+            full: Whether to observe every cell. Requires a server with coverage "client" or "full".
+            team: Whether to return one frame for each world's team instead of one for each robot.
+            timeout: Seconds to wait for the answer.
 
         Raises:
-            InvalidArgumentError: If the paths are not of that shape, type and range.
-            LeaseLostError: If the lease ended or a robot was taken over.
-            RequestTimeoutError: If no answer comes; `observe` tells whether the step was made.
+            InvalidArgumentError: If the paths do not have this shape, type and range.
+            LeaseLostError: If the lease expired or a robot was taken over.
+            RequestTimeoutError: If no answer comes; `observe` shows whether the step was made.
             ServerGoneError: If the server ended.
-            EmberwatchError: With code `"late"`: the world has moved on without this path, `observe`
-                tells to where. With code `"episode_over"`: reset that world.
+            EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
+                shows to which step. With code `"episode_over"`: reset that world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
         answer = self.native.step(paths, *place, timeout)
@@ -90,25 +92,25 @@ class Lease:
         accepts_late: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> tuple[StepAnswer, int]:
-        """Flies one path with each robot, as `step`, however long teammates take.
+        """Flies one path with each robot, like `step`, and waits however long teammates take.
 
-        After each timeout it looks whether the worlds have moved, and if not, sends the paths
-        again. It waits as long as the server answers. If paths of another thread moved a world,
-        that world counts as moved on without these paths.
+        After each timeout it observes whether the worlds have moved, and sends the paths again if
+        not. It waits as long as the server answers. If another thread's paths moved a world, the
+        world counts as moved on without these paths.
 
         Args:
-            paths: As for `step`.
-            robots: As for `step`.
-            accepts_late: If a world has moved on without these paths, return how it stands instead
-                of raising the error with code `"late"`.
-            timeout: Seconds until it looks; the server's own deadline for teammates comes on top.
+            paths: As in `step`.
+            robots: As in `step`.
+            accepts_late: Whether to return the current results of a world that moved on without
+                these paths, instead of raising the error with code `"late"`.
+            timeout: Seconds until it observes. The server's own deadline for teammates is added.
 
         Returns:
-            How the worlds stand, and how many of their steps passed unseen before.
+            The results and frames, and the number of steps that the worlds made unobserved before.
 
         Raises:
-            RequestTimeoutError: If the server answers no observation either.
-            EmberwatchError: As `step`.
+            RequestTimeoutError: If the server does not answer the observation either.
+            EmberwatchError: As in `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
         return self.fly_from(paths, *place, accepts_late, timeout)
@@ -116,7 +118,7 @@ class Lease:
     def fly_from(
         self, paths: ArrayLike, first: int, n_robots: int, accepts_late: bool, timeout: float
     ) -> tuple[StepAnswer, int]:
-        """Like `fly`, for `n_robots` consecutive robots from number `first`, all of the lease."""
+        """Like `fly`, for `n_robots` consecutive robots of the lease from number `first` on."""
         flown = self.native.fly(paths, first, n_robots, accepts_late, timeout)
         if flown is None:
             moves = as_moves(paths, n_robots, self.client.info.n_moves)
@@ -131,9 +133,14 @@ class Lease:
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """Returns the last results and frames of its robots again, or of some of them.
+        """Returns the results and frames of the last step again.
 
-        The next `step` is for the observed step.
+        The next `step` continues from the observed step.
+
+        Args:
+            robots: The numbers of consecutive robots; None: all robots of the lease.
+            team: Whether to return one frame for each world's team instead of one for each robot.
+            timeout: Seconds to wait for the answer.
         """
         place = self._place(robots, team * wire.TEAM_FRAMES)
         return StepAnswer(self.native.observe(*place, timeout))
@@ -145,16 +152,17 @@ class Lease:
         worlds: Sequence[int] | None = None,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Begins new episodes: burn-in, k = 0, the robots at their starts, empty frames.
+        """Begins new episodes: burn-in, then k = 0, robots at their start cells, empty frames.
 
         No other client may hold robots of these worlds.
 
         Args:
-            seeds: One per world; None: the server derives the next from the world's last.
-            worlds: Only these worlds; None: all of the lease.
+            seeds: One seed for each world; None: the server derives it from the world's last seed.
+            worlds: The worlds to reset; None: all worlds of the lease.
+            timeout: Seconds to wait for the answer.
 
         Returns:
-            Where the worlds stand, in the order asked.
+            The state of each reset world, in the given order.
         """
         pairs = as_seeds(seeds, self.worlds if worlds is None else worlds)
         return self._note(records(WorldInfo, self._ask("reset", timeout, worlds=pairs)))
@@ -167,12 +175,16 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Replaces its worlds with the worlds of a snapshot file, which continue bit for bit.
+        """Replaces worlds of the lease with worlds of a snapshot file, which continue bit for bit.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
-            worlds: Only these worlds, consecutive; None: all of the lease.
-            first: The first of the file's worlds that is read.
+            worlds: The consecutive worlds to replace; None: all worlds of the lease.
+            first: The file's world that replaces the first of them; the next ones follow.
+            timeout: Seconds to wait for the answer.
+
+        Returns:
+            The state of each restored world.
         """
         chosen = self.worlds if worlds is None else _part("worlds", worlds, self.worlds)
         place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
@@ -182,7 +194,13 @@ class Lease:
     def fork(
         self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
     ) -> tuple[WorldInfo, ...]:
-        """Replaces its world `target` with a copy of any world: both have the same future."""
+        """Replaces the lease's world `target` with a copy of the world `source`.
+
+        With the same actions, both worlds have the same future.
+
+        Returns:
+            The state of the world `target`.
+        """
         reply = self._ask("fork", timeout, **{"from": source, "to": target})
         return self._note(records(WorldInfo, reply))
 
@@ -195,13 +213,14 @@ class Lease:
         robot: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Leaves bytes about the present step to a robot's next client (`Client.belief`).
+        """Stores bytes about the current step for a robot's next client, for `Client.belief`.
 
         Args:
-            result: The robot's last result; another step is refused.
-            kind: Says to other agents what the bytes are, in at most 256 bytes.
-            data: At most 32,768 bytes and 76 per cell; more if the model has over 18 states.
-            robot: Its number; None: the first of the lease.
+            result: The robot's last result. The server refuses another step than the current one.
+            kind: The format of the bytes, for other agents. At most 256 bytes.
+            data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
+            robot: The robot's number; None: the first robot of the lease.
+            timeout: Seconds to wait for the answer.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
             self._ask(
@@ -217,11 +236,11 @@ class Lease:
             )
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
-        """Starts the lease's clock again without acting."""
+        """Restarts the lease's expiry time without acting."""
         self._ask("renew", timeout)
 
     def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Gives the robots back. May be called again."""
+        """Ends the lease, so that other clients may fly its robots. May be called again."""
         if not self._is_over:
             self._is_over = True
             self._ask("release", timeout)
@@ -231,7 +250,7 @@ class Lease:
         return self.client.control(request, timeout=timeout)
 
     def _place(self, robots: range | None, flags: int) -> tuple[int, int, int]:
-        """The first of some robots or of all, how many, and flags."""
+        """Returns the first of the chosen robots, their number, and the flags."""
         if robots is None:
             return *self._all, flags
         chosen = _part("robots", robots, self.robots)
@@ -253,7 +272,7 @@ class Lease:
         try:
             self.release()
         except Exception:
-            if kind is None:  # otherwise the first error says more
+            if kind is None:  # otherwise the error of the `with` block says more
                 raise
 
 

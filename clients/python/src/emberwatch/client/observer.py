@@ -1,6 +1,7 @@
-"""Observers: read what happens on an instance, before, while and after a server runs.
+"""Observers of an instance: readers of frames, hidden states and beliefs.
 
-Such as `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`.
+For example `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`. An
+observer may start before the server, and outlives it.
 """
 
 import time
@@ -16,7 +17,7 @@ from emberwatch.client.connection import Closable
 from emberwatch.client.wire import RobotResult, WorldResult
 from emberwatch.errors import EmberwatchError, RequestTimeoutError, invalid
 
-#: How long to wait for samples of given steps before they are first asked for again, seconds.
+#: Seconds to wait for the samples of given steps before a new reader is opened.
 _RETRY: Final = 0.02
 
 _Sample = TypeVar("_Sample")
@@ -25,10 +26,10 @@ _Step = TypeVar("_Step", bound="Frame | Truth")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobotFrame:
-    """What one robot flew and saw, copied."""
+    """The path and the frame of one robot in one step. Arrays are copies."""
 
     result: RobotResult
-    #: What it saw, `(H, W)`: an observation, or 255 where it saw nothing.
+    #: Its frame, `(H, W)`: the observed value of each cell, 255 in unobserved cells.
     frame: NDArray[np.uint8]
     #: The moves that it flew, `(n_moves,)`; empty after a reset, or if it stayed.
     path: NDArray[np.uint8]
@@ -36,18 +37,19 @@ class RobotFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
-    """A published step of one world, copied."""
+    """A published step of one world. Arrays are copies."""
 
+    #: Number of the world.
     world: int
     result: WorldResult
-    #: By robot of the world.
+    #: One entry for each robot of the world.
     robots: tuple[RobotFrame, ...]
-    #: Samples that this observer missed since the last one it got.
+    #: Number of samples that this observer missed since its last one.
     n_lost: int
 
     @property
     def frame(self) -> NDArray[np.uint8]:
-        """What the team saw, `(H, W)`: an observation, or 255 where nobody saw anything."""
+        """The team's frame, `(H, W)`: observed values, 255 in cells that no robot observed."""
         return np.minimum.reduce([robot.frame for robot in self.robots])
 
     @property
@@ -58,17 +60,19 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """Published hidden states, copied. For evaluation and pictures, never for learners."""
+    """The published hidden states of one world, for evaluation and pictures, never for learners."""
 
+    #: Number of the world.
     world: int
-    #: Resets of the world since the server started.
+    #: Number of resets of the world since the server started.
     episode: int
-    #: k of the states.
+    #: The step k.
     step: int
+    #: Seed of the episode.
     seed: int
-    #: The hidden states, `(H, W)`.
+    #: The hidden states X_k, `(H, W)`; a copy.
     states: NDArray[np.uint8]
-    #: Samples that this reader missed since the last one it got.
+    #: Number of samples that this reader missed since its last one.
     n_lost: int
 
     @property
@@ -79,31 +83,38 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outlook:
-    """What an agent believes about a world and plans there, copied."""
+    """An agent's published belief about a world, and its last plan there."""
 
+    #: Number of the world.
     world: int
-    #: Resets of the world since the server started.
+    #: Number of resets of the world since the server started.
     episode: int
-    #: k of the state that the belief is about.
+    #: The step k.
     step: int
+    #: Seed of the episode.
     seed: int
-    #: The belief after that step's frame, `(S, H, W)`, each in 0..=1.
+    #: The belief about X_k after its frame, `(S, H, W)`, probabilities; a copy.
     belief: NDArray[np.float32]
+    #: Names of the S states.
     states: tuple[str, ...]
+    #: Name of the agent's policy.
     policy: str
+    #: Name of the estimator that keeps the belief.
     belief_from: str
-    #: What the last path was for.
+    #: The objective of the last path.
     objective: str
+    #: Milliseconds that planning the last path took.
     plan_millis: float
+    #: Process ID of the agent.
     pid: int
     #: The numbers of the robots that the agent flies.
     robots: range
-    #: Samples of this agent that this reader missed since the last one it got.
+    #: Number of this agent's samples that this reader missed since its last one.
     n_lost: int
 
 
 class Reader(Closable, Generic[_Sample]):
-    """A subscriber of one channel. It never slows whom it reads."""
+    """A subscriber of one channel. A slow reader loses samples; it never delays the publisher."""
 
     def __init__(
         self, instance: str, native: _native.Frames | _native.Truths | _native.Outlooks
@@ -115,7 +126,7 @@ class Reader(Closable, Generic[_Sample]):
         self._native.close()
 
     def receive(self, timeout: float) -> _Sample | None:
-        """The next sample; `None` if none comes within `timeout` seconds."""
+        """Returns the next sample; `None` if none comes within `timeout` seconds."""
         fields = self._native.receive(timeout)
         return None if fields is None else self._made(fields)
 
@@ -124,7 +135,10 @@ class Reader(Closable, Generic[_Sample]):
 
 
 class Observer(Reader[Frame]):
-    """Reads the frames of an instance, a sample for each step of a world. Iterate over it."""
+    """A reader of the frames of an instance: one sample for each step of each world.
+
+    Iterate over it, or call `receive`.
+    """
 
     def __init__(
         self, instance: str = "default", *, world: int | None = None, timeout: float | None = None
@@ -134,9 +148,9 @@ class Observer(Reader[Frame]):
         self._timeout = timeout
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames as they come, until none comes for `timeout`; without one, for ever."""
+        """Yields frames as they come, until none comes for `timeout` seconds (None: for ever)."""
         while True:
-            # In portions, so that time does not overflow.
+            # Waits an hour at a time: an infinite wait would overflow.
             frame = self.receive(3600.0 if self._timeout is None else self._timeout)
             if frame is not None:
                 yield frame
@@ -148,7 +162,7 @@ class Observer(Reader[Frame]):
 
 
 class TruthReader(Reader[Truth]):
-    """Reads the hidden states of an instance whose server publishes them."""
+    """A reader of the hidden states of an instance, if its server publishes them."""
 
     def __init__(self, instance: str = "default") -> None:
         super().__init__(instance, _native.Truths(instance))
@@ -158,7 +172,10 @@ class TruthReader(Reader[Truth]):
 
 
 class OutlookReader(Reader[Outlook]):
-    """Reads what agents believe, which they publish while there is a reader."""
+    """A reader of the beliefs of the agents of an instance.
+
+    Agents publish their beliefs only while there is a reader.
+    """
 
     def __init__(self, instance: str = "default") -> None:
         super().__init__(instance, _native.Outlooks(instance))
@@ -171,7 +188,7 @@ class OutlookReader(Reader[Outlook]):
 
 
 class Newest(Generic[_Step]):
-    """The newest samples of consecutive worlds: for infos, pictures and rewards by the move."""
+    """The newest samples of consecutive worlds, for infos, pictures and rewards of single moves."""
 
     def __init__(self, subscribe: Callable[[], Reader[_Step]], worlds: range) -> None:
         self._subscribe = subscribe
@@ -182,11 +199,12 @@ class Newest(Generic[_Step]):
     def at(
         self, moments: Sequence[tuple[int, int, int]], timeout: float, first: int = 0
     ) -> list[_Step]:
-        """The samples of the worlds from `first` on at these moments.
+        """Waits for the samples of the given moments, and returns them.
 
         Args:
-            moments: Seed, episode and step of each world.
-            first: The first of these worlds, counted from 0.
+            moments: Seed, episode and step of consecutive worlds.
+            timeout: Seconds to wait.
+            first: Index of the first of these worlds.
         """
         wanted = dict(zip(self._worlds[first:], moments, strict=False))
         begin = asked = time.perf_counter()
@@ -194,13 +212,13 @@ class Newest(Generic[_Step]):
         while any(self._moment(world) != moment for world, moment in wanted.items()):
             now = time.perf_counter()
             if now - begin > timeout:
-                raise RequestTimeoutError(f"nothing was published within {timeout} s")
-            # The samples of other worlds may have displaced these: a new reader gets all again.
-            # Where it missed nothing, they may just take longer.
+                raise RequestTimeoutError(f"the step was not published within {timeout} s")
+            # If this reader lost samples, the ones it waits for may be among them: a new reader
+            # receives the current sample of each world. Without losses it waits longer each time.
             if now - asked > (_RETRY if n_lost else _RETRY * 2**n_asked):
                 self.close()
                 asked, n_asked, n_lost = now, n_asked + 1, 0
-            if self._reader is None:  # also where it was interrupted in between
+            if self._reader is None:  # closed above, or an earlier call was interrupted there
                 self._reader = self._subscribe()
             sample = self._reader.receive(min(timeout, _RETRY))
             if sample is not None:
@@ -220,7 +238,7 @@ class Newest(Generic[_Step]):
 
 
 class Present(Closable):
-    """The hidden states of worlds in this process; `Newest` has the states of a server."""
+    """The current hidden states of worlds in this process, with the interface of `Newest`."""
 
     def __init__(self, read: Callable[[range], list[dict[str, Any]]]) -> None:
         self._read = read
@@ -228,7 +246,7 @@ class Present(Closable):
     def at(
         self, moments: Sequence[tuple[int, int, int]], _timeout: float, first: int = 0
     ) -> list[Truth]:
-        """As `Newest.at`."""
+        """Returns the hidden states of the given moments, as `Newest.at` does."""
         truths = [Truth(**fields) for fields in self._read(range(first, first + len(moments)))]
         got = [truth.moment for truth in truths]
         if got != list(moments):
@@ -242,23 +260,23 @@ class Present(Closable):
 def observe(
     instance: str = "default", *, world: int | None = None, timeout: float | None = None
 ) -> Observer:
-    """Observes an instance: an iterator of frames, also a context manager.
+    """Observes an instance. Returns an iterator of frames, which is also a context manager.
 
-    The server publishes every world's current frame as soon as an observer comes. Repeats are
-    possible: same episode, same step.
+    The server publishes the current frame of every world when an observer connects, so the same
+    step of the same episode may come twice.
 
     Args:
-        instance: The instance's name; its server may start later.
-        world: Only this world; None: all.
-        timeout: Iteration ends when no frame comes for so many seconds; None: never.
+        instance: The instance's name. Its server may start later.
+        world: The only world to observe; None: all worlds.
+        timeout: Seconds without a frame after which the iteration ends; None: it never ends.
     """
     if timeout is not None and not timeout >= 0:
-        raise invalid("timeout", "seconds, at least 0, or None", timeout)
+        raise invalid("timeout", "seconds of at least 0, or None", timeout)
     return Observer(instance, world=world, timeout=timeout)
 
 
 def frame_of(fields: dict[str, Any]) -> Frame:
-    """A step out of a sample's fields."""
+    """Makes a `Frame` of the fields of a sample."""
     fields["result"] = WorldResult(*fields["result"])
     fields["robots"] = tuple(
         RobotFrame(result=RobotResult(*result), frame=frame, path=path)

@@ -1,7 +1,7 @@
-"""Reads recordings, the files of `emberwatch-server record` (PROTOCOL.md section 13).
+"""Reader of recordings, the files of `emberwatch-server record` (PROTOCOL.md section 13).
 
-Such as `for record in emberwatch.recording.read("lab.recording", world=0): ...`. It needs no server
-and opens no shared memory.
+For example `for record in emberwatch.recording.read("lab.recording", world=0): ...`. Reading needs
+no server, and opens no shared memory.
 """
 
 import json
@@ -18,44 +18,47 @@ from emberwatch.errors import EmberwatchError
 
 
 class RecordingCutWarning(UserWarning):
-    """A recording ends without an end. Every record before is whole."""
+    """A recording was cut short. All records before the cut are complete."""
 
 
 class RecordingDamagedWarning(UserWarning):
-    """A recording has bytes that no recorder wrote. Every record before is whole."""
+    """A recording is damaged. All records before the damage are complete."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Record:
-    """A record, checked."""
+    """A checked record of a recording."""
 
-    #: Time since the recording began.
+    #: Seconds since the recording began.
     seconds: float
+    #: The server that published the sample.
     server: ServerInfo
-    #: Its `n_lost` counts the samples of that channel, of all worlds, that the recorder missed
-    #: right before it.
+    #: The sample. Its `n_lost` counts the samples of the same channel, of all worlds, that the
+    #: recorder missed right before it.
     sample: Frame | Truth
 
 
 def read(
     path: str | os.PathLike[str], *, world: int | None = None, strict: bool = False
 ) -> Iterator[Record]:
-    """Reads a recording: an iterator of its frames and hidden states, in order.
+    """Reads a recording. Yields its frames and hidden states in order.
 
-    Hidden states come before the frame of their step. They are for evaluation and pictures, never
+    The hidden states of a step come before its frame. They are for evaluation and pictures, never
     for learners.
 
     Args:
-        world: Only this world; None: all.
-        strict: Raise an error where there would be a warning.
+        path: The file.
+        world: The only world to read; None: all worlds.
+        strict: Whether to raise an error instead of each warning.
 
     Raises:
-        EmberwatchError: With code `"recording"` if the file is none, naming the byte.
-        OSError: If it cannot be read.
+        EmberwatchError: With code `"recording"` if the file is not a recording. The message names
+            the position of the first wrong byte.
+        OSError: If the file cannot be read.
 
     Warns:
-        RecordingCutWarning: After the last whole record of a file that was cut short.
-        RecordingDamagedWarning: After the last whole record before damage.
+        RecordingCutWarning: After the last complete record of a file that was cut short.
+        RecordingDamagedWarning: After the last complete record before the damage.
     """
     try:
         for record in _records(path):
@@ -79,6 +82,6 @@ def _records(path: str | os.PathLike[str]) -> Iterator[Record]:
         nanos, kind, content = record
         if kind == "server":
             server = record_from_reply(ServerInfo, json.loads(content))
-        elif server is not None:  # samples come behind their server
+        elif server is not None:  # a recording names the server before its samples
             sample = frame_of(content) if kind == "frame" else Truth(**content)
             yield Record(seconds=nanos / 1e9, server=server, sample=sample)

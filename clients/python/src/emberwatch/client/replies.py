@@ -1,4 +1,4 @@
-"""What comes back on JSON requests (PROTOCOL.md sections 6 and 13)."""
+"""Replies to JSON requests (PROTOCOL.md sections 6 and 13)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import Shape
-from emberwatch.common.arguments import told
+from emberwatch.common.arguments import repr_of
 from emberwatch.errors import bad_answer, invalid
 from emberwatch.model import Description, color_from_hex
 from emberwatch.model.airspace import Airspace, Zones
@@ -19,10 +19,12 @@ _Record = TypeVar("_Record")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedWorld:
-    """What a server tells of recorded hidden states."""
+    """A server's description of its recorded hidden states."""
 
-    #: Their names, colours, rewards and readings as TOML text; None if the server hides it.
+    #: Names, colours, rewards and observations of the states, as TOML text; None if the server
+    #: hides them.
     description: str | None
+    #: Number of recorded sequences.
     n_sequences: int
     #: Steps of the shortest episode.
     n_steps: int
@@ -30,89 +32,106 @@ class RecordedWorld:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerInfo:
-    """How a server describes itself (PROTOCOL.md section 6, `hello`)."""
+    """A server's description of itself and its worlds (PROTOCOL.md section 6, `hello`)."""
 
+    #: Version of the protocol.
     protocol: int
+    #: Release of the server.
     build: str
     pid: int
+    #: Rows of the grid.
     height: int
+    #: Columns of the grid.
     width: int
+    #: Moves of a path, T.
     n_moves: int
     n_worlds: int
     #: Robots of each world, R: robot r of world w has number w R + r.
     n_robots: int
+    #: Number of observed values, O.
     n_observations: int
+    #: One name for each observed value.
     observations: tuple[str, ...]
     #: The model as TOML text; None if the server hides it or its worlds were recorded.
     model: str | None
+    #: Steps that a world is simulated before k = 0.
     burn_in: int
     #: Steps until an episode is truncated; 0: never.
     max_steps: int
     max_clients: int
-    #: Which cells a step observes: "path", "full" or "client" (as the step asks).
+    #: Which cells a step observes: "path", "full" or "client" (the client decides in each step).
     coverage: str
+    #: Whether the server publishes the hidden states.
     publish_truth: bool
+    #: Default time since its last use after which a lease expires, milliseconds.
     lease_millis: int
-    #: How long the other robots have after the first path of a step; 0: as long as they hold it.
+    #: How long a step waits for the other robots after its first path, milliseconds; 0: as long as
+    #: other clients hold them.
     deadline_millis: int
-    #: The task that its worlds are, by its name.
+    #: Name of the task that defines the worlds; None: no task.
     task: str | None = None
-    #: Identifies the worlds: a hash of every setting that a reward depends on, besides seed and
-    #: policy. None from servers before release 0.3.
+    #: Hash of every setting that rewards depend on, except seed and policy. It identifies the
+    #: worlds. None from servers before release 0.3.
     worlds_fingerprint: str | None = None
-    #: None of simulated worlds.
+    #: The recorded hidden states; None if the worlds are simulated.
     recorded_world: RecordedWorld | None = None
-    #: That of the number `pid`.
+    #: The PID namespace in which `pid` is valid.
     pid_namespace: int | None = None
     #: Where robots may fly and what they see.
     airspace: Airspace = Airspace()  # noqa: RUF009
-    #: Zones of land; None where all cells are alike.
+    #: The zones of land; None if there are no zones.
     zones: Zones | None = None
 
     @property
     def recorded_states(self) -> Description | None:
-        """What recorded worlds say of their states; None if there are none, or it is hidden."""
+        """The description of recorded states; None if worlds are simulated, or it is hidden."""
         text = None if self.recorded_world is None else self.recorded_world.description
         return None if text is None else Description.from_toml(text)
 
     @property
     def shape(self) -> Shape:
-        """What the answers of this server depend on."""
+        """The numbers that determine the layout of this server's answers."""
         return Shape(self.n_robots, self.height, self.width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldInfo:
-    """Where one world stands."""
+    """The step, episode and robots of one world."""
 
+    #: Number of the world.
     world: int
+    #: The step k.
     step: int
+    #: Seed of the episode.
     seed: int
+    #: Number of resets since the server started.
     episode: int
-    #: The cell of each robot.
+    #: Row and column of each robot.
     robots: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldStatus(WorldInfo):
-    """One world in a `ServerStatus`."""
+    """The status of one world in a `ServerStatus`."""
 
-    #: The process that holds each robot, if any.
+    #: Process ID of the client that holds each robot; None if none does.
     holder_pids: tuple[int | None, ...]
-    #: Paths that have come for the next step.
+    #: Number of paths received for the next step.
     n_paths: int
-    #: Whether it is in its burn-in.
+    #: Whether the world is in its burn-in.
     resetting: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerStatus:
-    """What is going on at a server."""
+    """A server's load, and the status of its worlds."""
 
     pid: int
     uptime_millis: int
+    #: Number of world steps since the start.
     n_steps: int
     steps_per_second: float
+    #: Number of refused requests since the start.
     n_refused: int
     n_clients: int
     n_observers: int
@@ -141,18 +160,19 @@ class LeftBeliefInfo:
 
 
 class LeftBelief(NamedTuple):
-    """What an agent left about a world to the next."""
+    """A belief about a world that an agent left for the next agent."""
 
-    #: Says what the bytes are.
+    #: The format of the bytes.
     kind: str
+    #: Number of resets of the world since the server started.
     episode: int
-    #: The step k at which it was left: the present one.
+    #: The step k that the belief is about: the current one.
     step: int
     data: bytes
 
 
 def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
-    """The records of a reply's worlds."""
+    """Parses the records of a reply's `worlds`."""
     worlds = reply.get("worlds")
     if not isinstance(worlds, list):
         raise bad_answer("reply", "a list 'worlds'", repr(worlds))
@@ -160,7 +180,7 @@ def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...
 
 
 def record(kind: type[_Record], keys: Any) -> _Record:
-    """A record from a reply; keys that this release does not know are ignored."""
+    """Parses a record of a reply. Keys that this release does not know are ignored."""
     if not isinstance(keys, Mapping):
         raise bad_answer("reply", "an object", repr(keys))
     given = cast("Mapping[str, Any]", keys)
@@ -170,7 +190,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
             continue
         if name in ("pid_namespace", "task", "worlds_fingerprint") and name not in given:
             continue
-        if name == "recorded_world":  # it may be missing, too
+        if name == "recorded_world":  # may also be missing
             nested = given.get(name)
             values[name] = None if nested is None else record(RecordedWorld, nested)
             continue
@@ -186,7 +206,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
 
 
 def _land(given: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Airspace | Zones]:
-    """What the answer to `hello` says of airspace and zones; both may be missing."""
+    """Parses airspace and zones of the answer to `hello`; both may be missing."""
     land: dict[str, Airspace | Zones] = {}
     airspace, zones = given.get("airspace"), given.get("zones")
     try:
@@ -207,25 +227,28 @@ def _land(given: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Airspac
 
 
 def _cells(what: str, rows: Any, shape: tuple[int, int], n_values: int) -> NDArray[np.uint8]:
-    """A map of the grid from its rows, which have numbers below `n_values`."""
+    """Parses a map of the grid from its rows of numbers below `n_values`."""
     try:
         cells = np.array(rows)
     except ValueError:  # rows differ in length
         cells = np.empty(0)
     is_map = cells.shape == shape and cells.dtype.kind == "i"
     if not is_map or ((cells < 0) | (cells >= n_values)).any():
-        raise invalid(what, f"integers below {n_values} of shape {shape}", told(rows))
+        raise invalid(what, f"integers below {n_values} of shape {shape}", repr_of(rows))
     return cells.astype(np.uint8)
 
 
 def _as_tuples(value: Any) -> Any:
-    """Lists, and those in them, as tuples."""
+    """Converts lists, and the lists in them, to tuples."""
     return tuple(map(_as_tuples, cast("list[Any]", value))) if isinstance(value, list) else value
 
 
 @cache
 def _types(kind: type[Any]) -> dict[str, Any]:
-    """What each field of a record may be: a tuple of anything, and any number for a float."""
+    """Returns the accepted type of each field of a record.
+
+    A tuple may hold anything, and a float may be any number.
+    """
     wider = {float: int | float}
     return {
         name: tuple if get_origin(hint) is tuple else wider.get(hint, hint)

@@ -1,4 +1,4 @@
-"""Names and types of the wire, as PROTOCOL.md describes it: codes, limits, results, answers."""
+"""Names and types of PROTOCOL.md: codes, limits, results and answers."""
 
 import struct
 from typing import Final, NamedTuple
@@ -10,43 +10,44 @@ from emberwatch._native import Answer
 from emberwatch.common.codes import N_MOVES as N_MOVES
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 
-#: Operations of `step`.
+#: Operations of the channel `step`.
 STEP: Final = 1
 OBSERVE: Final = 2
 RECALL: Final = 3
 
-#: Flags: a step that observes every cell; an answer with the team's frame of each world.
+#: Flags of a request: observe every cell; answer with one frame for each world's team.
 FULL_COVERAGE: Final = 1
 TEAM_FRAMES: Final = 2
 
-#: Number of samples that a reader of hidden states may be behind.
+#: Number of samples that a reader of hidden states may lag behind.
 TRUTH_BUFFER: Final = 128
 
 
 class WorldResult(NamedTuple):
-    """How one world stands after a step or a reset (PROTOCOL.md, `WorldResult`)."""
+    """The result of one world after a step or a reset (PROTOCOL.md, `WorldResult`)."""
 
     #: k, the number of steps since the last reset.
     step: int
-    #: Seed of the episode. With the model it gives the hidden state away: not for learners.
+    #: Seed of the episode. Seed and model determine the hidden states: not for learners.
     seed: int
-    #: Resets of this world since the server started.
+    #: Number of resets of this world since the server started.
     episode: int
-    #: The team's: the sum of the model's rewards over the distinct cells that any robot visited.
+    #: Reward of the team: the sum of the model's rewards over all distinct cells that its robots
+    #: visited.
     reward: float
-    #: Bit r: nobody held robot r.
+    #: Bit r is 1 if no client held robot r, which hovered.
     hovered: int
-    #: Bit r: robot r was held, and its path came too late.
+    #: Bit r is 1 if robot r was held, but its path came too late.
     late: int
-    #: Cells of the whole grid in the state that pays most (fire): for reports.
+    #: Number of cells of the whole grid in the state that pays most (fire); for reports.
     n_target_cells: int
-    #: Distinct cells that the team visited.
+    #: Number of distinct cells that the team visited.
     n_visited: int
-    #: Of these, those in the state that pays most.
+    #: Number of these cells that were in the state that pays most.
     n_hits: int
     #: 1 if the episode ended by itself.
     terminated: int
-    #: 1 if the server's `max_steps` ended it.
+    #: 1 if the server's `max_steps` ended the episode.
     truncated: int
 
     @property
@@ -56,57 +57,57 @@ class WorldResult(NamedTuple):
 
 
 class RobotResult(NamedTuple):
-    """How one robot stands after a step or a reset (PROTOCOL.md, `RobotResult`)."""
+    """The result of one robot after a step or a reset (PROTOCOL.md, `RobotResult`)."""
 
-    #: Its share: a cell that v robots visited pays 1 / v of its reward.
+    #: The robot's share of the team's reward: a cell that v robots visited pays each of them 1 / v.
     reward: float
-    #: What the team's reward would lack without it.
+    #: The robot's marginal reward: how much lower the team's reward would be without it.
     marginal: float
-    #: Distinct cells that it visited.
+    #: Number of distinct cells that it visited.
     n_visited: int
-    #: Of these, those in the state that pays most.
+    #: Number of these cells that were in the state that pays most.
     n_hits: int
-    #: Where its path began.
+    #: The cell where its path began.
     start_row: int
     start_col: int
-    #: Where it is.
+    #: Its current cell.
     row: int
     col: int
-    #: What its frame shows: 0 nothing, 1 the path, 2 every cell.
+    #: The observed cells of its frame: 0 none, 1 the path, 2 every cell.
     coverage: int
-    #: Moves flown: 0 after a reset, or if it hovered or was late.
+    #: Number of moves flown: 0 after a reset, or if the robot hovered or was late.
     n_moves: int
 
     @property
     def start(self) -> tuple[int, int]:
-        """The cell where its path began."""
+        """Row and column where its path began."""
         return self.start_row, self.start_col
 
     @property
     def cell(self) -> tuple[int, int]:
-        """The cell where it is."""
+        """Its current row and column."""
         return self.row, self.col
 
 
 class StepResult(NamedTuple):
-    """How one robot and its world stand after a step or a reset."""
+    """The results of one robot and its world after a step or a reset."""
 
     world: WorldResult
     robot: RobotResult
 
 
-#: The results as bytes.
+#: Byte layouts of the results.
 WORLD: Final = struct.Struct("=QQQdQQIIIHH")
 ROBOT: Final = struct.Struct("=ddIIIIIIII")
 
-#: The same for many at once, and a `StepResult` for each robot.
+#: The same layouts for NumPy; `RESULT_DTYPE` is a `StepResult`.
 WORLD_DTYPE: Final = np.dtype([*zip(WorldResult._fields, WORLD.format[1:], strict=True)])
 ROBOT_DTYPE: Final = np.dtype([*zip(RobotResult._fields, ROBOT.format[1:], strict=True)])
 RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
 
 
 class Shape(NamedTuple):
-    """What the meaning of an answer depends on, as `hello` tells it."""
+    """The numbers that determine the layout of answers, from the reply to `hello`."""
 
     #: Robots of a world, R.
     n_robots: int
@@ -114,7 +115,7 @@ class Shape(NamedTuple):
     width: int
 
     def n_worlds(self, first_robot: int, n_robots: int) -> int:
-        """How many worlds some consecutive robots are in."""
+        """Returns the number of worlds that the given consecutive robots are in."""
         last_robot = first_robot + n_robots - 1
         return last_robot // self.n_robots - first_robot // self.n_robots + 1
 
@@ -124,28 +125,28 @@ class StepAnswer:
 
     Attributes:
         first_robot: The number of the first robot; robot r of world w has number w R + r.
-        simulation_nanos: How long the simulation took, nanoseconds.
-        frames: What each robot saw, `(n_robots, H, W)`: an observation, or 255 where nothing was
-            seen. If team frames were asked for: what all robots of each world saw,
-            `(n_worlds, H, W)`. They are your own; write to them as you like.
+        simulation_nanos: Nanoseconds that the simulation took.
+        frames: The frame of each robot, `(n_robots, H, W)`: observed values, 255 in unobserved
+            cells. If team frames were requested: the frame of each world's team,
+            `(n_worlds, H, W)`. The array is a copy that you may write to.
     """
 
     __slots__ = ("first_robot", "frames", "native", "simulation_nanos")
 
     def __init__(self, native: Answer) -> None:
-        """Presents an answer of the native module."""
+        """Wraps an answer of the native module."""
         self.native: Final = native
         self.first_robot, self.simulation_nanos = native.first_robot, native.simulation_nanos
         self.frames = native.frames
 
     @property
     def worlds(self) -> NDArray[np.void]:
-        """A `WorldResult` per world, `(n_worlds,)` of `WORLD_DTYPE`."""
+        """One `WorldResult` for each world, `(n_worlds,)` of `WORLD_DTYPE`."""
         return self.native.worlds.view(WORLD_DTYPE)
 
     @property
     def robots(self) -> NDArray[np.void]:
-        """A `RobotResult` per robot, `(n_robots,)` of `ROBOT_DTYPE`."""
+        """One `RobotResult` for each robot, `(n_robots,)` of `ROBOT_DTYPE`."""
         return self.native.robots.view(ROBOT_DTYPE)
 
     def __repr__(self) -> str:
@@ -158,15 +159,15 @@ class StepAnswer:
 
     @property
     def world_of(self) -> NDArray[np.int64]:
-        """The position in `worlds` of each robot's world, `(n_robots,)`."""
+        """The index in `worlds` of each robot's world, `(n_robots,)`."""
         return self.native.world_of_robots
 
     @property
     def results(self) -> NDArray[np.void]:
-        """One `StepResult` per robot, `(n_robots,)` of `RESULT_DTYPE`; a new array."""
+        """One `StepResult` for each robot, `(n_robots,)` of `RESULT_DTYPE`; a new array."""
         return self.native.results.view(RESULT_DTYPE)
 
     def result(self, index: int = 0) -> StepResult:
-        """The results of one robot and its world; `index` counts from the first."""
+        """Returns the results of one robot and its world; `index` 0 is the first robot."""
         world, robot = self.native.result(index)
         return StepResult(WorldResult(*world), RobotResult(*robot))

@@ -1,1 +1,1 @@
-"""What every room uses: checks of arguments, paths, shared numbers."""
+"""Shared by the whole package: checks of arguments, paths, constants."""

@@ -1,4 +1,4 @@
-"""What callers hand in: seeds, choices, moves, each checked before anything is sent."""
+"""Checks of arguments, such as seeds and moves, before anything is sent."""
 
 import json
 import operator
@@ -19,58 +19,62 @@ _Value = TypeVar("_Value")
 
 
 def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
-    """All settings that a server with these would have, by their names in `config/server.toml`."""
+    """Checks settings, and returns them with all defaults, by their names in `config/server.toml`.
+
+    Raises:
+        InvalidArgumentError: If a server would refuse them.
+    """
     return json.loads(_native.check_settings(json.dumps(settings)))
 
 
 def as_setting(name: str, value: object) -> bool | int | str:
-    """The value of a setting, as JSON and programs take it."""
+    """Converts the value of a setting to its JSON form."""
     if isinstance(value, np.generic):
         value = cast("object", value.item())
     if isinstance(value, bool | int):
         return value
     if isinstance(value, str | PathLike):
         return utf8(name, cast("str | PathLike[str]", value))
-    raise invalid(name, "an integer, True or False, text or a path", told(value))
+    raise invalid(name, "an integer, True or False, text or a path", repr_of(value))
 
 
 def as_seed(seed: object) -> int:
-    """Checks a world's seed: an integer of Python, NumPy or another library."""
+    """Checks a world's seed: an integer of Python, NumPy or another library, below 2**64."""
     number = as_integer(seed)
     if number is not None and 0 <= number < 2**64:
         return number
-    raise invalid("seed", "an integer within 0 to 2**64 - 1", told(seed))
+    raise invalid("seed", "an integer within 0 to 2**64 - 1", repr_of(seed))
 
 
 def as_integer(value: object) -> int | None:
-    """One integer of any library, as Python's own; None: it is none."""
+    """Converts an integer of any library to an `int`; None if the value is not one integer."""
     if isinstance(value, int | np.integer):
         return int(cast("int", value))
     try:
         return None if _is_masked(value) else operator.index(cast("SupportsIndex", value))
-    except Exception:  # of any kind: what a library says of an array that is elsewhere, or of many
+    except Exception:  # any type: libraries differ on arrays on a GPU, or with several elements
         return None
 
 
 def as_count(value: object, subject: str, least: int, most: int) -> int:
-    """Checks an integer within `least` to `most`; refuses True and False."""
+    """Checks that a value is an integer within `least` to `most`; refuses True and False."""
     number = None if isinstance(value, bool) else as_integer(value)
     if number is not None and least <= number <= most:
         return number
-    raise invalid(subject, f"an integer within {least} to {most}", told(value))
+    raise invalid(subject, f"an integer within {least} to {most}", repr_of(value))
 
 
 def as_flag(value: object, subject: str) -> bool:
-    """Checks a switch: True or False, of Python or NumPy."""
+    """Checks that a value is True or False, of Python or NumPy."""
     if isinstance(value, bool | np.bool_):
         return bool(cast("bool", value))
-    raise invalid(subject, "True or False", told(value))
+    raise invalid(subject, "True or False", repr_of(value))
 
 
 def as_seeds(
     seeds: Iterable[int | None] | None, worlds: Iterable[int]
 ) -> list[dict[str, int | None]]:
-    """Checks the seeds of a reset, one for each world, and names them as its request does."""
+    """Checks the seeds of a reset, one for each world; returns the entries of its request."""
     chosen = list(worlds)
     given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
     if len(given) != len(chosen):
@@ -82,23 +86,23 @@ def as_seeds(
 
 
 def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
-    """What a caller gives for each world."""
+    """Makes a list of an argument with one value for each world."""
     try:
         return list(values)
-    except Exception as error:  # of any kind, as of `as_array`
+    except Exception as error:  # any type, as in `as_array`
         got = f"{type(values).__name__}: {error}"
         raise invalid(subject, "one for each world", got) from None
 
 
 def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
-    """An array of any library as NumPy's own, without masked values, which mean nothing."""
+    """Converts an array of any library to a NumPy array; refuses masked values."""
     if type(value) is np.ndarray:
         return value
     if isinstance(value, int | np.generic):
         return np.asarray(value)
     try:
         given = np.asarray(value)
-    except Exception as error:  # of any kind: the library's own words, as of an array on a GPU
+    except Exception as error:  # any type, in the library's own words: an array on a GPU, say
         raise invalid(subject, expected, f"{type(value).__name__}: {error}") from None
     is_sequence = isinstance(value, list | tuple)
     if any(map(_is_masked, cast("list[object]", value))) if is_sequence else _is_masked(value):
@@ -110,8 +114,8 @@ def _is_masked(value: object) -> bool:
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(cast("Any", value)))
 
 
-def told(value: object) -> str:
-    """What a caller gave, or what it says instead of showing itself."""
+def repr_of(value: object) -> str:
+    """Returns the `repr` of an argument for an error, or the exception that its `repr` raises."""
     try:
         return repr(value)
     except Exception as error:
@@ -119,7 +123,7 @@ def told(value: object) -> str:
 
 
 def as_json(value: object) -> Any:
-    """A keyword as JSON has it, which means the same: for `spec.to_json`, and so for Minari."""
+    """Converts a keyword to an equivalent JSON value: for `spec.to_json`, which Minari calls."""
     if isinstance(value, PathLike):
         return fspath(cast("PathLike[str]", value))
     if isinstance(value, np.generic | np.ndarray):
@@ -139,11 +143,11 @@ def as_choice(action: object, n_choices: int) -> int:
     given = as_array(action, "action", expected)
     if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
         return int(given.item())
-    raise invalid("action", expected, told(action))
+    raise invalid("action", expected, repr_of(action))
 
 
 def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:
-    """Checks actions, one integer below `n_choices` for each world, and makes them bytes."""
+    """Checks actions, one integer below `n_choices` for each world; returns them as uint8."""
     chosen = _native.choices(actions, n_worlds, n_choices)
     if chosen is not None:
         return chosen
@@ -158,7 +162,7 @@ def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uin
 
 
 def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
-    """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes."""
+    """Checks paths, shape (n_worlds, T) or for one world (T,); returns them as uint8."""
     is_read = type(paths) is np.ndarray
     given = paths if is_read else as_array(paths, "action", "an array of moves")
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
@@ -166,7 +170,7 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
         raise invalid("action", f"shape ({n_worlds}, {n_moves}){one}", given.shape)
     if given.dtype.kind not in "iu":
         raise invalid("action", "integers", given.dtype)
-    # One shift leaves something of each value below 0 or above 3.
+    # The shift is 0 for the moves 0 to 3 alone.
     if (given >> 2).any():
         where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= codes.N_MOVES))[0])
         raise invalid("action", f"moves 0 to {codes.N_MOVES - 1}", f"{given[where]} at {where}")

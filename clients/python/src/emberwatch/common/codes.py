@@ -1,8 +1,8 @@
-"""Numbers that every part of the package shares, as PROTOCOL.md has them."""
+"""Constants of PROTOCOL.md that the whole package shares."""
 
 from typing import Final
 
-#: Byte of a frame where nothing was observed.
+#: Value of an unobserved cell in a frame.
 UNOBSERVED: Final = 255
 
 #: Number of moves: up, down, left, right.

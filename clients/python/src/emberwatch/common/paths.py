@@ -1,4 +1,4 @@
-"""Paths as they are outside Python, where they are bytes."""
+"""Conversion of paths between Python's text and the bytes that other programs use."""
 
 import os
 import sys
@@ -6,12 +6,12 @@ from typing import Final
 
 from emberwatch.errors import invalid
 
-#: What editors on Windows write before text in UTF-8.
+#: Character that editors on Windows write before UTF-8 text.
 BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def utf8(subject: str, path: str | os.PathLike[str]) -> str:
-    """Checks a path, and encodes it as UTF-8 in any locale, as programs and GDAL read it."""
+    """Checks a path, and converts it to UTF-8 in any locale, as other programs and GDAL read it."""
     try:
         text = os.fsencode(path).decode()
     except TypeError:
@@ -25,12 +25,12 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
 
 
 def local(text: str) -> str:
-    """A path in UTF-8, as programs tell it, as Python takes it in this locale."""
+    """Converts a UTF-8 path of another program to the text that Python opens in this locale."""
     return os.fsdecode(text.encode())
 
 
 def shown(text: str) -> str:
-    """The text with escapes for what standard output cannot write, such as paths of other bytes."""
+    """Escapes characters that standard output cannot write, such as those of undecodable paths."""
     encoding = sys.stdout.encoding or "utf-8"
     try:
         text.encode(encoding, sys.stdout.errors or "strict")

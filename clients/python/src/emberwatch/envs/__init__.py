@@ -1,4 +1,4 @@
-"""The environments, of Gymnasium and PettingZoo."""
+"""The environments for Gymnasium and PettingZoo."""
 
 from emberwatch.envs.moves_env import WildfireMovesEnv as WildfireMovesEnv
 from emberwatch.envs.moves_env import WildfireMovesVectorEnv as WildfireMovesVectorEnv

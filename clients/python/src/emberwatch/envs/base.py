@@ -1,4 +1,4 @@
-"""What the environments of one robot share: its session, its pictures, its beginning."""
+"""The base class of the environments of one robot, and checks that several environments share."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import UNOBSERVED, StepAnswer
-from emberwatch.common.arguments import as_seed, told
+from emberwatch.common.arguments import as_seed, repr_of
 from emberwatch.envs.observations import Observations
 from emberwatch.envs.owner import SessionOwner
 from emberwatch.envs.session import Session
@@ -21,16 +21,16 @@ NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
-#: Rewards of a robot's step, in the order of the native module's `pays`.
+#: Kinds of reward, in the order of the native module's `pays`.
 REWARDS: Final = ("share", "team", "marginal")
 Reward: TypeAlias = Literal["share", "team", "marginal"]
 
-#: What moves in an environment of one robot.
+#: The mask of moved rows in an environment of one robot: its only row.
 ONE_ROW: Final = np.ones(1, np.bool_)
 
 
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """One robot, in a world of its own or of a running server."""
+    """An environment of one robot, in its own world or in a world of a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": list(RENDER_MODES),
@@ -43,7 +43,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
         self._reveals = session.settings.reveals
-        #: Which robot of a world that others fly in; None: it is alone in its world.
+        #: The robot's index in a world that other clients fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         self._n_missed = 0
         self._answer: StepAnswer | None = None
@@ -51,7 +51,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path: NDArray[np.intp] | None = None
 
     def render(self) -> Any:
-        """Draws the last frame, path and robot, next to the truth if it is revealed."""
+        """Draws the last frame, path and robot, next to the hidden states if they are revealed."""
         if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
@@ -60,10 +60,10 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
     def close(self) -> None:
         self._session.close()
         self._view.close()
-        self._answer = None  # which cannot be copied
+        self._answer = None  # it cannot be copied or pickled
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
-        """Begins an episode, or continues the world's present one."""
+        """Begins an episode, or continues the world's current one."""
         resumes = wants_to_resume(options, seed) or self._robot is not None
         seed = None if seed is None else as_seed(seed)
         super().reset(seed=seed)
@@ -79,7 +79,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return answer
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
-        """Updates the observations with a step, first with an empty frame for each missed step."""
+        """Updates the observations with an empty frame for each missed step, then with `answer`."""
         if self._robot is not None:
             stayed = int(answer.robots["n_moves"][0]) == 0
             self._n_missed = self._session.n_skipped + stayed
@@ -88,17 +88,17 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         observations.update(ONE_ROW, answer.frames)
 
     def _teams(self, observations: Observations, answer: StepAnswer) -> StepAnswer | None:
-        """What is seen of teammates that others fly."""
+        """Returns the team's results and frame, if other clients fly teammates and it is needed."""
         is_needed = self._robot is not None and observations.shows_team
         return self._session.teams(answer) if is_needed else None
 
     def _trace(self, answer: StepAnswer, path: NDArray[np.uint8]) -> None:
-        """Keeps the cells of a path for pictures, if it was flown."""
+        """Stores the flown cells of a path for pictures."""
         robot = answer.result().robot
         self._path = fly(robot.start, path[: robot.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, step: int, n_visited: int) -> dict[str, Any]:
-        """The info of a step: never the seed, which gives the hidden states away."""
+        """Returns the info of a step. It never has the seed, which reveals the hidden states."""
         info: dict[str, Any] = {"step": step, "n_visited": n_visited}
         if self._robot is not None:
             info["n_missed"] = self._n_missed
@@ -116,13 +116,13 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return self._view.draw(self._answer.frames[0], cells, paths, self._truth)
 
     def _cell(self) -> tuple[int, int]:
-        """Where the robot is drawn."""
+        """Returns the cell at which the robot is drawn."""
         assert self._answer is not None
         return self._answer.result().robot.cell
 
 
 def check_reward(reward: str, *more: str) -> int:
-    """The index of a reward in `REWARDS`; `more` rewards have the share's."""
+    """Returns the index of a reward in `REWARDS`; rewards in `more` have the index of `"share"`."""
     if reward not in (*REWARDS, *more):
         expected = ", ".join(map(repr, (*REWARDS, *more)))
         raise invalid("reward", f"one of {expected}", repr(reward))
@@ -130,24 +130,24 @@ def check_reward(reward: str, *more: str) -> int:
 
 
 def as_options(options: object) -> dict[str, Any]:
-    """The options of a reset, checked to be a dictionary; None: none."""
+    """Checks that the options of a reset are a dictionary, or None for no options."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
-        raise invalid("options", "a dictionary such as {'resume': True}, or None", told(options))
+        raise invalid("options", "a dictionary such as {'resume': True}, or None", repr_of(options))
     return dict(cast("Mapping[str, Any]", options))
 
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
-    """Reads the options of a reset."""
+    """Returns whether a reset continues the current episode, from the option `resume`."""
     for key in as_options(options):
         if key != "resume":
-            raise invalid("options", "'resume'", told(key))
+            raise invalid("options", "'resume'", repr_of(key))
     resume = as_options(options).get("resume", False)
     if not isinstance(resume, bool):
-        raise invalid("options", "resume True or False", told(resume))
+        raise invalid("options", "resume True or False", repr_of(resume))
     if resume and seed is not None:
         raise InvalidArgumentError(
-            "options: expected no seed with resume=True, which begins no episode"
+            "options: resume=True continues an episode, so it cannot be combined with a seed"
         )
     return resume

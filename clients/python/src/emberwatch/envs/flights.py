@@ -1,4 +1,4 @@
-"""Paths flown move by move by many robots, in rows."""
+"""Paths that robots fly move by move."""
 
 from emberwatch._native import Flights
 from emberwatch.envs.settings import WorldSpec
@@ -6,10 +6,10 @@ from emberwatch.errors import InvalidArgumentError
 
 
 def flights_of(spec: WorldSpec, n_rows: int, *, pays: bool) -> Flights:
-    """The present path of each robot, as far as it is flown.
+    """Makes the state of the current paths of `n_rows` robots.
 
-    `pays`: each cell pays when it is first visited, or seen where that pays, what its hidden state
-    pays.
+    With `pays`, moves are rewarded: each cell pays the reward of its hidden state when the path
+    first visits it, or first sees it if the airspace pays seen cells.
     """
     if pays and spec.described is None:
         raise InvalidArgumentError("reward='move': expected a server that reveals its model")

@@ -1,7 +1,4 @@
-"""`emberwatch/WildfireMoves-v0`: one step flies one move; the world moves after T of them.
-
-For one robot, or for many.
-"""
+"""`emberwatch/WildfireMoves-v0`: one step is one move, and the world moves after T moves."""
 
 from typing import Any, Literal, TypeAlias, Unpack
 
@@ -29,65 +26,76 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Description
 
-    As `WildfireEnv`, but one step is one move of the robot. After T moves the path is complete:
-    the world moves once, and the cells visited are observed and rewarded.
+    Like `WildfireEnv`, but one step is one move of the robot. After T moves the path is complete.
+    Then the world moves once, and the visited cells are observed and rewarded.
 
     ## Action Space
 
     `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. A move off the grid or into a no-fly cell leaves
-    the robot in place. The action mask, `(4,)` int8, has 1 for each move that does not, and only 1
-    where all moves do. It is `info["action_mask"]`, `action_masks()`, which MaskablePPO of
-    sb3-contrib calls, and on request a part of the observation:
+    the robot in place. The action mask, `(4,)` int8, is 1 for each move that leads to another cell.
+    If no move does, it is 1 for all moves. The mask is in `info["action_mask"]`, and can be an
+    observation part. `action_masks()`, which MaskablePPO of sb3-contrib calls, returns it, too.
 
         action = env.action_space.sample(info["action_mask"])
 
     ## Observation Space
 
-    `observation` names the parts, as in `WildfireEnv`: `frame` and `image` (of the last complete
-    path), `robot`, `age`, `belief`, and
+    `observation` names the parts. They are the parts of `WildfireEnv`, of which `frame` and `image`
+    show the last complete path, and these:
 
     | part | space | meaning |
     |---|---|---|
     | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
-    | `move` | `Discrete(T)` | moves made of this path |
+    | `move` | `Discrete(T)` | number of moves made on this path |
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
-    | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | what frames alone told of the same cells |
+    | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | the last observations around the robot |
     | `action_mask` | `Box(0, 1, (4,), int8)` | 1 for each move that leads to another cell |
 
-    The channels of `local`, times 255: the probability of the state that pays most, and the entropy
-    of the belief divided by log S, both 0 where this path has been (and what it has seen, where
-    that pays); 1 where it has been; 1 off the grid and in no-fly cells; and the share of the path's
-    moves that are left, everywhere alike. `recent` needs no model: its first channels are the value
-    last observed in a cell, one of O channels, 1 if seen in the last frame and half of it for each
-    16 steps since; the last three are the same.
+    `local` has five channels, each times 255:
+
+    1. The probability of the state that pays most.
+    2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
+       path has visited, or in the cells that it has seen if the model pays seen cells.
+    3. 1 in the cells that this path has visited.
+    4. 1 off the grid and in no-fly cells.
+    5. The share of the path's moves that remain, the same in all cells.
+
+    `recent` needs no model. It has one channel for each of the O observed values. The channel of a
+    cell's last observed value is 255 if the last frame observed it, and halves every 16 steps; the
+    cell's other channels are 0. All O are 0 in the cells where channels 1 and 2 of `local` are. The
+    last three channels are channels 3 to 5 of `local`.
 
     ## Rewards
 
-    With `reward="share"` (the default), `"team"` or `"marginal"` the path's reward comes with its
-    last move, and 0 before: what a cell pays is only decided when the world moves, after the
-    flight. The three differ in worlds of several robots, as for `WildfireEnv`.
+    With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path has the
+    path's reward, and the moves before have 0. Cells pay by their state after the world moved, so
+    the reward is known only after the flight. The three differ in worlds of several robots, as for
+    `WildfireEnv`.
 
-    With `reward="move"` each cell pays when it is first visited, what its hidden state pays before
-    the world moves (or seen, where that pays); the last move also brings the difference to the
-    robot's share of the path's true reward, which is small for a lone robot, as one step changes
-    few cells. So both sum to the same over each path, but the second says more about the hidden
-    state, and earlier: results with the two are not comparable. The environment needs the `truth`
-    channel for it: with `instance`, the server must publish it.
+    With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
+    the world moves. (If the model pays seen cells, a cell pays when it is first seen.) The last
+    move also has the difference to the robot's share of the path's true reward. This is small for a
+    lone robot, as one step changes few cells. Both kinds of reward sum to the same over each path.
+    But `"move"` reveals more about the hidden state, and earlier, so results with the two are not
+    comparable. It needs the hidden states: with `instance`, the server must publish them.
 
     ## Episode End
 
-    Never `terminated`. `truncated` after `max_episode_steps` moves (64,000, thus 1,000 paths of
-    the default length, unless `gymnasium.make` is told otherwise), or after the running server's
-    own `--max-steps`.
+    Never `terminated`. `truncated` after `max_episode_steps` moves (default 64,000, which is 1,000
+    paths of 64 moves; pass another number to `gymnasium.make`), or after the running server's
+    `--max-steps`.
 
     ## Starting State, Information
 
-    As `WildfireEnv`; the information is about the last complete path, except `action_mask`.
+    As in `WildfireEnv`. The info is about the last complete path, except `action_mask`.
 
     ## Arguments
 
-    As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, `reward`
-    may also be `"move"`, and `window` is an odd number of cells (15).
+    As in `WildfireEnv`, with these differences:
+
+    * `observation`: `("frame", "visited", "robot", "move")` by default.
+    * `reward`: may also be `"move"`.
+    * `window`: L, the side of `local` and `recent` in cells, an odd number (15).
 
     ## Vectorized environment
 
@@ -122,7 +130,7 @@ class WildfireMovesEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; with `robot`, continues from where the shared world stands.
+        """Begins an episode, or with `robot` joins the current episode of the shared world.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
@@ -135,10 +143,10 @@ class WildfireMovesEnv(WorldEnv):
         return seen
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Flies one move; the T-th completes the path and moves the world.
+        """Flies one move. Move number T completes the path and moves the world.
 
         Raises:
-            EmberwatchError: As `WildfireEnv.step`.
+            EmberwatchError: As in `WildfireEnv.step`.
         """
         move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
         with self._session.turn:
@@ -149,16 +157,16 @@ class WildfireMovesEnv(WorldEnv):
         return outcome
 
     def action_masks(self) -> NDArray[np.int8]:
-        """1 for each move that takes the robot to another cell, else 0; `(4,)` int8.
+        """Returns 1 for each move that takes the robot to another cell, otherwise 0; `(4,)` int8.
 
-        All 1 in a cell that no move leads out of. As `info["action_mask"]`.
+        All 1 if no move leads to another cell. The same as `info["action_mask"]`.
         """
         if not self.is_open:
             raise not_reset()
         return self._flights.masks[0]
 
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """A move that does not complete its path."""
+        """Makes a move that does not complete its path."""
         assert self._answer is not None
         reward = float(self._flights.move(ONE_ROW, move)[0])
         self._observations.visit(ONE_ROW)
@@ -166,7 +174,7 @@ class WildfireMovesEnv(WorldEnv):
         return observation, reward, False, False, info
 
     def _complete(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Flies the path after its last move, and moves the world."""
+        """Completes the path with its last move, flies it, and moves the world."""
         path = self._flights.paths(move)
         answer = self._session.step(path)
         before = float(self._flights.paid[0])
@@ -209,10 +217,11 @@ class WildfireMovesEnv(WorldEnv):
 
 
 class WildfireMovesVectorEnv(WorldVectorEnv):
-    """Many robots of `WildfireMovesEnv`: one message steps all whose paths are complete.
+    """Many robots of `WildfireMovesEnv`, stepped together.
 
-    As `WildfireVectorEnv`; arguments are those of `WildfireMovesEnv`, and `num_envs`,
-    `max_episode_steps` (moves), `autoreset_mode`.
+    One message flies the paths of all robots that complete one. The arguments are those of
+    `WildfireMovesEnv`, and `num_envs`, `max_episode_steps` (in moves) and `autoreset_mode` of
+    `WildfireVectorEnv`.
     """
 
     @shows_keywords
@@ -244,7 +253,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         )
 
     def action_masks(self) -> NDArray[np.int8]:
-        """The masks of all robots, `(num_envs, 4)`; see `WildfireMovesEnv.action_masks`."""
+        """Returns the masks of all robots, `(num_envs, 4)`; see `WildfireMovesEnv.action_masks`."""
         if not self.is_open:
             raise not_reset()
         return self._flights.masks
@@ -265,7 +274,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return rewards
 
     def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """One move that completes no path."""
+        """Makes a move of the robots `moved`, which completes no path."""
         rewards = self._flights.move(moved, actions)
         self._parts.visit(moved)
         return rewards

@@ -1,7 +1,4 @@
-"""`emberwatch/WildfireObjective-v1`: one step chooses what the next path is for.
-
-For one world, or for many.
-"""
+"""`emberwatch/WildfireObjective-v1`: one step chooses the objective of the next path."""
 
 from os import PathLike
 from typing import Any, Unpack
@@ -20,68 +17,70 @@ from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
 
 
 class WildfireObjectiveEnv(PlansOwner, WorldEnv):
-    """The paper's high-level decision: what the next path of the robot is for.
+    """The paper's high-level decision: the objective of the robot's next path.
 
     ## Description
 
-    The world is that of `WildfireEnv`. The environment keeps the belief about it, plans a path for
-    each of eight objectives, and describes what each path promises. A learner chooses which of them
-    is flown: it takes the place of the paper's deep Q-network (section III.E).
+    The world is the one of `WildfireEnv`. The environment keeps a belief about it, plans a path for
+    each of eight objectives, and describes each planned path by features. The learner, in the role
+    of the paper's deep Q-network (section III.E), chooses which path is flown.
 
     ## Action Space
 
-    `Discrete(8)`, by the names in `objectives`: exploit what pays most; the same with some entropy
-    beside it (two weights); the belief's entropy alone; cells that were not seen for long; what
-    pays most over three paths; the region that promises most; the region not seen for longest.
+    `Discrete(8)`, one action for each of the `objectives`: the probability of the state that pays
+    most; the same plus the entropy of the belief, with two different weights; the entropy alone;
+    cells that were not observed for long; the probability along three paths together; the region of
+    the highest probability; the region that was not observed for longest.
 
     ## Observation Space
 
     `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
-    `feature_names` names the 26 numbers, docs/environments/objective.md explains them. One network
-    can score each row by itself. `gymnasium.wrappers.FlattenObservation` makes a vector of them.
+    `feature_names` names the 26 numbers, and docs/environments/objective.md explains them. One
+    network can score each row separately. `gymnasium.wrappers.FlattenObservation` makes a vector.
 
     ## Starting State
 
-    As `WildfireEnv`, with the first belief that `prior` names, or the learned one. With
-    ``reset(options={"resume": True})`` the belief is the one that was left for the world's present
-    step, or else is made anew from the frames of the episode that are still kept.
+    As in `WildfireEnv`. The first belief is the one that `prior` names, or the learned one. With
+    ``reset(options={"resume": True})``, it is the belief that the last agent left for the world's
+    current step. Without one, it is computed from the frames of the episode that the server keeps.
 
     ## Rewards, Episode End, Information
 
-    As `WildfireEnv`.
+    As in `WildfireEnv`.
 
     ## Arguments
 
-    As `WildfireEnv` without `observation`, `reward` and `robot`, in worlds of one robot, and
+    As in `WildfireEnv` without `observation`, `reward` and `robot`, for worlds of one robot. Also:
 
-    * `estimator`: what keeps the belief; by default what `checkpoint` holds, without one
-      `"known_model"`. A learned one finds several times as many fires where these are rare.
-        * `"known_model"`: the Bayes filter of the true model
-        * `"spatial_filter"`: known, and observations also correct neighbouring cells
-        * `"second_order_filter"`: known, predicting with the mean of the ratio in eq. 3
-        * `"cavity_filter"`: known, predicting without a cell's own echo in its neighbours
-        * `"spatial_cavity_filter"`: known+spatial, predicting as known+cavities does
-        * `"learned_filter"`: a Bayes filter whose parameters were learned
-        * `"learned_spatial_filter"`: learned, and observations also correct neighbouring cells
-        * `"learned_cavity_filter"`: learned, predicting as known+cavities does
-        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting as known+cavities does
-        * `"neural_belief"`: a learned network on the grid, from last observations to predicted ones
+    * `estimator`: the kind of belief. The default is the kind that `checkpoint` holds, or
+      `"known_model"` without a checkpoint. If fires are rare, learned ones find several times as
+      many.
+        * `"known_model"`: the Bayes filter with the true model
+        * `"spatial_filter"`: known, where observations also correct neighbouring cells
+        * `"second_order_filter"`: known, with a second-order mean of the ratio in eq. 3
+        * `"cavity_filter"`: known, predicting a cell without its own influence on its neighbours
+        * `"spatial_cavity_filter"`: known+spatial, predicting like known+cavities
+        * `"learned_filter"`: a Bayes filter with learned parameters
+        * `"learned_spatial_filter"`: learned, where observations also correct neighbouring cells
+        * `"learned_cavity_filter"`: learned, predicting like known+cavities
+        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting like known+cavities
+        * `"neural_belief"`: a learned network that predicts observations from the last ones
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
-    * `prior`: of the known model's filter, `"simulated"` (the default; the first time it takes a
-      second), `"initial"` or `"uniform"`.
+    * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; it
+      takes a second the first time), `"initial"` or `"uniform"`.
 
-    With `instance`, beliefs and plans are kept here, too: other clients see the beliefs as those of
-    `emberwatch-agent`, and `close` leaves them to whoever flies next. A server that hides its model
-    needs `model`, or a `checkpoint`.
+    With `instance`, this process keeps the beliefs and plans, too. It publishes its beliefs like
+    `emberwatch-agent`, and `close` leaves them to the next client. If the server hides its model,
+    pass `model` or `checkpoint`.
 
     ## Vectorized environment
 
     `gymnasium.make_vec("emberwatch/WildfireObjective-v1", num_envs=64)` is
-    `WildfireObjectiveVectorEnv`: all worlds are planned for at once, on several threads.
+    `WildfireObjectiveVectorEnv`, which plans for all worlds at once on several threads.
 
     ## Version History
 
-    * v1: eight plans with features, on a belief of choice; v0 chose among states and entropy.
+    * v1: eight plans with features, and a choice of estimators. v0 chose among states and entropy.
     """
 
     @shows_keywords
@@ -114,10 +113,10 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     def step(
         self, action: np.integer[Any] | int
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Flies the path planned for an objective.
+        """Flies the path that was planned for the chosen objective.
 
         Raises:
-            EmberwatchError: As `WildfireEnv.step`.
+            EmberwatchError: As in `WildfireEnv.step`.
         """
         choice = np.array([as_choice(action, int(self._plans.action_space.n))], np.uint8)
         with self._session.turn:
@@ -148,8 +147,8 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     """Many worlds of `WildfireObjectiveEnv`, stepped and planned for together.
 
-    As `WildfireVectorEnv`; arguments are those of `WildfireObjectiveEnv`, and `num_envs`,
-    `max_episode_steps`, `autoreset_mode`.
+    The arguments are those of `WildfireObjectiveEnv`, and `num_envs`, `max_episode_steps` and
+    `autoreset_mode` of `WildfireVectorEnv`.
     """
 
     @shows_keywords

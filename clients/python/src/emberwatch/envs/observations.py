@@ -1,4 +1,4 @@
-"""What a learner sees: which parts, as which spaces."""
+"""Observations of learners: their parts, and the space of each part."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, TypeAlias, cast
@@ -24,20 +24,20 @@ MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "acti
 Parts: TypeAlias = Part | Sequence[Part]
 MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
 
-#: Cells along a side of the parts `local` and `recent`, unless told otherwise.
+#: Default side of the parts `local` and `recent`, in cells.
 WINDOW: Final = 15
 
-#: Maximum of that number.
+#: Maximum side of these parts.
 MAX_WINDOW: Final = 255
 
-#: Parts that a filter is needed for, those from memory of frames, and those about other robots.
+#: Parts that need a filter, parts that need a memory of frames, and parts about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
 _OF_MEMORY: Final = frozenset(("age", "recent"))
 OF_TEAM: Final = frozenset(("team", "others"))
 
 
 class Observations:
-    """Observations of some robots, in rows: all of some worlds, or a single one."""
+    """Observations of several robots, one row for each: all robots of some worlds, or one robot."""
 
     def __init__(
         self,
@@ -49,9 +49,10 @@ class Observations:
         *,
         first: int = 0,
     ) -> None:
-        """With `flights`, there are the parts of a path that is not complete.
+        """Checks the parts and makes their spaces.
 
-        `first`: which robot of its world is the first row.
+        With `flights`, the parts about an incomplete path are available. `first`: index of the
+        first row's robot in its world.
         """
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
@@ -60,13 +61,13 @@ class Observations:
         self._names, self._is_plain = names, isinstance(parts, str)
         self._spec, self._n_rows, self._flights = spec, n_rows, flights
         self._first = first
-        #: Whether there are parts about other robots.
+        #: Whether a part is about other robots.
         self.shows_team = bool(OF_TEAM & set(names))
         if OF_BELIEF & set(names) and spec.model is None:
             needs = "a server that reveals its model"
             if spec.is_recorded:
                 needs = "simulated worlds, as recorded ones have no model"
-            raise InvalidArgumentError(f"observation: expected {needs}, for the belief")
+            raise InvalidArgumentError(f"observation: expected {needs}, for parts with a belief")
         #: The space of one robot's observation.
         self.space = (
             known[names[0]]
@@ -82,16 +83,16 @@ class Observations:
             for name in names
             if name in channels
         }
-        #: Whether frames alone tell what is observed.
+        #: Whether the last frame alone determines the observation.
         self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
         self._beliefs = np.empty(0, np.uint8)
-        # By observed value, the last for none.
+        # One row for each observed value; the last row is for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Forgets all in rows whose episode has begun, or been resumed with a frame.
+        """Resets the rows `begun`, whose episodes have begun, or were resumed with a frame.
 
-        `frames` are those of all rows, `(n_rows, H, W)`.
+        `frames` has a frame for every row, shape (n_rows, H, W).
         """
         if self._last_seen is not None:
             self._last_seen.reset(begun, frames)
@@ -101,7 +102,7 @@ class Observations:
         self._show(begun)
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """One step of the rows `moved`; `frames` are those of all."""
+        """Updates the rows `moved` with a step; `frames` has a frame for every row."""
         if self._has_no_memory:
             return
         if self._last_seen is not None:
@@ -111,7 +112,7 @@ class Observations:
         self._show(moved)
 
     def visit(self, moved: NDArray[np.bool_]) -> None:
-        """Some robots have made a move."""
+        """Updates the rows `moved` with a move that did not complete its path."""
         if self._flights is not None:
             for windows in self._windows.values():
                 windows.visit(self._flights, moved)
@@ -122,12 +123,13 @@ class Observations:
         robots: NDArray[np.int64],
         teams: wire.StepAnswer | None = None,
     ) -> Any:
-        """The observations of all rows, stacked.
+        """Returns the observations of all rows, stacked.
 
         Args:
-            frames: Of all rows; taken as they are.
-            robots: Row and column of each; taken as they are.
-            teams: Team frames and all robots of the worlds, where the rows are not all of them.
+            frames: The frames of all rows; not copied.
+            robots: Row and column of each robot; not copied.
+            teams: Team frames and results of all robots of the worlds; needed if the rows are not
+                all robots of their worlds.
         """
         parts = {name: self._part(name, frames, robots, teams) for name in self._names}
         return parts[self._names[0]] if self._is_plain else parts
@@ -138,7 +140,7 @@ class Observations:
         robots: NDArray[np.int64],
         teams: wire.StepAnswer | None = None,
     ) -> Any:
-        """The observation of the only row; arguments as of `all`."""
+        """Returns the observation of the only row; arguments as in `all`."""
         if self._is_plain:
             return self._part(self._names[0], frames, robots, teams)[0]
         return {
@@ -181,11 +183,11 @@ class Observations:
         return self._flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Where the other robots of each row's world are; `robots` are all of the worlds."""
+        """Returns 255 in the cells of each row's teammates; `robots` has all robots."""
         spec = self._spec
         shown = np.zeros((self._n_rows, spec.height, spec.width, 1), np.uint8)
         own = np.remainder(self._first + np.arange(self._n_rows), spec.n_robots)
-        n_same = self._n_rows * spec.n_robots // len(robots)  # rows of a world
+        n_same = self._n_rows * spec.n_robots // len(robots)  # rows for each world
         rows, others = np.nonzero(own[:, np.newaxis] != np.arange(spec.n_robots))
         cells = robots[rows // n_same * spec.n_robots + others]
         shown[rows, cells[:, 0], cells[:, 1]] = 255
@@ -198,7 +200,7 @@ class Observations:
         return Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
 
     def _show(self, rows: NDArray[np.bool_]) -> None:
-        """Shows what is known before a path to the rows that begin one."""
+        """Computes the beliefs and windows of `rows`, which begin a new path."""
         if self._filters is not None and "belief" in self._names:
             beliefs = np.rint(255.0 * self._filters.predictor.transpose(1, 2, 3, 0))
             self._beliefs = beliefs.astype(np.uint8)
@@ -210,24 +212,24 @@ class Observations:
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
-    """What the robots of each world saw together, `(n_worlds, H, W)`."""
-    return frames.reshape(-1, n_robots, *frames.shape[1:]).min(axis=1)  # 255 is nothing
+    """Returns the frame of each world's team, `(n_worlds, H, W)`."""
+    return frames.reshape(-1, n_robots, *frames.shape[1:]).min(axis=1)  # unobserved is 255
 
 
 def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:
-    """Row and column of each robot, a new array."""
+    """Returns row and column of each robot as a new array."""
     return np.stack((robots["row"], robots["col"]), axis=1).astype(np.int64)
 
 
 def names_of(parts: object) -> tuple[str, ...]:
-    """The names of parts that a caller asks for, as given; unchecked."""
+    """Returns the names in the argument `observation`, unchecked."""
     if isinstance(parts, str):
         return (parts,)
     return tuple(map(str, cast("Iterable[object]", parts))) if isinstance(parts, Iterable) else ()
 
 
 def of_row(observations: Any, index: int) -> Any:
-    """The observation of one row among stacked ones."""
+    """Returns the observation of one row of stacked observations."""
     if isinstance(observations, dict):
         parts = cast("dict[str, NDArray[Any]]", observations)
         return {name: part[index] for name, part in parts.items()}

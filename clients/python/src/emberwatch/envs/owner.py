@@ -1,4 +1,4 @@
-"""The public attributes that all environments and vectors have."""
+"""The public attributes that all environments and vector environments share."""
 
 from contextlib import AbstractContextManager
 from copy import copy
@@ -14,14 +14,14 @@ from emberwatch.model import Model
 
 
 class SessionOwner:
-    """The public attributes of an environment or vector, read from its session."""
+    """The public attributes of an environment or vector environment, read from its session."""
 
     _session: Session
     _made_by: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification that `gymnasium.make` used; its keywords can be written as JSON."""
+        """The specification that `gymnasium.make` used, with keywords that JSON can represent."""
         return self._made_by
 
     @spec.setter
@@ -32,7 +32,7 @@ class SessionOwner:
 
     @property
     def model(self) -> Model | None:
-        """The model behind the worlds; None if a running server hides it, or they were recorded."""
+        """The model of the worlds; None if the server hides it, or the worlds are recorded."""
         return self._session.spec.model
 
     @property
@@ -47,21 +47,21 @@ class SessionOwner:
 
     @property
     def burn_in(self) -> int:
-        """Steps that the worlds are simulated before k = 0."""
+        """Number of steps that the worlds are simulated before k = 0."""
         return self._session.spec.burn_in
 
     @property
     def instance(self) -> str:
-        """The instance name of the server that it is attached to, after a reset.
+        """The instance name of the server that the environment is attached to, after a reset.
 
         Raises:
-            InvalidArgumentError: If it was made without `instance`: its worlds are in this process.
+            InvalidArgumentError: If the worlds are in this process, without `instance`.
         """
         return self._session.instance
 
     @property
     def lease(self) -> Lease:
-        """The lease of its robots, after a reset: for snapshots and forks of its worlds.
+        """The lease on the environment's robots, after a reset: for snapshots and forks of worlds.
 
         After `lease.restore` or `lease.fork`, continue with ``reset(options={"resume": True})``.
         """
@@ -69,12 +69,12 @@ class SessionOwner:
 
     @property
     def is_open(self) -> bool:
-        """Whether it has been reset since it was made or closed."""
+        """Whether the environment has been reset since it was made or closed."""
         return self._session.is_open
 
     @property
     def turn(self) -> AbstractContextManager[object]:
-        """Lets one thread at a time step or reset; use it in a `with`."""
+        """A lock that lets one thread at a time step or reset; use it in a `with`."""
         return self._session.turn
 
     def allow_test_worlds(self) -> None:
@@ -82,16 +82,19 @@ class SessionOwner:
         self._session.allows_test_worlds = True
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which only a closed environment has: no two may act on the same worlds."""
+        """Supports copies of closed environments only: no two may act on the same worlds."""
         return state_of(self, self.is_open, "gymnasium.make(env.spec)")
 
 
 def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
-    """What a copy or a pickle of a closed environment holds; `maker` is how to make another."""
+    """Returns the state of a closed environment for a copy or a pickle.
+
+    `maker`: the call that makes another environment, for the error.
+    """
     if is_open:
         raise TypeError(
             f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
-            f"that acts on worlds: close it first, or make another with {maker}; "
+            f"that is open: close it first, or make another with {maker}; "
             "Client.snapshot and Lease.fork copy worlds"
         )
     return vars(environment).copy()

@@ -1,4 +1,4 @@
-"""`emberwatch.parallel_env`: all robots of one world for PettingZoo, imported only here."""
+"""`emberwatch.parallel_env`: all robots of one world. Importing this needs PettingZoo."""
 
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # pyright: reportUnknownArgumentType=false
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from emberwatch.client.wire import UNOBSERVED
-from emberwatch.common.arguments import as_array, told
+from emberwatch.common.arguments import as_array, repr_of
 from emberwatch.envs.base import NOTHING_TO_DRAW, as_options
 from emberwatch.envs.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.envs.observations import MovesParts, names_of, of_row
@@ -32,19 +32,21 @@ _OBSERVATIONS: Final = {"move": "local", "path": ("frame", "robot")}
 class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     """All robots of one world, as agents `robot_0`, `robot_1`, ... of PettingZoo's parallel API.
 
-    With `action="move"` each agent acts, observes and is paid as in `WildfireMovesEnv`, with
-    `action="path"` as in `WildfireEnv`. The robots begin together, fly together and end together.
-    Seeds, `resume`, infos and pictures are as there; a picture shows the whole team. The action
-    mask of each agent is where PettingZoo's tools look: in `infos[agent]["action_mask"]` or, if
-    `observation` names it, in the observation.
+    With `action="move"`, actions, observations and rewards of each agent are those of
+    `WildfireMovesEnv`; with `action="path"`, those of `WildfireEnv`. The robots begin, step and end
+    their episodes together. Seeds, `resume`, infos and pictures work as in these environments; a
+    picture shows the whole team. The action mask of each agent is in `infos[agent]["action_mask"]`,
+    or in the observation if `observation` names it. PettingZoo's tools read both.
 
-    Arguments, all by keyword, are those of these environments, and:
+    The arguments, all by keyword, are those of these environments, and:
 
-    * `robots`: how many (2); with `instance` or `task` as many as that has.
+    * `robots`: number of robots (2); a `task` or the server of `instance` determines it.
     * `action`: `"move"`, a `Discrete(4)` (the default), or `"path"`, a `MultiDiscrete([4] * T)`.
-    * `observation`: parts, by default `"local"` for moves, `("frame", "robot")` for paths.
-    * `reward`: `"share"` (the default), `"team"`, `"marginal"`, or for moves `"move"`.
-    * `max_episode_steps`: truncate after so many moves or paths (1,000); None: never.
+    * `observation`: observation parts, by default `"local"` for moves and `("frame", "robot")` for
+      paths.
+    * `reward`: `"share"` (the default), `"team"`, `"marginal"`, or with moves also `"move"`.
+    * `max_episode_steps`: number of moves or paths after which episodes are truncated (1,000).
+      None: never.
     """
 
     @shows_keywords
@@ -58,7 +60,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         window: int | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. Nothing is opened before the first reset."""
+        """See the class. Worlds are created or acquired at the first reset."""
         if action not in _ENVIRONMENTS:
             raise invalid("action", "'move' or 'path'", repr(action))
         if world.get("instance") is None and world.get("task") is None:
@@ -84,7 +86,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             "is_parallelizable": True,
         }
         self.render_mode = self._worlds.render_mode
-        # Copies with seeds of their own: each agent draws its own samples.
+        # Separate copies: each agent's space draws its own samples.
         self.observation_spaces = {
             agent: deepcopy(self._worlds.single_observation_space) for agent in self.possible_agents
         }
@@ -94,7 +96,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         for space in (*self.observation_spaces.values(), *self.action_spaces.values()):
             space.seed()
         spec = self._worlds.world_spec
-        #: What `state` returns.
+        #: The space of `state`.
         self.state_space = spaces.Box(
             0, 255, (spec.height, spec.width, spec.n_observations + 2), np.uint8
         )
@@ -108,7 +110,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begins an episode; of the options, only `resume` counts, see `WildfireEnv`."""
+        """Begins an episode. The only option is `resume`, see `WildfireEnv`; others are ignored."""
         known = {key: value for key, value in as_options(options).items() if key == "resume"}
         with self._worlds.turn:
             seen, infos = self._worlds.reset(seed=seed, options=known)
@@ -124,14 +126,18 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """A move or a path of each robot; raises as `WildfireEnv.step` does."""
+        """Flies a move or a path with each robot.
+
+        Raises:
+            EmberwatchError: As in `WildfireEnv.step`.
+        """
         with self._worlds.turn:
             return self._step(actions)
 
     def _step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
         given: Any = actions
         if not isinstance(given, dict) or actions.keys() != set(self.agents):
-            raise invalid("actions", f"one for each of {self.agents}", told(actions))
+            raise invalid("actions", f"one for each of {self.agents}", repr_of(actions))
         if not actions:
             return {}, {}, {}, {}, {}
         chosen = as_array([actions[agent] for agent in self.agents], "actions", "all of one shape")
@@ -148,18 +154,19 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         )
 
     def action_masks(self) -> dict[str, NDArray[np.int8]]:
-        """The mask of each agent, as in its info; see `WildfireMovesEnv.action_masks`.
+        """Returns the mask of each agent, as in its info; see `WildfireMovesEnv.action_masks`.
 
-        Of moves only: where a move of a path leads depends on those before it.
+        Only with `action="move"`: in a path, where a move leads depends on the moves before it.
         """
         if not isinstance(self._worlds, WildfireMovesVectorEnv):
-            raise invalid("action_masks", "an environment of action='move'", "'path'")
+            raise invalid("action_masks", "an environment with action='move'", "'path'")
         return dict(zip(self.possible_agents, self._worlds.action_masks(), strict=True))
 
     def state(self) -> NDArray[np.uint8]:
-        """What the team saw in the last step, and where the robots are; not the hidden states.
+        """Returns the team's last frame and the robots' cells, not the hidden states.
 
-        A channel of 0 or 255 for each observed value, one for nothing, one for the robots' cells.
+        The channels are 0 or 255: one for each observed value, one for unobserved cells, and one
+        for the robots' cells. Shape (H, W, O + 2).
         """
         frame, cells = self._worlds.seen(self._all)
         shown = np.zeros(self.state_space.shape, np.uint8)
@@ -170,7 +177,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         return shown
 
     def render(self) -> Any:
-        """Draws the team: what all saw, their paths and where they are."""
+        """Draws the team's last frame, paths and robots."""
         if self.render_mode is None or not self._worlds.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
@@ -192,6 +199,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     def _infos(self, infos: dict[str, Any]) -> dict[str, dict[str, Any]]:
         if self._observes_masks:
-            # PettingZoo has a mask in the observation or in the info; TorchRL fails on both.
+            # PettingZoo allows a mask in the observation or in the info; TorchRL fails if both
+            # have one.
             infos = {name: each for name, each in infos.items() if name != "action_mask"}
         return {agent: info_of(infos, row) for row, agent in enumerate(self.possible_agents)}

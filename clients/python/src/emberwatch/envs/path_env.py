@@ -1,4 +1,4 @@
-"""`emberwatch/Wildfire-v0`: one step flies one path, of one robot or of many."""
+"""`emberwatch/Wildfire-v0`: one step flies one path."""
 
 from typing import Any, Unpack
 
@@ -19,115 +19,122 @@ from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
 
 
 class WildfireEnv(WorldEnv):
-    """A robot explores a wildfire of which it sees only the cells that it flies over.
+    """A robot explores a wildfire, and sees only the cells that it flies over.
 
     ## Description
 
-    A hidden Markov model spreads a fire over a grid of H x W cells, each normal, latent or on
-    fire. In each step the robot flies a path of T moves; then the whole world moves once, and the
-    cells visited are observed, with errors: a latent cell mostly looks normal. Where to fly next
-    must be decided from what was seen before. The model is that of Yoon et al., *Estimation and
-    Planning of Exploration Over Grid Map Using A Spatiotemporal Model with Incomplete State
-    Observations*, equations 2 to 4; any other model file runs as well.
+    A hidden Markov model spreads a fire over a grid of H x W cells. Each cell is normal, latent or
+    on fire. In each step the robot flies a path of T moves. Then the whole world moves once, and
+    the robot observes the cells that it visited. Observations have errors: a latent cell mostly
+    looks normal. The robot must decide where to fly from what it has observed before. The model is
+    the one of Yoon et al., *Estimation and Planning of Exploration Over Grid Map Using A
+    Spatiotemporal Model with Incomplete State Observations*, equations 2 to 4. Any other model
+    file works, too.
 
     The world is simulated in this process. With `instance`, the environment attaches to a running
-    `emberwatch-server` instead, whose worlds other agents and observers share.
+    `emberwatch-server` instead, and shares its worlds with other agents and observers.
 
     ## Action Space
 
-    `MultiDiscrete([4] * T)`: a path, move by move: 0 up (row - 1), 1 down (row + 1), 2 left
+    `MultiDiscrete([4] * T)`: the moves of a path: 0 up (row - 1), 1 down (row + 1), 2 left
     (column - 1), 3 right (column + 1). A move off the grid or into a no-fly cell of the model file
-    leaves the robot where it is. There is no `action_masks`, as MaskablePPO asks for: where a move
-    leads depends on those before it. `WildfireMovesEnv` has one.
+    leaves the robot where it is. There is no `action_masks` for MaskablePPO, because where a move
+    leads depends on the moves before it. `WildfireMovesEnv` has masks.
 
     ## Observation Space
 
-    `observation` names the parts: a sequence makes a flat `Dict` of them, one name alone that
-    part as it is.
+    `observation` names the parts. A sequence of names makes a flat `Dict`; a single name makes the
+    space of that part.
 
     | part | space | meaning |
     |---|---|---|
-    | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
-    | `image` | `Box(0, 255, (H, W, O + 1), uint8)` | 255 in the channel of what was observed |
+    | `frame` | `Box(0, 255, (H, W, 1), uint8)` | observed value of each cell; 255: not observed |
+    | `image` | `Box(0, 255, (H, W, O + 1), uint8)` | `frame` one-hot, 255 in the value's channel |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
-    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
+    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was observed; 255: never, or >= 255 |
     | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
-    | `team` | `Box(0, 255, (H, W, 1), uint8)` | `frame`, of what all robots of the world saw |
-    | `others` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells where other robots are |
+    | `team` | `Box(0, 255, (H, W, 1), uint8)` | `frame` of all robots of the world together |
+    | `others` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells of the other robots |
 
-    The last channel of `image` stands for nothing observed. With a `sensor_radius` of r, or a
-    sensor in the model file, cells up to r rows and columns from the path are seen, too; O counts
-    the observations once for each of the sensor's matrices. `belief` is about what the next path
-    will meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far;
-    it begins as `wrappers.BeliefObservation` does.
+    The last channel of `image` is for unobserved cells. With a `sensor_radius` of r, or a sensor in
+    the model file, the robot also observes cells up to r rows and columns away from its path. O is
+    the number of the model's observations times the number of the sensor's observation matrices.
+    `belief` is the known model's Bayes filter (paper equations 5 and 6): the distribution of the
+    state that the next path meets, given all frames so far. Its prior is the default of
+    `wrappers.BeliefObservation`.
 
     ## Rewards
 
-    The number of distinct cells visited that burn after the world moved (in general the sum of the
-    model's rewards; of the cells seen, where the model file's sensor says so). The start cell
-    counts only if it is flown over again. In a world of several robots `reward` chooses: `"share"`
-    (the default), where a cell that v robots visited pays 1 / v to each; `"team"`, the reward of
-    all robots together; or `"marginal"`, what that would lack without this robot.
+    The number of distinct visited cells that burn after the world moved. In general, the sum of the
+    model's rewards over these cells, or over the seen cells if the model file's sensor pays them.
+    The start cell counts only if the path returns to it. In a world of several robots, `reward`
+    chooses between `"share"` (the default: a cell that v robots visited pays each of them 1 / v),
+    `"team"` (the reward of all robots together), and `"marginal"` (how much lower the team's reward
+    would be without this robot).
 
     ## One Robot of a Team
 
-    With `instance` and `robot=2` it is one robot of a world in which other processes fly the
-    others. A step waits for the paths of all robots that somebody holds, but no longer than the
-    server's `--deadline-ms`. A path that comes too late is not flown: the answer tells how the
-    world stands, and `info["n_missed"]` in how many steps this robot stayed where it was. `reset`
-    begins no episode, as the world is not its own; it continues from where the world stands, and
-    its `seed` is for `np_random` alone. `emberwatch.parallel_env` flies all robots of a world.
+    With `instance` and for example `robot=2`, the environment flies one robot of a world, and other
+    processes fly the others. A step waits for the paths of all robots that a client holds, but no
+    longer than the server's `--deadline-ms`. A path that comes too late is not flown: the step
+    returns the world's current results, and `info["n_missed"]` is the number of steps in which
+    this robot stayed where it was. `reset` begins no episode, because other clients share the
+    world. It joins the current episode, and uses its `seed` only for `np_random`. To fly all robots
+    of a world, use `emberwatch.parallel_env`.
 
     ## Starting State
 
-    The world after `burn_in` steps from the model's initial distribution, a pure function of the
-    seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
-    reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
-    has been observed. `reset(options={"resume": True})` begins nothing but continues from
-    where the world stands, such as after another agent, or after a step that was interrupted.
+    The world after `burn_in` steps from the model's initial distribution. It is a pure function of
+    the seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
+    reset without a seed draws one from `np_random`. The robot is at `start`, and no cell has been
+    observed. `reset(options={"resume": True})` begins no episode. It continues the current one, for
+    example after another agent, or after an interrupted step.
 
     ## Episode End
 
-    Never `terminated`. `truncated` after `max_episode_steps` (1,000 unless `gymnasium.make` is
-    told otherwise), or after the steps of the task or of the running server's own `--max-steps`.
+    Never `terminated`. `truncated` after `max_episode_steps` (default 1,000; pass another number to
+    `gymnasium.make`), or after the steps of the task or the running server's `--max-steps`.
 
     ## Information
 
-    `step` (k) and `n_visited` (distinct cells visited). With `truth=True`, for reports and
-    pictures, as a learner that uses them cheats: `n_target_cells` (cells burning on the whole
-    grid), `n_hits` (of the visited, burning) and the hidden `truth`, `(H, W)` uint8.
+    `step` (k) and `n_visited` (number of distinct visited cells). With `truth=True` also
+    `n_target_cells` (number of burning cells on the whole grid), `n_hits` (number of visited cells
+    that burn) and `truth` (the hidden states, `(H, W)` uint8). These are for reports and pictures:
+    a learner that uses them cheats.
 
     ## Arguments
 
-    All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`:
+    All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`. Defaults are in
+    parentheses.
 
-    * `observation`: parts of the observation; `("frame", "robot")` by default.
-    * `reward`: `"share"`, `"team"` or `"marginal"`.
-    * `instance`: attach to this running server; None: worlds of its own, in this process. The
+    * `observation`: the parts of the observation (`("frame", "robot")`).
+    * `reward`: `"share"`, `"team"` or `"marginal"` (`"share"`).
+    * `instance`: the running server to attach to. None: simulate the world in this process. The
       results are the same bytes either way.
-    * `world`: with `instance`, which of the server's worlds (0).
-    * `robot`: with `instance`, which of the world's robots, if others fly the rest (None: the world
-      has only one).
-    * `takeover`: with `instance`, take the world from its holder (False).
+    * `world`: with `instance`, the number of the server's world (0).
+    * `robot`: with `instance`, the index of the robot in its world, if other clients fly the rest
+      (None: the world has only one robot).
+    * `takeover`: with `instance`, whether to take the world from its holder (False).
     * `task`: the name of a built-in task, such as `"small"`, or the path of a task file
-      (`docs/environments/index.md` lists tasks and models). It decides all keywords from `model` to
-      `states_offset`, `robots` and the length of episodes: none of them may stand beside it. With
-      `instance`: the name of the running server's.
-    * `model`: the name of a built-in model (`"wildfire"`) or the path of a model file;
-      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `sensor_radius` (None: as the
-      model says), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of worlds of its
-      own. With `instance` they may be left out, or must agree with the server.
-    * `states`: recorded states instead of a model (built-in ones by name, or a `.npz` or `.npy`
-      file or a folder, see `docs/recorded-worlds.md`), which decide `height`, `width` and
-      `burn_in`; `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
-    * `truth`: reveal the hidden states in `info` and pictures (False).
-    * `timeout`: how long to wait for a step of a running server, or until it is there, seconds (5).
+      (`docs/environments/index.md` lists tasks and models). A task determines `robots`, all
+      keywords from `model` to `states_offset`, and the length of episodes, so none of them may be
+      given with it. With `instance`, it must be the task of the running server.
+    * `model`: the name of a built-in model (`"wildfire"`) or the path of a model file.
+    * `height`, `width` (64), `n_moves` (64; the T above), `burn_in` (10,000), `sensor_radius`
+      (None: the model's), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): for worlds
+      in this process. With `instance`, leave them out or repeat the server's values.
+    * `states`: recorded states instead of a model: the name of built-in ones, a `.npz` or `.npy`
+      file, or a folder (see `docs/recorded-worlds.md`). They determine `height`, `width` and
+      `burn_in`, and the last recorded step truncates the episode.
+    * `states_symmetries` (False), `states_offset` (0): how episodes are made of recorded states.
+    * `truth`: whether to reveal the hidden states in `info` and pictures (False).
+    * `timeout`: seconds to wait for a step of a running server, and for the server to start (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.
 
     ## Vectorized environment
 
-    `gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=64)` is `WildfireVectorEnv`: one call
-    steps all worlds.
+    `gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=64)` is `WildfireVectorEnv`, which steps
+    all worlds in one call.
 
     ## Version History
 
@@ -153,7 +160,7 @@ class WildfireEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; with `robot`, continues from where the shared world stands.
+        """Begins an episode, or with `robot` joins the current episode of the shared world.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
@@ -171,12 +178,14 @@ class WildfireEnv(WorldEnv):
         """Flies a path of T moves.
 
         Raises:
-            InvalidArgumentError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
-            LeaseLostError: If another client took the world over.
-            ServerGoneError: If the server has ended; the next reset attaches to its successor.
-            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            InvalidArgumentError: If the action is not `(T,)` integers of 0 to 3. Nothing is sent.
+            LeaseLostError: If another client took over the world.
+            ServerGoneError: If the server has ended. The next reset attaches to a new server of
+                the same instance.
+            RequestTimeoutError: If the server does not answer. The world may have moved: reset or
+                resume.
             EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
-                as after Ctrl-C: reset or resume. Nothing is sent.
+                for example after Ctrl-C: reset or resume. Nothing is sent.
         """
         session = self._session
         with session.turn:
@@ -196,7 +205,7 @@ class WildfireEnv(WorldEnv):
         self, answer: StepAnswer, step: int, n_visited: int, cells: NDArray[np.int64]
     ) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, step, n_visited)
-        # The learner may write to its frame: pictures come from another.
+        # The learner may write to its frame, so pictures are drawn from another copy.
         frames = answer.frames if self.render_mode is None else answer.frames.copy()
         if self.render_mode == "human":
             self._draw()
@@ -205,20 +214,20 @@ class WildfireEnv(WorldEnv):
 
 
 class WildfireVectorEnv(WorldVectorEnv):
-    """Many robots of `WildfireEnv`, stepped together: all of some worlds.
+    """Many robots of `WildfireEnv`, stepped together: all robots of one or more worlds.
 
-    Observations, rewards, ends and infos are those of Gymnasium's `SyncVectorEnv` over the single
-    environment with the same seeds, field by field, in all three autoreset modes; world i of
-    `reset(seed=s)` has seed s + i. `options={"reset_mask": mask}` resets some of the worlds.
+    Observations, rewards, episode ends and infos equal, field by field, those of Gymnasium's
+    `SyncVectorEnv` of single environments with the same seeds, in all three autoreset modes. World
+    i of `reset(seed=s)` has seed s + i. `options={"reset_mask": mask}` resets only some worlds.
 
-    Arguments are those of `WildfireEnv`, and:
+    The arguments are those of `WildfireEnv`, and:
 
-    * `num_envs`: number of robots, a multiple of `robots`; None: those of one world.
-    * `robots`: robots of each world (1). They begin and end their episodes together.
-    * `max_episode_steps`: truncate after so many steps; None or -1: never.
+    * `num_envs`: number of robots, a multiple of `robots`. None: the robots of one world.
+    * `robots`: number of robots of each world (1). They begin and end their episodes together.
+    * `max_episode_steps`: number of steps after which episodes are truncated; None or -1: never.
     * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.
-    * `world`: the first world; the others follow.
-    * `render_mode`: `"human"` shows the first world only.
+    * `world`: the number of the first world; the others follow it.
+    * `render_mode`: `"human"` shows only the first world.
     """
 
     @shows_keywords

@@ -1,7 +1,4 @@
-"""Beliefs about worlds of one robot each, and the plans there that a learner chooses among.
-
-`WildfireObjectiveEnv` makes an environment of it.
-"""
+"""Beliefs about worlds of one robot each, and the plans that `WildfireObjectiveEnv` offers."""
 
 from os import PathLike
 from typing import Final, Literal, TypeAlias
@@ -12,7 +9,7 @@ from numpy.typing import NDArray
 
 import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepResult, WorldResult
-from emberwatch.common.arguments import told
+from emberwatch.common.arguments import repr_of
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
@@ -33,15 +30,15 @@ FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
 _NAMES: Final = _native.option_names()
 
-#: The names of the options.
+#: The names of the options, each an objective.
 OBJECTIVES: Final = tuple(_NAMES[0])
 
-#: The names of the numbers that describe the plan of each.
+#: The names of the features of each option's plan.
 FEATURES: Final = tuple(_NAMES[1])
 
 
 class Plans:
-    """The plan of each option in each world of a session, made on the belief about it."""
+    """The beliefs about the worlds of a session, and each option's plan in each world."""
 
     def __init__(
         self,
@@ -50,10 +47,10 @@ class Plans:
         checkpoint: str | PathLike[str] | None,
         prior: FirstBelief,
     ) -> None:
-        """Arguments are those of `WildfireObjectiveEnv`, checked here."""
+        """Checks the arguments, which are those of `WildfireObjectiveEnv`."""
         if session.settings.robot is not None or session.spec.n_robots > 1:
             raise InvalidArgumentError(
-                "robots, robot: expected worlds of one robot, as options are planned for one"
+                "robots, robot: expected worlds of one robot, as options are planned for one robot"
             )
         given: dict[str, object] = {
             "estimator": estimator,
@@ -63,21 +60,21 @@ class Plans:
         for name, value in given.items():
             kinds = (str, PathLike) if name == "checkpoint" else str
             if not isinstance(value, kinds) and (name == "prior" or value is not None):
-                expected = "a path" if name == "checkpoint" else "the name of one"
-                raise invalid(name, expected, told(value))
+                expected = "a path" if name == "checkpoint" else "a name"
+                raise invalid(name, expected, repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
         self._arguments = estimator, path, prior
-        #: Of one world.
+        #: The action space of one world.
         self.action_space: Final = spaces.Discrete(len(OBJECTIVES))
         shape = len(OBJECTIVES), len(FEATURES)
         self.space: Final = spaces.Box(-np.inf, np.inf, shape, np.float32)
-        #: What keeps the beliefs.
+        #: Name of the estimator that keeps the beliefs.
         self.estimator: Final = self._made().estimator
         self._native: _native.Options | None = None
-        #: Where it shows beliefs, if it does.
+        #: Instance and number of world 0 under which beliefs are published; None: they are not.
         self._watched: tuple[str, int] | None = None
-        #: What the plans of all worlds promise; a new array after each step.
+        #: Features of all worlds' plans; a new array after each step.
         self.features = np.zeros((session.n_worlds, *shape), np.float32)
         self._paths = np.zeros((session.n_worlds, len(OBJECTIVES), 0), np.uint8)
 
@@ -86,8 +83,9 @@ class Plans:
     ) -> None:
         """Begins or resumes the episodes of the worlds in `begun`.
 
-        The belief of a resumed world is the one left for its present step, or is computed from the
-        frames that are kept. `results` and `frames` have a row for every world.
+        A resumed world's belief is the one that an agent left for the current step. Without one, it
+        is computed from the frames that the server keeps. `results` and `frames` have a row for
+        every world.
         """
         settings = self._session.settings
         watched = None if settings.instance is None else (settings.instance, settings.world)
@@ -106,7 +104,7 @@ class Plans:
         self._plan(new, results, frames)
 
     def paths(self, choices: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The moves of each world's choice, `(n_worlds, T)`."""
+        """Returns the path of each world's chosen option, `(n_worlds, T)`."""
         return self._paths[np.arange(len(choices)), choices]
 
     def see(
@@ -116,20 +114,20 @@ class Plans:
         results: NDArray[np.void],
         frames: NDArray[np.uint8],
     ) -> None:
-        """Updates the beliefs of the worlds in `moved` with a step, and plans again there.
+        """Updates the beliefs of the worlds in `moved` with a step, and plans again in them.
 
-        Arrays have a row for every world; `choices` are the options that were flown.
+        Arrays have a row for every world; `choices` are the flown options.
         """
         self._plan(moved, results, frames, choices)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Does nothing, as `begin` needs the results, too."""
+        """Does nothing: `begin` does the work, as it also needs the results."""
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Does nothing, as `see` needs the results, too."""
+        """Does nothing: `see` does the work, as it also needs the results."""
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The observations of all worlds, stacked."""
+        """Returns the observations of all worlds, stacked."""
         return self.features
 
     def close(self, results: NDArray[np.void] | None) -> None:
@@ -154,7 +152,7 @@ class Plans:
                 if left is not None:
                     lease.leave_belief(StepResult(*at), *left, robot=lease.robots[world])
             except EmberwatchError:
-                return  # a server that is gone, or keeps none: the next one recalls frames
+                return  # the server ended or keeps no beliefs: the next client recalls frames
 
     def _plan(
         self,
@@ -177,7 +175,7 @@ class Plans:
         )
 
     def _resumes(self, native: _native.Options, world: int, result: np.void) -> bool:
-        """Restores the belief of a world; returns whether it includes the present step."""
+        """Restores the belief of a world; returns whether it includes the current step."""
         step = int(result["world"]["step"])
         if step == 0:
             return False
@@ -194,18 +192,18 @@ class Plans:
 
 
 class PlansOwner:
-    """The public attributes of environments that choose among plans."""
+    """The public attributes of environments whose actions choose a plan."""
 
     _plans: Plans
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """The names of the actions."""
+        """The names of the actions, in order."""
         return OBJECTIVES
 
     @property
     def feature_names(self) -> tuple[str, ...]:
-        """The names of an observation's columns."""
+        """The names of the columns of an observation."""
         return FEATURES
 
     @property

@@ -1,8 +1,7 @@
-"""The robots behind an environment, in worlds of its own or of a running server.
+"""Sessions: the robots behind an environment, in worlds of this process or of a running server.
 
-Worlds of its own are simulated in this process. Nothing is opened before the first reset, so that
-an environment may be made in one process and used in a forked child, as Gymnasium's
-`AsyncVectorEnv` does.
+A session opens nothing before the first reset. So an environment may be made in one process and
+used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 """
 
 import inspect
@@ -38,17 +37,17 @@ from emberwatch.errors import (
 )
 from emberwatch.model.tasks import Task
 
-# Seconds after its last use that a lease on a running server ends: learners may think long, and
-# the server notices a dead holder at once anyway.
+# Seconds since its last use after which a lease on a running server expires. Long, as learners may
+# pause between steps; the server notices a dead holder at once anyway.
 _LEASE: Final = 3600.0
 
-#: Errors after which the worlds are no longer held, or may stand elsewhere than expected.
+#: Errors after which the session does not hold its worlds, or does not know their step.
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
 #: Number of forks between the first process and this one.
 _n_forks = 0
-#: Lets one thread of a forked child at a time replace the lock of a session.
+#: Held by a thread of a forked child while it replaces the lock of a session.
 _fork_lock = threading.Lock()
 
 
@@ -62,35 +61,35 @@ if hasattr(os, "register_at_fork"):
 
 
 class State(Enum):
-    """What a session may do next."""
+    """The state of a session, which determines the calls that it allows."""
 
-    #: Nothing is open: the next reset opens it.
+    #: Nothing is open: the next reset opens the worlds.
     CLOSED = "closed"
-    #: The worlds stand where the last step or reset has shown them.
+    #: The worlds are in the state that the last step or reset returned.
     READY = "ready"
-    #: A step or reset has begun, and has changed nothing yet: a refusal makes it READY again.
+    #: A step or reset has begun, and has not changed anything yet: a refusal leads back to READY.
     BEGUN = "begun"
-    #: A step or reset has changed worlds, and the environment has not processed all of it yet.
+    #: A step or reset has changed worlds, and the environment has not finished processing it.
     MOVED = "moved"
-    #: A reset follows a call that was interrupted: the server may still work on its request.
+    #: A reset follows an interrupted call: the server may still work on the interrupted request.
     TORN = "torn"
     #: A request was not answered in time.
     TIMED_OUT = "timed out"
-    #: The episode of a world that others fly in is over.
+    #: The episode of a world that is shared with other clients is over.
     OVER = "over"
 
 
-#: After a call that left one of these, worlds may have moved unseen: steps are refused.
+#: States in which worlds may have moved without the session's knowledge: steps are refused.
 _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIMED_OUT))
 
 
 class Session:
-    """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
+    """Consecutive robots under a lease, one row for each. The first reset opens the session.
 
-    It flies all robots of its worlds, or one robot of a world that others fly in. An environment
-    holds `turn` during each step and reset, since threads may share the environment. It calls
-    `begin_step` or `begin_reset` first and `finish` last. Ctrl-C or a signal handler may interrupt
-    anything in between; then the state stays unfinished, and steps are refused.
+    A session flies all robots of its worlds, or one robot of a world that other clients fly in. An
+    environment holds `turn` during each step and reset, as threads may share the environment. It
+    calls `begin_step` or `begin_reset` first and `finish` last. Ctrl-C or a signal handler may
+    interrupt anything in between. Then the state stays unfinished, and steps are refused.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -103,11 +102,11 @@ class Session:
         self._has_warned = False
         self._state = State.CLOSED
         self._made_after, self._turn = _n_forks, threading.RLock()
-        #: Whether test worlds are meant, as in an evaluation.
+        #: Whether test worlds are allowed without a warning, as in an evaluation.
         self.allows_test_worlds = False
-        # Nobody else moves worlds of which it flies all robots.
+        # Worlds can move without this session's path only if other clients fly in them.
         self._accepts_late = settings.robot is not None
-        #: World steps that passed unseen before the last answer, since a path came too late.
+        #: Number of unobserved world steps before the last answer, because a path came too late.
         self.n_skipped = 0
         if settings.instance is None:
             self.spec, self._robots = own_spec(settings, n_rows)
@@ -131,7 +130,7 @@ class Session:
 
     @property
     def turn(self) -> threading.RLock:
-        """Lets one thread at a time step or reset; use it in a `with`."""
+        """A lock that lets one thread at a time step or reset; use it in a `with`."""
         if self._made_after != _n_forks:
             with _fork_lock:
                 if self._made_after != _n_forks:
@@ -148,28 +147,28 @@ class Session:
 
     @property
     def lease(self) -> Lease:
-        """The lease under which it flies."""
+        """The lease on the session's robots."""
         return self._opened()
 
     @property
     def is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
+        """Whether the session has been reset since it was made or closed."""
         return self._lease is not None
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether worlds may have moved unseen: then all are reset, or resumed."""
+        """Whether worlds may have moved unobserved: then all of them must be reset or resumed."""
         return self._state in _UNFINISHED
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leaves out the lock: a copy waits for no thread of this session."""
+        """Leaves out the lock, so that a copy does not wait for threads of this session."""
         return {name: value for name, value in vars(self).items() if name != "_turn"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _turn=threading.RLock())
 
     def begin_step(self) -> None:
-        """Begins a step; refuses one before a reset, and after a call that did not finish."""
+        """Begins a step; refuses it before a reset, or after a call that did not finish."""
         if self._state is not State.READY:
             raise self._no_step()
         self._state = State.BEGUN
@@ -179,16 +178,19 @@ class Session:
         self._state = State.TORN if self.is_unfinished else State.BEGUN
 
     def finish(self) -> None:
-        """The environment has processed what `begin_step` or `begin_reset` began."""
+        """Ends the step or reset, after the environment has processed its result."""
         self._state = State.READY
 
     def refuse_over(self) -> EmberwatchError:
-        """The error for one robot of a world that is over; steps raise it until the next reset."""
+        """Returns the error for a shared world whose episode is over.
+
+        Steps raise it until the next reset.
+        """
         self._state = State.OVER
         return self._no_step()
 
     def resume(self) -> StepAnswer:
-        """Continues from where the worlds stand, such as after another agent."""
+        """Continues the current episodes of the worlds, for example after another agent."""
         if self.settings.instance is None and not self.is_open:
             self._state = State.CLOSED
             raise invalid("options", "a reset before resume=True", "the first one")
@@ -197,9 +199,10 @@ class Session:
             return self._observe()
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
+        """Begins new episodes in the worlds `indices`; returns the results of all worlds.
 
-        If the server has ended, a reset of all worlds opens another one.
+        `indices` count the session's worlds from 0. If the server has ended, a reset of all worlds
+        connects to its successor.
         """
         may_move = self.is_open and len(indices) == self.n_worlds
         try:
@@ -210,10 +213,10 @@ class Session:
         return self._begin(indices, seeds)
 
     def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
-        """Flies paths with all robots, or with the robots of some consecutive worlds.
+        """Flies paths with all robots, or with the consecutive robots `rows` of some worlds.
 
-        Waits for slow teammates as long as the server lives. A path that came too late for them is
-        given up, and the answer is how the world stands.
+        Waits for slow teammates as long as the server lives. If the world moved on without this
+        path, the path is dropped, and the answer has the world's current results.
         """
         lease = self._opened()
         first, n_robots = self._first, self.n_rows
@@ -232,7 +235,7 @@ class Session:
         return answer
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
-        """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
+        """Returns the hidden states after the step of an answer, `(n_rows, H, W)`; a copy."""
         if self._truth is None:
             raise EmberwatchError("truth: expected an open session made with truth=True", "closed")
         first = answer.first_robot // self.spec.n_robots - self.settings.world
@@ -241,8 +244,8 @@ class Session:
         return np.stack([truth.states for truth in truths])[answer.world_of]
 
     def teams(self, answer: StepAnswer) -> StepAnswer:
-        """Results of all robots in the answer's worlds, and the frame of each world's team."""
-        # Of one robot's world, which may stand elsewhere by now.
+        """Returns the results of all robots in the answer's world, and the team's frame."""
+        # Recalls the step of the answer, as other clients may have moved the world since.
         shape, client = self.spec.shape, self._client
         if client is None:
             raise not_reset()
@@ -251,7 +254,7 @@ class Session:
         return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
     def left_belief(self, row: int) -> LeftBelief | None:
-        """The belief that was left for a robot's present step."""
+        """Returns the belief that an agent left for a robot's current step."""
         if self._client is None:
             raise not_reset()
         try:
@@ -260,7 +263,7 @@ class Session:
             raise self._lost(error) from None
 
     def history(self, row: int, step: int) -> Iterator[StepAnswer]:
-        """The steps of a robot's episode before this one, from the first on whose are all kept."""
+        """Yields the earlier steps of a robot's episode, from the first one that is still kept."""
         client, robot, past = self._client, self._robots[row], 0
         while client is not None and past < step:
             try:
@@ -276,18 +279,18 @@ class Session:
             past += 1
 
     def close(self) -> None:
-        """Gives the worlds back; a new reset opens it again.
+        """Releases the worlds; the next reset opens the session again.
 
-        May be called again, also after it was interrupted.
+        May be called again, also after an interrupted call.
         """
         self._state = State.CLOSED
         lease, self._lease = self._lease, None
         try:
-            # Worlds of its own end with their client.
+            # Worlds in this process end with their client, without a release.
             if lease is not None and self.settings.instance is not None:
                 lease.release(timeout=self.settings.timeout)
         except EmberwatchError:
-            pass  # lost, or the server is gone: nothing is held any more
+            pass  # the lease is lost or the server has ended: there is nothing to release
         finally:
             for part in (self._truth, self._client):
                 if part is not None:
@@ -295,9 +298,9 @@ class Session:
             self._truth = self._client = None
 
     def _open(self, seed: int) -> None:
-        """Opens the worlds and holds them, or waits until an unfinished call is over.
+        """Opens and acquires the worlds, or waits until the server ends an interrupted call.
 
-        `seed` is the seed of world 0, if the worlds are its own.
+        `seed` is the seed of world 0, for worlds in this process.
         """
         if self.is_open:
             if self._state is State.TORN:
@@ -305,7 +308,7 @@ class Session:
                     self._settle()
             return
         settings = self.settings
-        self.close()  # what an interrupted call has left
+        self.close()  # an interrupted call may have left parts open
         try:
             if settings.instance is None:
                 chosen = {"seed": seed, **settings.of_server(self.n_worlds)}
@@ -316,7 +319,7 @@ class Session:
                 self._check_unchanged(client)
                 if settings.truth:
                     self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
-            self._lease = self._acquire(client, settings.takeover)  # from here on it is open
+            self._lease = self._acquire(client, settings.takeover)  # sets `is_open`
             self._state = State.MOVED
         except BaseException:
             self.close()
@@ -335,10 +338,11 @@ class Session:
         """Waits until the server has finished an interrupted step or reset."""
         client = self._client
         assert client is not None
-        # A server that does not answer is not waited for as long as a burn-in may take.
+        # Checks first that the server answers, as the next request may wait for a burn-in.
         client.status(timeout=self.settings.timeout)
         try:
-            # Answered after the burn-in of a reset; paths under the old lease are refused by then.
+            # The answer comes after the burn-in of a reset. The server then refuses paths under
+            # the old lease.
             self._lease = self._acquire(client, takeover=False)
         except EmberwatchError as error:
             if error.code == "busy":
@@ -362,16 +366,16 @@ class Session:
         return answer
 
     def _warn_of_barren(self, answer: StepAnswer) -> None:
-        """Warns once of worlds in which there is nothing to find."""
+        """Warns once if worlds begin without a cell in the state that pays most."""
         worlds = answer.worlds
         barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
         if self._has_warned or self.spec.is_recorded or not len(barren):
             return
         self._has_warned = True
         _warn(
-            f"no cell of world {barren[0]} (of {len(barren)} of {len(worlds)} worlds) is in the "
-            "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
-            "model='wildfire-small'"
+            f"no cell of world {barren[0]} is in the state that pays most (the same in "
+            f"{len(barren)} of {len(worlds)} worlds): use a longer burn_in, a larger grid, or a "
+            "model for small grids, model='wildfire-small'"
         )
 
     def _warn_of_test_worlds(self, seeds: Sequence[int]) -> None:
@@ -384,17 +388,17 @@ class Session:
             return
         try:
             self._warn_of_task(task)
-        except Warning:  # made an error: nothing has changed
+        except Warning:  # a filter turns warnings into errors: nothing has changed yet
             if self._state is State.BEGUN:
                 self._state = State.READY if self.is_open else State.CLOSED
             raise
 
     def _warn_of_task(self, task: Task) -> None:
         tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
-        # Of this line, wherever the reset is: Python shows it once in a process.
+        # Attributed to this line, wherever the reset is: so Python shows it once in a process.
         warnings.warn(
-            f"task {task.name!r}: an episode begins on a test world, as seeds {tests.start} to "
-            f"{tests.stop - 1} do; train on seeds from {others} on, with reset(seed={others}) or a "
+            f"task {task.name!r}: an episode begins on a test world (seeds {tests.start} to "
+            f"{tests.stop - 1}); train on seeds from {others} on, with reset(seed={others}) or a "
             f"trainer's seed={others}; to test, use emberwatch.benchmark.evaluate, or ignore "
             "emberwatch.TrainingOnTestWorldsWarning with warnings.filterwarnings",
             TrainingOnTestWorldsWarning,
@@ -402,7 +406,7 @@ class Session:
         )
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
-        """Closes what is gone, so that a reset opens it again; remembers a timeout."""
+        """Closes the session after a loss, so that a reset opens it again; remembers a timeout."""
         if isinstance(error, RequestTimeoutError):
             self._state = State.TIMED_OUT
         else:
@@ -430,8 +434,8 @@ class Session:
             return not_reset()
         if self._state is State.OVER:
             return EmberwatchError(
-                "the episode of the world is over: a reset is for a client that holds all its "
-                "robots",
+                "the episode of the world is over: only a client that holds all its robots can "
+                "reset it",
                 "episode_over",
             )
         what, code = "did not finish (Ctrl-C or an error)", "interrupted"
@@ -439,7 +443,7 @@ class Session:
             what, code = "timed out", "closed"
         return EmberwatchError(
             f"an earlier step or reset {what}, and the world may have moved: reset, or continue "
-            "from where it stands with reset(options={'resume': True})",
+            "the episode with reset(options={'resume': True})",
             code,
         )
 
@@ -452,22 +456,22 @@ class Session:
         return self._opened().observe(timeout=self.settings.timeout)
 
     def _check_unchanged(self, client: Client) -> None:
-        """Another server may serve the instance by now."""
+        """Refuses a server whose worlds differ: the instance may have a new server."""
         spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
             raise invalid(
                 f"instance {client.instance!r}",
-                f"the server as it was when the environment was made, {_told(self.spec)}",
-                f"{_told(spec)} or another model: make the environment again",
+                f"the server as it was when the environment was made, {_without_model(self.spec)}",
+                f"{_without_model(spec)} or another model: make the environment again",
             )
 
 
-def _told(spec: WorldSpec) -> WorldSpec:
+def _without_model(spec: WorldSpec) -> WorldSpec:
     return replace(spec, model=None, description=None)
 
 
 def _warn(message: str) -> None:
-    """Warns at the caller's line: the first outside this package and Gymnasium."""
+    """Warns at the caller's line: the innermost one outside this package and Gymnasium."""
     frame, level = inspect.currentframe(), 1
     while frame and frame.f_globals["__name__"].partition(".")[0] in ("emberwatch", "gymnasium"):
         frame, level = frame.f_back, level + 1
@@ -475,5 +479,5 @@ def _warn(message: str) -> None:
 
 
 def not_reset() -> EmberwatchError:
-    """The error of an environment without an episode."""
+    """Returns the error for an environment that was not reset."""
     return EmberwatchError("the environment is closed: reset it first", "closed")

@@ -1,4 +1,4 @@
-"""The keywords of every environment: their names, defaults and checks."""
+"""The keywords that all environments share: their names, defaults and checks."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.model.tasks import Task, built_in_tasks
 
-#: Drawn seeds are below this: every JSON reader represents them exactly (PROTOCOL.md section 2).
+#: Upper bound of drawn seeds, which every JSON reader represents exactly (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
 
-#: Keywords by the name of their setting in `config/server.toml`, where the names differ.
+#: Keywords whose name differs from their setting in `config/server.toml`, by the setting.
 _KEYWORDS: Final = {
     "moves": "n_moves",
     "worlds": "num_envs",
@@ -32,7 +32,7 @@ _KEYWORDS: Final = {
     "cells times robots": "height times width times robots",
 }
 
-#: What to do instead, by the removed keyword.
+#: Hints for removed keywords.
 _REMOVED: Final = {
     "backend": " (removed: worlds are simulated in this process; instance=... attaches to a server)"
 }
@@ -41,7 +41,7 @@ _Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
-    """The keywords, as type checkers see them; `Settings` has the defaults."""
+    """The keywords for type checkers; `Settings` has the defaults."""
 
     instance: str | None
     world: int
@@ -66,7 +66,7 @@ class WorldArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """The keywords; `WildfireEnv` explains them. None: the default, or the server's value."""
+    """The keywords, which `WildfireEnv` explains. None: the default, or the server's value."""
 
     instance: str | None = None
     world: int = 0
@@ -87,7 +87,7 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
-    #: Whether infos and pictures show the hidden states; `truth` may be for rewards alone.
+    #: Whether infos and pictures show the hidden states. `truth` may be set for rewards alone.
     reveals: bool = False
 
     def __post_init__(self) -> None:
@@ -114,10 +114,11 @@ class Settings:
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
-        """The settings from what is left of an environment's keywords.
+        """Makes settings of an environment's shared keywords.
 
         Raises:
-            TypeError: If a keyword is unknown; names the most similar one, and all.
+            TypeError: If a keyword is unknown. The message names the most similar keyword, and all
+                known ones.
         """
         parameters = signature(environment).parameters.values()
         known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}
@@ -126,16 +127,16 @@ class Settings:
                 alike = get_close_matches(name, known, 1)
                 hint = f" (did you mean {alike[0]!r}?)" if alike else ""
                 hint = _REMOVED.get(name, hint)
-                # In Python's words, by which TorchRL knows what to leave out.
+                # Python's own message, which TorchRL parses to drop the keyword.
                 raise TypeError(
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
-                    f"known are {', '.join(sorted(known))}"
+                    f"known keywords: {', '.join(sorted(known))}"
                 )
         asked = cls(**world)
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
     def of_server(self, n_worlds: int) -> dict[str, Any]:
-        """The settings of these worlds, by their names in `config/server.toml`."""
+        """Returns the settings of `n_worlds` worlds, by their names in `config/server.toml`."""
         given = {
             "worlds": n_worlds,
             "robots": self.robots,
@@ -149,14 +150,14 @@ class Settings:
             "sensor_radius": self.sensor_radius,
             "start": self.start,
             "publish_truth": self.truth,
-            # Refused where there is no states file.
+            # Left out at the default, as they are refused without a states file.
             "states_symmetries": self.states_symmetries or None,
             "states_offset": self.states_offset or None,
         }
         return {name: as_setting(name, it) for name, it in given.items() if it is not None}
 
     def check(self, n_worlds: int) -> dict[str, Any]:
-        """All settings of these worlds, with defaults. A refusal names the keyword."""
+        """Checks the settings, and returns them with all defaults. Errors name the keyword."""
         try:
             return check_settings(self.of_server(n_worlds))
         except InvalidArgumentError as error:
@@ -166,7 +167,7 @@ class Settings:
 
 
 def shows_keywords(init: _Init) -> _Init:
-    """Shows the keywords and their defaults instead of ``**world``, for `help` and editors."""
+    """Replaces ``**world`` in a signature by the keywords and defaults, for `help` and editors."""
     plain: Any = init
     own = signature(plain).parameters.values()
     kinds = get_type_hints(Settings)
@@ -185,31 +186,36 @@ def shows_keywords(init: _Init) -> _Init:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldSpec:
-    """What an environment must know of its worlds before they are made."""
+    """The properties of an environment's worlds that are known before the worlds exist."""
 
-    #: None if a running server hides it, or the worlds were recorded.
+    #: None if a running server hides it, or the worlds are recorded.
     model: Model | None
+    #: Rows of the grid.
     height: int
+    #: Columns of the grid.
     width: int
+    #: Moves of a path, T.
     n_moves: int
+    #: Number of observed values, O.
     n_observations: int
+    #: Number of steps that the worlds are simulated before k = 0.
     burn_in: int
     #: Where robots may fly and what they see.
     airspace: Airspace
-    #: Which land each cell is, for pictures; None where all are alike, or a server hides it.
+    #: Zones of land, for pictures; None if there are no zones, or a running server hides them.
     zones: Zones | None
-    #: Robots of a world.
+    #: Robots of each world.
     n_robots: int
-    #: Whether hidden states come from a states file, not from a model.
+    #: Whether the hidden states come from a states file instead of a model.
     is_recorded: bool
-    #: What recorded worlds say of their states; None if a running server hides it.
+    #: The description of recorded states; None if worlds are simulated, or the server hides it.
     description: Description | None = None
-    #: The task that the worlds are, if it is known.
+    #: The task that defines the worlds, if it is known.
     task: Task | None = field(default=None, compare=False, repr=False)
 
     @property
     def described(self) -> Description | None:
-        """What states are called and pay."""
+        """The description or model, for the names and rewards of states; None if hidden."""
         return self.description or self.model
 
     @property
@@ -218,12 +224,12 @@ class WorldSpec:
 
 
 def draw_seed(generator: np.random.Generator) -> int:
-    """Draws the world's seed of a reset without one, from the environment's own generator."""
+    """Draws a world's seed from the environment's generator, for a reset without a seed."""
     return int(generator.integers(SEEDS))
 
 
 def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
-    """Describes the worlds that this process will simulate, and numbers the robots to fly.
+    """Returns the spec of the worlds that this process will simulate, and the robots to fly.
 
     `n_rows`: number of robots; None: all robots of one world.
     """
@@ -232,7 +238,7 @@ def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
         if getattr(settings, name) != default:
             raise InvalidArgumentError(
                 f"{name}: applies only with instance=..., the name of a running server; without "
-                "it, the environment simulates worlds of its own"
+                "it, the environment simulates its own worlds"
             )
     task = None if settings.task is None else Task.named(settings.task)
     n_robots = settings.robots or (1 if task is None else task.robots)
@@ -259,24 +265,28 @@ def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
 def running_spec(
     settings: Settings, n_rows: int | None, info: ServerInfo
 ) -> tuple[WorldSpec, range]:
-    """A running server's worlds, which the settings must agree with, and the robots to fly."""
+    """Returns the spec of a running server's worlds, and the robots to fly.
+
+    Raises:
+        InvalidArgumentError: If the settings do not match the server.
+    """
     own = ("start", None), ("states", None), ("states_symmetries", False), ("states_offset", 0)
     for name, default in own:
         if getattr(settings, name) != default:
             raise InvalidArgumentError(
-                f"{name}: expected {default}, as the running server has its own"
+                f"{name}: expected {default} (the default), as the running server determines it"
             )
     task = built_in_tasks().get(info.task or "")
     if settings.task is not None:
         task = _check_task(settings.task, info)
     if settings.model is not None and info.model is not None:
-        raise InvalidArgumentError("model: expected None, as the running server reveals its own")
+        raise InvalidArgumentError("model: expected None, as the running server reveals its model")
     known = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
     known |= {"robots": info.n_robots, "sensor_radius": info.airspace.radius}
     for name, has in known.items():
         asked = getattr(settings, name)
         if asked not in (None, has):
-            raise invalid(name, f"{has}, as the server has, or None", asked)
+            raise invalid(name, f"the server's {has}, or None", asked)
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
@@ -311,19 +321,19 @@ def running_spec(
 
 
 def _check_task(asked: str | Path, info: ServerInfo) -> Task:
-    """The task; refuses a server of another, and one whose worlds are not the task's."""
+    """Returns the task; refuses a server of another task, or with worlds that differ from it."""
     task = Task.named(asked)
     if task.name != info.task:
-        raise invalid("task", f"{info.task!r}, as the server has, or None", repr(task.name))
+        raise invalid("task", f"the server's {info.task!r}, or None", repr(task.name))
     own = check_settings({"task": utf8("task", asked)})
     has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
     has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
     for name, got in has.items():
         if own[name] != got:
-            raise invalid(f"{name} of task {task.name!r}", f"{got}, as the server has", own[name])
+            raise invalid(f"{name} of task {task.name!r}", f"the server's {got}", own[name])
     described = _described(own)
     if described.sensor_radius != info.airspace.radius:
-        expected = f"{info.airspace.radius}, as the server has"
+        expected = f"the server's {info.airspace.radius}"
         name = f"sensor_radius of task {task.name!r}"
         raise invalid(name, expected, described.sensor_radius)
     served: Description | None = info.recorded_states
@@ -332,12 +342,12 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     elif info.model is not None:
         served = Model.from_toml(info.model)
     if served not in (None, described):
-        raise invalid(f"states of task {task.name!r}", "those that the server has", described.name)
+        raise invalid(f"states of task {task.name!r}", "the server's states", described.name)
     return task
 
 
 def _described(checked: dict[str, Any]) -> Description:
-    """Names of states and how they are observed, by settings that have been checked."""
+    """Returns the model, or the description of recorded states, of checked settings."""
     if checked["states"]:
         described: Description = _description(local(checked["states"]))
     else:
@@ -347,7 +357,7 @@ def _described(checked: dict[str, Any]) -> Description:
 
 
 def _description(states: str) -> Description:
-    """The description of recorded worlds whose states file has been checked."""
+    """Returns the description of a states file that has been checked."""
     text = _native.built_in("states").get(states)
     if text is None:
         place = Path(states)
@@ -357,7 +367,7 @@ def _description(states: str) -> Description:
 
 
 def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
-    """The numbers of the robots to fly: one, or all of some worlds."""
+    """Returns the numbers of the robots to fly: one robot, or all robots of some worlds."""
     first = settings.world * n_robots
     if settings.robot is not None:
         if n_rows != 1:
@@ -369,7 +379,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
     if n_rows // n_robots * n_robots != n_rows:
         raise InvalidArgumentError(
             f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
-            "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "
-            f"num_envs, a multiple of {n_robots}, got {n_rows}"
+            "robot=..., all robots of a world with emberwatch.parallel_env, or all robots of "
+            f"several worlds with num_envs, a multiple of {n_robots}, got {n_rows}"
         )
     return range(first, first + n_rows)

@@ -1,7 +1,7 @@
-"""What the vector environments share: episodes, their ends, infos, pictures.
+"""The base class of the vector environments: episodes, their ends, infos and pictures.
 
-Rows are robots: all of the first world, then those of the next. The robots of a world begin and end
-their episodes together.
+Rows are robots: all robots of the first world, then those of the next world, and so on. The robots
+of a world begin and end their episodes together.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from emberwatch._native import columns
 from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
-from emberwatch.common.arguments import as_array, as_integer, as_seed, told
+from emberwatch.common.arguments import as_array, as_integer, as_seed, repr_of
 from emberwatch.envs.base import (
     NOTHING_TO_DRAW,
     WorldEnv,
@@ -35,7 +35,7 @@ from emberwatch.model.moves import fly
 
 
 class Columns(NamedTuple):
-    """The numbers of all rows, `(n_rows,)` each."""
+    """The results of all rows as columns, `(n_rows,)` each."""
 
     rewards: NDArray[np.float64]
     terminated: NDArray[np.bool_]
@@ -51,9 +51,9 @@ class Columns(NamedTuple):
 class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]
 ):
-    """Many robots, stepped together."""
+    """A vector environment of many robots, stepped together."""
 
-    # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
+    # True until `__init__` ends, as Gymnasium 1.2 also closes an object whose `__init__` failed.
     closed = True
 
     def __init__(
@@ -66,8 +66,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
-        """`pays`: which of `base.REWARDS` a step pays."""
-        if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
+        """`pays`: the index in `base.REWARDS` of the reward of a step."""
+        if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
             raise invalid("max_episode_steps", "at least 1 or None", max_episode_steps)
@@ -89,18 +89,18 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._pays = pays
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
-        #: The numbers of the results.
+        #: The results as columns.
         self._columns = self._columns_of(self._results)
         self._every = np.ones(num_envs, np.bool_)
         self._none = np.zeros(num_envs, np.bool_)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over, self._has_ended = self._none, False
-        #: Robots that completed a path in this step; None: none of them.
+        #: Mask of the robots that completed a path in this step; None: no robot did.
         self._exchanged: NDArray[np.bool_] | None = None
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
-        #: Whether `seen` shows frames that no learner has written to.
+        #: Whether learners get copies of the frames, whose changes do not affect `seen`.
         self.keeps_frames = False
 
     def reset(
@@ -109,11 +109,12 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins episodes in all worlds, or in those of `options["reset_mask"]`.
+        """Begins episodes in all worlds, or in the worlds of `options["reset_mask"]`.
 
         Args:
-            seed: For world 0, the others follow; or one per row, of which each world takes its
-                first; None: each world's own generator goes on.
+            seed: The seed s of the first world; world i gets s + i. Or a sequence with one seed for
+                each row, in which the first row of a world counts. None: each world's generator
+                draws its next seed.
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
         """
@@ -124,11 +125,12 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         with self._session.turn:
             if not mask.all() and not self.is_open:
                 raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected a reset of all worlds before"
+                    "reset_mask: expected all worlds in the first reset, got some"
                 )
             if not mask.all() and self._session.is_unfinished:
                 raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected all worlds, as an earlier step or reset did not finish"
+                    "reset_mask: expected all worlds, as an earlier step or reset did not finish, "
+                    "got some"
                 )
             self.closed = False
             self._session.begin_reset()
@@ -145,11 +147,11 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def step(
         self, actions: NDArray[np.integer[Any]]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """One step of each robot.
+        """Steps all robots.
 
         Raises:
             gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
-            EmberwatchError: As `WildfireEnv.step`.
+            EmberwatchError: As in `WildfireEnv.step`.
         """
         chosen = self._check_actions(actions)
         with self._session.turn:
@@ -172,7 +174,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return outcome
 
     def render(self) -> tuple[Any, ...] | None:
-        """The picture of each robot, as `WildfireEnv.render` draws it."""
+        """Returns a picture for each robot, as `WildfireEnv.render` draws it."""
         if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
@@ -181,7 +183,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return tuple(self.draw(slice(row, row + 1)) for row in range(self.num_envs))
 
     def draw(self, rows: slice) -> Any:
-        """The picture of some robots of one world, and of what they saw together."""
+        """Draws some robots of one world, and their combined frame."""
         row: int = rows.start
         frame, cells = self.seen(rows)
         robots = [(at[0], at[1]) for at in cells.tolist()]
@@ -190,22 +192,22 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._views[row].draw(frame, robots, paths, truth)
 
     def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """What some robots of one world saw together, `(H, W)`, and their cells; new arrays."""
+        """Returns the combined frame of some robots of one world, and their cells; new arrays."""
         return self._frames[rows].min(axis=0), self._robots()[rows]
 
     @property
     def results(self) -> NDArray[np.void]:
-        """The last result of each robot and its world, for reports, not for learners.
+        """The last result of each robot and its world, `(num_envs,)` of `wire.RESULT_DTYPE`.
 
-        `(num_envs,)` of `wire.RESULT_DTYPE`.
+        For reports, not for learners.
         """
         return self._results.copy()
 
     @property
     def truths(self) -> NDArray[np.uint8] | None:
-        """The hidden states of each robot's world, where they are read; as `results`.
+        """The hidden states of each robot's world, `(num_envs, H, W)`; None if they are not read.
 
-        `(num_envs, H, W)`; not to be written to.
+        For reports, not for learners. Do not write to the array.
         """
         return self._truths
 
@@ -218,26 +220,26 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         raise NotImplementedError
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Steps the rows `flown`; of the rewards, those of the others do not count."""
+        """Steps the rows `flown`, and returns rewards; the values of other rows are ignored."""
         raise NotImplementedError
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        """Episodes have begun in some rows, or go on."""
+        """Called after episodes in the rows `begun` have begun or were resumed."""
 
     def _robots(self) -> NDArray[np.int64]:
-        """Row and column of each robot, a new array."""
+        """Returns row and column of each robot as a new array."""
         return self._columns.cells.copy()
 
     def _path(self, row: int) -> NDArray[np.intp] | None:
-        """The cells of a robot's path, where there is a render mode."""
+        """Returns the cells of a robot's last path, which are kept only with a render mode."""
         return self._paths[row]
 
     def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
-        """Flies whole paths in some rows, in one message where they are consecutive."""
+        """Flies complete paths in the rows `moved`, with one message for each run of rows."""
         if moved is self._every or moved.all():
             self._take(self._session.step(paths))
         elif moved.any():
-            self._frames = self._frames.copy()  # the learner has the others
+            self._frames = self._frames.copy()  # the learner holds the previous array
             for run in _runs(moved):
                 self._exchange_run(paths, run)
         self._exchanged = moved
@@ -257,7 +259,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             self._truths[chosen] = self._session.truth(answer)
 
     def _restart(self, rows: list[int], seeds: Sequence[int | None]) -> None:
-        """Begins episodes in the worlds of some rows; `seeds` are those of all worlds."""
+        """Begins episodes in the worlds of some rows; `seeds` has an entry for every world."""
         n_robots = self._spec.n_robots
         worlds, chosen = [row // n_robots for row in rows[::n_robots]], list[int]()
         for world in worlds:
@@ -293,7 +295,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _outcome(
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """What `step` returns."""
+        """Returns the outcome of a step, after resets in mode `SAME_STEP`."""
         terminations, truncations, may_end = self._none, self._none, False
         if self._exchanged is not None and self._columns.is_over:
             terminations = self._exchanged & self._columns.terminated
@@ -315,7 +317,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._seen(), rewards, terminations, truncations, infos
 
     def _final(self, over: NDArray[np.bool_]) -> dict[str, Any]:
-        """The last observations and infos of episodes that end in this step."""
+        """Returns the last observations and infos of the episodes that end in this step."""
         observations = np.full(self.num_envs, None, dtype=object)
         seen = self._observations.all(self._frames.copy(), self._robots())
         for index in np.flatnonzero(over).tolist():
@@ -328,7 +330,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         }
 
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        """The infos of some rows, zero for the others, as Gymnasium stacks them."""
+        """Returns the infos of the rows in `mask`, stacked as Gymnasium does; other rows are 0."""
         infos: dict[str, Any] = {}
         for name, values in self._reported().items():
             if mask is self._every:
@@ -340,7 +342,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return infos
 
     def _reported(self) -> dict[str, NDArray[Any]]:
-        """What the infos of `WorldEnv` report, of all rows."""
+        """Returns the info of `WorldEnv` for all rows, by name."""
         reported: dict[str, NDArray[Any]] = {
             "step": self._columns.steps,
             "n_visited": self._columns.n_visited,
@@ -359,23 +361,22 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """The frames, which the learner may write to: pictures come from others."""
+        """Returns the frames for the learner; copies if pictures or `seen` need the originals."""
         is_own = self.render_mode is None and not self.keeps_frames
         return self._frames if is_own else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
-        """The seed of each world."""
+        """Returns the seed of each world. Checks all before any world's generator is replaced."""
         n_worlds = self._session.n_worlds
         if seed is None:
             return [None] * n_worlds
-        # Checked before any world's generator is replaced.
         first = as_integer(seed)
         if first is not None:
             return [as_seed(first + world) for world in range(n_worlds)]
         if isinstance(seed, np.ndarray):
             seed = as_array(seed, "seed", "integers").tolist()
         if not isinstance(seed, Sequence) or len(seed) != self.num_envs:
-            raise invalid("seed", f"an integer, None or {self.num_envs} of them", told(seed))
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr_of(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]
 
@@ -389,12 +390,12 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             raise invalid("reset_mask", expected, got)
         worlds = mask.reshape(-1, self._spec.n_robots)
         if (worlds.any(axis=1) != worlds.all(axis=1)).any():
-            raise invalid("reset_mask", "all robots of a world or none", "some")
+            raise invalid("reset_mask", "the same value for all robots of a world", "a mixture")
         return mask
 
 
 def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
-    """The info of one row among stacked ones, its numbers as Python's own."""
+    """Returns the info of one row of stacked infos, with numbers as `int`, `float` and `bool`."""
     shown = {name: values[row] for name, values in infos.items() if not name.startswith("_")}
     return {
         name: value.item() if isinstance(value, np.generic) else value
@@ -403,13 +404,13 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
 
 
 def vector_session(settings: Settings, num_envs: int | None) -> Session:
-    """A session of all robots of some worlds."""
+    """Makes a session of all robots of some worlds."""
     if settings.robot is not None:
-        raise invalid("robot", "None, as a vector environment flies all", settings.robot)
+        raise invalid("robot", "None, as a vector environment flies all robots", settings.robot)
     return Session(settings, num_envs)
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[range]:
-    """The runs of consecutive true entries."""
+    """Returns the runs of consecutive true entries."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
     return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -1,4 +1,4 @@
-"""The picture of an environment in its render mode."""
+"""Pictures of an environment in its render mode."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -11,15 +11,15 @@ from emberwatch.errors import invalid
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.render.scenery import Scenery
 
-#: The render modes of every environment here.
+#: The render modes of all environments.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 
-#: Pictures a second of a film, and at most in a window.
+#: Pictures per second of a film; the maximum in a window.
 RENDER_FPS: Final = 10
 
 
 class View:
-    """Draws one world: the frame, robots and their paths, and the truth where it is known."""
+    """A painter of one world: its frame, robots, paths, and hidden states if they are known."""
 
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
@@ -39,7 +39,7 @@ class View:
         paths: Sequence[NDArray[np.intp]],
         truth: NDArray[np.uint8] | None,
     ) -> Any:
-        """An image, a text, or `None` after showing it to a human, as the mode has it."""
+        """Returns an image or a text, or shows it and returns None, depending on the mode."""
         picture = Picture(frame, robots, self._palette, paths, truth, self._scenery)
         if self.mode == "rgb_array":
             return rgb_array(picture)

@@ -8,15 +8,19 @@ from numpy.typing import NDArray
 from emberwatch.belief import Filters, entropy
 from emberwatch.model import Model
 
-#: Channels of `local` about the world.
+#: Number of channels of `local` about the world.
 N_OF_BELIEF: Final = 2
 
-#: The last channels of every window: visited, off the grid or no-fly, share of the path left.
+#: Number of the last channels of every window: visited, off the grid or no-fly, remaining moves.
 N_OF_PATH: Final = 3
 
 
 def of_belief(model: Model, filters: Filters, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The channels of `local` about the world: probability that pays, and entropy."""
+    """Returns the first channels of `local`, times 255, for the rows `rows`.
+
+    The probability of the state that pays most, and the entropy divided by log S. Shape
+    (n, H, W, 2).
+    """
     predictor = filters.predictor if rows.all() else filters.predictor[:, rows]
     shown = np.empty((*predictor.shape[1:], N_OF_BELIEF), np.uint8)
     channels = predictor[model.target_state], entropy(predictor) / np.log(model.n_states)

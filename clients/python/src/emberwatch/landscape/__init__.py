@@ -1,12 +1,13 @@
 """Recorded worlds from rasters of fires: `python -m emberwatch.landscape IN... --out world.npz`.
 
-`inputs` finds files; `raster` (with rasterio), `netcdf` (with netCDF4; its `axes` and `packing`
-know CF) and `numpy_file` read them as `layers`; ``pip install emberwatch[landscape]``. `schedule`
-says when layers are, `ground` how large cells are on the ground (with pyproj), `lengths` knows
-units, `grid` checks where cells are and resamples, `fire` makes states of times, masks or codes,
-`world` writes what `emberwatch-server --states` reads, `picture` draws it, `__main__` reads flags.
+Reading needs ``pip install emberwatch[landscape]``. `inputs` finds the files. `raster` (with
+rasterio), `netcdf` (with netCDF4; `axes` and `packing` apply the CF conventions) and `numpy_file`
+read them as `layers`. `schedule` computes the time of each layer, `ground` the size of cells on the
+ground (with pyproj). `lengths` has units, `grid` checks positions and resamples. `fire` makes
+states of times, masks or codes, `world` writes the files for `emberwatch-server --states`,
+`picture` draws them, and `__main__` parses the flags.
 
-`python -m emberwatch.landscape land` makes model files with zones: `elevation` computes slopes,
-`terrain` finds zones and has the formula of slope and wind, `compass` names directions, `zoned`
-writes kernels for each, `land` reads flags.
+`python -m emberwatch.landscape land` makes model files with zones. `elevation` computes slopes,
+`terrain` finds zones and has the formula of slope and wind, `compass` parses directions, `zoned`
+makes the kernels of each zone, and `land` parses the flags.
 """

@@ -1,4 +1,4 @@
-"""`python -m emberwatch.landscape`: rasters of fires in, a recorded world out."""
+"""`python -m emberwatch.landscape`: converts rasters of fires to a recorded world."""
 
 import argparse
 import math
@@ -27,19 +27,19 @@ from emberwatch.landscape.world import Fill, arrays, check_outputs, description,
 _NAME: Final = "python -m emberwatch.landscape"
 _EXAMPLES: Final = """
 examples:
-  # Arrival times in seconds (as of ELMFIRE); a cell burns for 6 steps of 10 minutes:
+  # Arrival times in seconds (as from ELMFIRE); a cell burns for 6 steps of 10 minutes:
   python -m emberwatch.landscape time_of_arrival.tif --kind arrival --unit s --step "10 min" \\
       --burning 6 --cell 120 --out world.npz
-  # Masks of all that has burnt so far, one file a time:
+  # Masks of all cells that have burnt so far, one file for each time:
   python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 \\
       --out world.npz
-  # A NetCDF variable with a time dimension, of codes 0, 1, 2:
+  # A NetCDF variable of the codes 0, 1, 2 with a time dimension:
   python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
       --out world.npz
 
-`python -m emberwatch.landscape land` makes a model file with zones of elevation and wind.
+`python -m emberwatch.landscape land` makes a model file with zones from elevation and wind.
 """
-#: Flags that mean something for some kinds only.
+#: Flags that apply only to some kinds.
 _ONLY_FOR: Final = {
     "begin": ("arrival",),
     "burning": ("arrival", "mask"),
@@ -50,9 +50,10 @@ _ONLY_FOR: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Imports what the flags name; else exits with code 2 and what is wrong.
+    """Converts the rasters that the flags name; exits with code 2 and a message on an error.
 
-    The first word `land` makes a model file instead; a folder of that name is `./land`.
+    If the first word is `land`, makes a model file instead. An input folder of that name must be
+    written `./land`.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["land"]:
@@ -68,55 +69,64 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a recorded world for `emberwatch-server --states` of rasters: GeoTIFF "
+        description="Make a recorded world for `emberwatch-server --states` from rasters: GeoTIFF "
         "(.tif), ESRI ASCII grid (.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md "
-        "has all rules.",
+        "describes all rules.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="IN", help="files, or a folder for each sequence")
-    add("--out", type=Path, required=True, metavar="FILE.npz", help="and FILE.toml beside it")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE.npz",
+        help="the output; its description goes to FILE.toml",
+    )
     add(
         "--kind",
         required=True,
         choices=("arrival", "mask", "burning", "states"),
-        help="arrival: one file a fire, of the times at which cells begin to burn; mask: layers of "
-        "what has burnt so far; burning: layers of what burns now; states: layers of codes",
+        help="arrival: one file for each fire, with the times at which cells begin to burn; mask: "
+        "layers of all cells that have burnt so far; burning: layers of the cells that burn at "
+        "this time; states: layers of codes",
     )
-    add("--step", required=True, metavar="TIME", help="what one step lasts, such as '10 min'")
-    add("--unit", choices=("s", "min", "h", "d"), help="what times count [as the file says]")
+    add("--step", required=True, metavar="TIME", help="duration of a step, such as '10 min'")
+    add("--unit", choices=("s", "min", "h", "d"), help="unit of times in the files [the file's]")
     add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
     add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
-    add("--every", type=_whole, metavar="N", help="make a step of each so many layers [1]")
-    add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
-    add("--variable", metavar="NAME", help="of a NetCDF or .npz file that has several")
-    add("--band", type=_whole, metavar="N", help="the one band to take of each file [all]")
+    add("--every", type=_whole, metavar="N", help="make a step of every N-th layer [1]")
+    add("--codes", type=_codes, metavar="U,B,D", help="codes of unburnt, burning, burnt [0,1,2]")
+    add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
+    add("--band", type=_whole, metavar="N", help="the only band to read from each file [all]")
     add(
         "--nodata",
         type=float,
         action="append",
         metavar="X",
-        help="a number for no value; --nodata=-1e30 where it has an exponent",
+        help="a number that means no value; if negative with an exponent, write --nodata=-1e30",
     )
-    add("--missing-is-unburnt", action="store_true", help="take cells without a value as unburnt")
-    add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="cells of the input to use")
+    add("--missing-is-unburnt", action="store_true", help="treat cells without a value as unburnt")
+    add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="part of the input to use")
     add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
     add("--width", type=_whole, metavar="N", help="columns of the world [the input's]")
     add(
-        "--cell", metavar="METRES", help="side of a cell, or '98.4 ft', instead of rows and columns"
+        "--cell",
+        metavar="METRES",
+        help="side of the world's cells instead of rows and columns, such as 30 or '98.4 ft'",
     )
     add(
         "--resample",
         choices=("earliest", "nearest"),
         default="earliest",
-        help="when a larger cell burns: as the first of its input cells, or as its middle one "
+        help="when a larger cell burns: with the first of its input cells, or with the middle one "
         "[earliest]",
     )
-    add("--oblong", action="store_true", help="take cells that are not square as squares")
-    add("--mixed", action="store_true", help="take sequences whose cells differ on the ground")
-    add("--name", help="of the world [the output's]")
-    add("--picture", type=Path, metavar="FILE.png", help="draw what came out")
+    add("--oblong", action="store_true", help="treat cells that are not square as squares")
+    add("--mixed", action="store_true", help="allow sequences whose cells differ on the ground")
+    add("--name", help="name of the world [the output file's]")
+    add("--picture", type=Path, metavar="FILE.png", help="draw the result")
     add("--force", action="store_true", help="replace the output")
     return parser
 
@@ -152,12 +162,15 @@ def _import(flags: argparse.Namespace) -> None:
         contents[flags.picture] = lambda file: image.save(file, "PNG")
     write(contents)
     for states_of_fire in sequences:
-        print(_told(states_of_fire))
+        print(_summary(states_of_fire))
     if first is not None and flags.cell is not None and first.ground() is None:
-        print("cells taken as metres, as nothing says their unit; --height N does not need it")
+        print(
+            "assumed that cells are measured in metres, as the files name no unit; with --height N "
+            "no unit is needed"
+        )
     n_bytes = flags.out.stat().st_size
-    told = f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}"
-    print(shown(told))
+    summary = f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}"
+    print(shown(summary))
 
 
 def _meaning(flags: argparse.Namespace) -> Meaning:
@@ -165,14 +178,15 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         given = getattr(flags, name)
         if flags.kind not in kinds and given is not None and given is not False:
             flag = name.replace("_", "-")
-            raise invalid(f"--{flag}", f"--kind {' or '.join(kinds)} beside it", flags.kind)
+            raise InvalidArgumentError(
+                f"--{flag}: applies only with --kind {' or '.join(kinds)}, got --kind {flags.kind}"
+            )
     if flags.kind in _ONLY_FOR["burning"] and flags.burning is None:
         raise InvalidArgumentError(
-            f"--burning: expected the steps that a cell burns, as --kind {flags.kind} does not "
-            "say it, got none"
+            f"--burning: required with --kind {flags.kind}: the number of steps that a cell burns"
         )
     if flags.cell is not None and (flags.height, flags.width) != (None, None):
-        raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
+        raise InvalidArgumentError("--cell: cannot be combined with --height or --width")
     if flags.begin is not None and not math.isfinite(flags.begin):
         raise invalid("--begin", "a number", flags.begin)
     flags.cell = None if flags.cell is None else side("--cell", flags.cell).metres
@@ -190,7 +204,7 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
     )
 
 
-def _told(sequence: NDArray[np.uint8]) -> str:
+def _summary(sequence: NDArray[np.uint8]) -> str:
     n_steps, height, width = sequence.shape
     burning = (sequence == BURNING).sum(axis=(1, 2))
     burnt = (sequence[-1] >= BURNING).mean()
@@ -203,7 +217,7 @@ def _told(sequence: NDArray[np.uint8]) -> str:
 def _whole(text: str) -> int:
     number = int(text) if text.isdecimal() and len(text) < 10 else 0
     if number < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of 1 to 999999999, got {text}")
+        raise argparse.ArgumentTypeError(f"expected a whole number, 1 to 999999999, got {text}")
     return number
 
 

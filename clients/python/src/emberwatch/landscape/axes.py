@@ -1,4 +1,4 @@
-"""The axes of a NetCDF variable: which dimension is which, and where the cells along it are."""
+"""The axes of a NetCDF variable: the meaning of its dimensions, and the positions of cells."""
 
 import re
 from collections.abc import Iterator
@@ -18,15 +18,15 @@ _STANDARD_NAMES: Final = {
     "Y": ("projection_y_coordinate", "latitude", "grid_latitude"),
     "T": ("time",),
 }
-#: Names of dimensions whose coordinates do not say which they are.
+#: Axes by the name of a dimension, if its coordinates do not state the axis.
 _NAMES: Final = {
     "X": ("x", "lon", "longitude", "rlon", "easting", "dimx", "west_east"),
     "Y": ("y", "lat", "latitude", "rlat", "northing", "dimy", "south_north"),
     "T": ("time", "t", "dimt", "date", "step", "layer", "band"),
 }
-_EVEN: Final = 0.1  # share of a cell by which one may be beside its place, as 32-bit numbers are
+_EVEN: Final = 0.1  # tolerance of cell positions, as a share of a cell: 32-bit numbers are rounded
 
-#: Names of dimensions and coordinates that are hardly metres.
+#: Names of dimensions and coordinates that are most likely angles, not metres.
 _ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
 
 
@@ -36,29 +36,30 @@ class Axis(NamedTuple):
     name: str
     position: int
     letter: str
-    """X, Y, Z or T, as in CF; empty if nothing says which."""
+    """X, Y, Z or T, as in CF; empty if unknown."""
     coordinate: Any | None
-    """The variable of its coordinates."""
+    """The coordinate variable; None if there is none."""
 
 
 class Line(NamedTuple):
-    """Cells side by side, along an axis."""
+    """Cells of one size, side by side along an axis."""
 
     low: float
-    """The least coordinate of their edges."""
+    """The smallest coordinate of their edges."""
     cell: float
-    """0 if the file does not say."""
+    """The size of a cell; 0 if unknown."""
     is_falling: bool
+    """Whether coordinates fall along the axis."""
     unit: str
-    """`m`, `degrees`, or empty if the file does not say."""
+    """`m`, `degrees`, or empty if unknown."""
 
 
 def axes_of(file: Path, variable: Any) -> dict[str, Axis]:
-    """Columns (X), rows (Y) and, if there is one, time (T)."""
+    """Returns the axes of columns (X), rows (Y) and, if there is one, time (T)."""
     axes = [
         _axis(file, variable, name, position) for position, name in enumerate(variable.dimensions)
     ]
-    for letter in "XY":  # the last dimensions are rows and columns, unless they say otherwise
+    for letter in "XY":  # by default, the last dimensions are rows and columns
         unknown = [axis for axis in axes if not axis.letter]
         if unknown and all(axis.letter != letter for axis in axes):
             axes[unknown[-1].position] = unknown[-1]._replace(letter=letter)
@@ -67,15 +68,15 @@ def axes_of(file: Path, variable: Any) -> dict[str, Axis]:
         wrong = [a.name for a in axes if a.letter in ("", "Z") or letters.count(a.letter) > 1]
         raise invalid(
             file,
-            "a variable of time, rows and columns",
-            f"it over {', '.join(wrong or variable.dimensions)}",
+            "a variable with the dimensions time, rows and columns",
+            f"one with {', '.join(wrong or variable.dimensions)}",
         )
     return {axis.letter: axis for axis in axes}
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
-    """Where the cells are along an axis; None if it has no coordinates."""
+    """Returns the positions of the cells along an axis; None if it has no coordinates."""
     if axis.coordinate is None:
         return None
     given, name = attributes(axis.coordinate), f"{file}, {axis.coordinate.name}"
@@ -86,8 +87,8 @@ def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
     middles = np.unwrap(middles, period=360) if is_longitude else middles
     n = middles.size
     step = (middles[-1] - middles[0]) / (n - 1) if n > 1 else sizes.sum()
-    beside = np.append(middles - middles[0] - step * np.arange(n), sizes - abs(step))
-    if (n > 1 and step == 0) or not np.abs(beside).max() <= _EVEN * abs(step):
+    errors = np.append(middles - middles[0] - step * np.arange(n), sizes - abs(step))
+    if (n > 1 and step == 0) or not np.abs(errors).max() <= _EVEN * abs(step):
         sizes = np.abs(np.append(np.diff(middles), sizes))
         got = f"some of {sizes.min():.6g} and some of {sizes.max():.6g}" if n > 1 else middles[0]
         raise invalid(name, "cells of one size side by side", got)
@@ -96,7 +97,7 @@ def line(file: Path, axis: Axis, mapping: Attributes) -> Line | None:
 
 
 def auxiliary(variable: Any) -> Iterator[Any]:
-    """The variables that its `coordinates` name, if they are there."""
+    """Yields the existing variables that the attribute `coordinates` names."""
     for name in str(attributes(variable).get("coordinates", "")).split():
         found = find(variable.group(), name)
         if found is not None:
@@ -104,7 +105,7 @@ def auxiliary(variable: Any) -> Iterator[Any]:
 
 
 def find(group: Any, name: str) -> Any | None:
-    """The variable of a name as it is seen from a group: there or in one around it."""
+    """Returns the variable of a name in a group or in the groups around it."""
     while group is not None:
         try:
             found = group[name]
@@ -117,7 +118,7 @@ def find(group: Any, name: str) -> Any | None:
 
 
 def letter_of(file: Path, coordinate: Any) -> str:
-    """Which axis a coordinate says it is of; empty if it does not."""
+    """Returns the axis (X, Y, Z or T) that a coordinate's attributes state; empty if none."""
     given = attributes(coordinate)
     axis, name, unit = (str(given.get(key, "")) for key in ("axis", "standard_name", "units"))
     degrees = re.fullmatch("degrees?_?(e|n)(ast|orth)?", unit, re.IGNORECASE)
@@ -147,7 +148,7 @@ def _axis(file: Path, variable: Any, name: str, position: int) -> Axis:
 def _unit(
     name: str, given: Attributes, mapping: Attributes, *, is_angle: bool
 ) -> tuple[float, str]:
-    """What coordinates are multiplied by, and the unit that they are then in, as in `Line`."""
+    """Returns the factor that converts coordinates to the unit of a `Line`, and this unit."""
     unit = str(given.get("units", "")).strip().lower()
     is_said = "itude" in str(given.get("standard_name", ""))
     if unit.startswith("degree") or (is_said and not unit):
@@ -165,7 +166,7 @@ def _unit(
 def _cells(
     file: Path, coordinate: Any, given: Attributes, *, is_longitude: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The middles of cells, and their sizes where the file has bounds."""
+    """Returns the middles of cells, and their sizes if the file has bounds."""
     if "bounds" not in given:
         return unpacked(f"{file}, {coordinate.name}", coordinate[:], given), np.empty(0)
     bounds = find(coordinate.group(), str(given["bounds"]))
@@ -173,7 +174,7 @@ def _cells(
         raise invalid(
             f"{file}, {coordinate.name}, bounds", "two for each cell", f"'{given['bounds']}'"
         )
-    # They are packed as their coordinate is, unless they are of another type.
+    # Bounds are packed like their coordinate, unless they have another type.
     inherited: Attributes = given if bounds.dtype == coordinate.dtype else {}
     edges = unpacked(f"{file}, {bounds.name}", bounds[:], {**inherited, **attributes(bounds)})
     edges = np.unwrap(edges, period=360) if is_longitude else edges

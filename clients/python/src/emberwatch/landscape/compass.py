@@ -1,4 +1,4 @@
-"""Directions as maps and weather reports name them: clockwise from the north."""
+"""Compass directions, clockwise from the north, as in maps and weather reports."""
 
 import re
 from typing import Final
@@ -7,9 +7,9 @@ POINTS: Final = tuple("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".spli
 
 
 def bearing(text: str) -> float | None:
-    """Degrees clockwise from the north; None if the text is neither a point nor a number.
+    """Parses a direction to degrees clockwise from the north; None if the text is not a direction.
 
-    A point is one of `POINTS`, or in words, such as `north-west`.
+    A direction is a number, one of `POINTS`, or a point in words, such as `north-west`.
     """
     words = re.sub(r"[\s-]", "", text.lower())
     for name in ("north", "east", "south", "west"):
@@ -23,9 +23,9 @@ def bearing(text: str) -> float | None:
 
 
 def facing(eighths: int) -> str:
-    """The aspect of a slope: the point that it faces, downhill.
+    """Returns the aspect of a slope: the point that it faces, downhill.
 
-    `eighths`: the direction in which it rises, in eighths of a circle from the east towards the
-    north.
+    `eighths`: the direction in which the slope rises, in eighths of a circle from the east towards
+    the north.
     """
     return POINTS[(12 - 2 * eighths) % len(POINTS)]

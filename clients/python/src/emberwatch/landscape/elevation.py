@@ -1,4 +1,4 @@
-"""Slopes of a raster of heights: cells and heights in metres, and what had to be assumed."""
+"""Slopes of a raster of heights, with notes on the units that were assumed."""
 
 from typing import Final, NamedTuple
 
@@ -12,10 +12,10 @@ from emberwatch.landscape.layers import Layer
 from emberwatch.landscape.lengths import METRES, NAMES, Side, unit_named
 from emberwatch.landscape.terrain import gradient
 
-_HEIGHTS: Final = (-1000.0, 10_000.0)  # metres: all land, and not -9999
-_LIKE: Final = 0.02  # share by which --cell may differ from what a raster says
-_FEET: Final = (0.3, 0.31)  # metres: all kinds of feet
-_TURNED: Final = 5.0  # degrees from true north
+_HEIGHTS: Final = (-1000.0, 10_000.0)  # range of heights in metres: all land, but not -9999
+_LIKE: Final = 0.02  # relative tolerance between --cell and the raster's own cell size
+_FEET: Final = (0.3, 0.31)  # range of all kinds of feet, metres
+_TURNED: Final = 5.0  # angle to true north above which a note is made, degrees
 
 
 class Slopes(NamedTuple):
@@ -24,11 +24,11 @@ class Slopes(NamedTuple):
     rise: NDArray[np.float64]
     """Metres per metre to the east and to the north, shape (2, H, W)."""
     notes: list[str]
-    """In which units cells and heights were read, and why."""
+    """The units of cells and heights, and where they come from."""
 
 
 def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: bool) -> Slopes:
-    """The slopes of a raster; flags say what it does not."""
+    """Computes the slopes of a raster. Flags supply units that the raster does not state."""
     (width, height), why = _sides(layer, cell, oblong=oblong)
     is_in_feet = _is_in_feet(layer, cell)
     metres, heights = _height_unit(layer, height_unit, is_in_feet=is_in_feet)
@@ -43,28 +43,28 @@ def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: 
 
 
 def _sides(layer: Layer, cell: Side | None, *, oblong: bool) -> tuple[tuple[float, float], str]:
-    """Width and height of a cell in metres, and what says so."""
+    """Returns width and height of a cell in metres, and the source of these numbers."""
     place, name = layer.place, layer.name
     if min(place.shape) < 2:
         got = f"{place.shape[0]} x {place.shape[1]}"
-        raise invalid(name, "at least 2 x 2 cells, as slopes are between cells", got)
+        raise invalid(name, "at least 2 x 2 cells, as a slope needs two neighbours", got)
     if not oblong:
         check_square(place, name)
         check_even(place, name)
     ground = place.ground()
     if ground is None and cell is not None:
-        return (cell.metres, cell.metres), ", as --cell says"
+        return (cell.metres, cell.metres), ", from --cell"
     if ground is None:
-        check_unit(place, name, "say --cell METRES, or its projection (gdal_translate -a_srs)")
-        return place.cell, ", as nothing says another unit (--cell does)"
+        check_unit(place, name, "give --cell METRES, or set its projection (gdal_translate -a_srs)")
+        return place.cell, ", as the raster names no other unit (--cell sets the size)"
     if cell is not None and abs(cell.metres / ground.height - 1) > _LIKE:
-        side = f"{ground.height:.6g} metres, as {name} says, or no flag"
+        side = f"{ground.height:.6g} metres, as in {name}, or no flag"
         raise invalid("--cell", side, f"{cell.metres:g}")
     return (ground.width, ground.height), " on the ground"
 
 
 def _is_in_feet(layer: Layer, cell: Side | None) -> bool:
-    """Whether cells are measured in feet, so that heights may be, too."""
+    """Returns whether cells are measured in feet, in which case heights may be, too."""
     projection = layer.place.projection
     unit = None if projection is None else unit_of(projection)
     if unit is None:
@@ -74,24 +74,24 @@ def _is_in_feet(layer: Layer, cell: Side | None) -> bool:
 
 
 def _height_unit(layer: Layer, wanted: str | None, *, is_in_feet: bool) -> tuple[float, str]:
-    """The length of a unit of height in metres, and a note of it."""
+    """Returns the length of a unit of height in metres, and a note on its source."""
     words, projection = layer.clock.words.strip(), layer.place.projection
     known = unit_named(words)
     vertical = None if projection is None else vertical_unit(projection)
     if wanted is not None:
-        instead = "" if known in (None, wanted) else f", not in {NAMES[known]}, as the raster says"
-        return METRES[wanted], f"heights in {NAMES[wanted]}, as --height-unit says{instead}"
+        instead = "" if known in (None, wanted) else f" instead of the raster's {NAMES[known]}"
+        return METRES[wanted], f"heights in {NAMES[wanted]} (from --height-unit{instead})"
     if known is not None:
-        return METRES[known], f"heights in {NAMES[known]}, as the raster says"
+        return METRES[known], f"heights in {NAMES[known]} (from the raster)"
     if vertical is not None:
-        return vertical[0], f"heights in units of {ascii(vertical[1])}, as the projection says"
+        return vertical[0], f"heights in units of {ascii(vertical[1])} (from the projection)"
     if words not in ("", "1"):
         expected = f"heights in one of {', '.join(METRES)}"
-        raise invalid(layer.name, expected, f"'{words}'; say --height-unit")
+        raise invalid(layer.name, expected, f"'{words}'; give --height-unit")
     if is_in_feet:
         expected = "a unit of heights, as cells are in feet"
-        raise invalid(layer.name, expected, "none; say --height-unit ft, us-ft or m")
-    return 1.0, "heights taken as metres, as nothing says their unit; --height-unit ft changes that"
+        raise invalid(layer.name, expected, "none; give --height-unit ft, us-ft or m")
+    return 1.0, "heights in metres (assumed, as the raster names no unit; --height-unit sets it)"
 
 
 def _check_heights(layer: Layer, values: NDArray[np.float64]) -> None:
@@ -99,20 +99,20 @@ def _check_heights(layer: Layer, values: NDArray[np.float64]) -> None:
     if missing.size:
         row, column = missing[0].tolist()
         got = f"none in {len(missing)} cells, the first in row {row}, column {column}"
-        remedy = "fill them (gdal_fillnodata), or take a part (gdal_translate -srcwin)"
+        remedy = "fill them (gdal_fillnodata), or use a part (gdal_translate -srcwin)"
         raise invalid(layer.name, "a height in each cell", f"{got}; {remedy}")
     wrong = values[(values < _HEIGHTS[0]) | (values > _HEIGHTS[1])]
     if wrong.size:
         expected = f"heights of {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} metres"
-        remedy = "say --nodata if it means no value, --height-unit if it is not in metres"
+        remedy = "give --nodata if it means no value, --height-unit if it is not in metres"
         raise invalid(layer.name, expected, f"{wrong[0]:g}; {remedy}")
 
 
 def _turned(layer: Layer) -> list[str]:
-    """A note where the grid's north is not the Earth's."""
+    """Returns a note if the grid's north differs from true north."""
     ground = layer.place.ground()
     north = 0.0 if ground is None else (ground.north + 180) % 360 - 180
     if abs(north) <= _TURNED:
         return []
     side = "east" if north > 0 else "west"
-    return [f"north is up here, which is {abs(north):.0f} degrees {side} of true north"]
+    return [f"the grid's north is {abs(north):.0f} degrees {side} of true north"]

@@ -1,7 +1,8 @@
 """States of a fire from its layers: unburnt, burning, burnt.
 
-Whatever the files hold is first two times of each cell, counted in layers or steps: when it begins
-to burn and when it is burnt. These are resampled, and then counted out step by step.
+Every kind of input is first converted to two times for each cell, counted in layers or steps: when
+the cell begins to burn, and when it is burnt. These times are resampled, and then converted to the
+state of each cell in each step.
 """
 
 import math
@@ -23,67 +24,74 @@ UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 
-#: Parts of words for each state, in the order in which they are looked for.
+#: Parts of words that name each state, in the order in which they are searched.
 _WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
-MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
+MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Times:
-    """When each cell of one fire begins to burn and is burnt, in steps; infinite if never."""
+    """The times at which each cell of one fire begins to burn, and is burnt.
+
+    They are in steps, and infinite if never.
+    """
 
     arrival: NDArray[np.float64]
     burnt: NDArray[np.float64]
     n_steps: int
     place: Place
     name: str
-    """Of the first layer, for errors."""
+    """Name of the first layer, for errors."""
     begin: datetime | None = None
-    """When step 0 is, if the files say."""
+    """The date of step 0, if the files have it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meaning:
-    """What the numbers in the layers mean."""
+    """The interpretation of the numbers in the layers, from the flags."""
 
     kind: Kind
     step: float
-    """Seconds."""
+    """Duration of a step, seconds."""
     unit: str | None = None
-    """Of arrival times, or of the times of layers."""
+    """Unit of arrival times, or of the times of layers; None: the file's."""
     begin: float | None = None
-    """The arrival time of step 0, which earlier ones count as; None: the earliest."""
+    """The arrival time of step 0; earlier arrivals count as this one. None: the earliest."""
     burning: int = 1
-    """Steps that a cell burns after its arrival."""
+    """Number of steps that a cell burns after its arrival."""
     every: int = 1
+    """A step is made of every `every`-th layer without a time."""
     crop: tuple[int, ...] | None = None
-    """Top, left, height and width of what is used of each layer; None: all."""
+    """Top, left, height and width of the used part of each layer; None: the whole layer."""
     codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
+    """The numbers that mean unburnt, burning and burnt, for the kind `states`."""
     oblong: bool = False
+    """Whether to treat cells that are not square as squares."""
     missing_is_unburnt: bool = False
+    """Whether to treat cells without a value as unburnt."""
 
 
 def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
-    """Reads the layers of one fire."""
+    """Computes the times of one fire from its layers."""
     if meaning.kind == "arrival":
         return _of_arrival(list(layers), meaning)
     return _of_stack(layers, meaning)
 
 
 def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]:
-    """The sequence (K, H, W): each step as the times say."""
+    """Computes the states of a fire in each step, shape (K, H, W)."""
     arrival, burnt = fire.arrival, fire.burnt
     burns = np.isfinite(arrival)
     if not burns.any():
         raise invalid(fire.name, "cells that burn", "none")
-    # A cell is burnt when the last part of it that burns at all is.
+    # A larger cell is burnt when the last of its input cells that ever burn is burnt.
     last = resampled(np.where(burns, burnt, -np.inf), shape, rule, latest=True)
     arrival = resampled(arrival, shape, rule)
     burnt = np.where(np.isfinite(arrival), last, np.inf)
     if not np.isfinite(arrival).any():
         raise InvalidArgumentError(
-            f"--resample: expected cells that burn on {shape[0]} x {shape[1]} cells, got none; "
-            "use 'earliest'"
+            f"--resample: no cell burns on the grid of {shape[0]} x {shape[1]} cells; use "
+            "'earliest'"
         )
     if fire.n_steps * arrival.size > MOST_STATES:
         raise InvalidArgumentError(
@@ -105,11 +113,11 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     layer = _cropped(layer, meaning)
     arrival = np.where(np.isfinite(layer.values), layer.values, np.inf)
     negative = arrival < 0
-    # Where each cell has a time, a negative one may mean never.
+    # If every cell has a time, a negative one may mean never.
     if negative.any() and (meaning.begin is None or not np.isinf(arrival).any()):
         raise InvalidArgumentError(
-            f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if that "
-            "means never, say --nodata; if it burnt before, --begin 0"
+            f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if it "
+            "means never, give --nodata; if the cell burnt before, --begin 0"
         )
     finite = arrival[np.isfinite(arrival)]
     if not finite.size:
@@ -117,11 +125,11 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     unit = unit_of(layer.clock, meaning.unit, layer.name)
     if unit is None:
         raise invalid(
-            "--unit", f"s, min, h or d, as {layer.name} does not say what its times count", "none"
+            "--unit", f"s, min, h or d, as {layer.name} does not state the unit of times", "none"
         )
     step = meaning.step / SECONDS[unit]
     begin = float(finite.min()) if meaning.begin is None else meaning.begin
-    # A step shows the fire at its time: what begins later burns in the next one.
+    # A step shows the fire at its time: a cell that begins to burn later burns in the next step.
     steps = steps_at(np.maximum(arrival, begin) - begin, step)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
     date = layer.clock.date(begin * SECONDS[unit])
@@ -161,14 +169,14 @@ def _add(
     burnt: NDArray[np.float64],
     mark: float,
 ) -> float:
-    """Notes what burns and is burnt in layer k; returns the number that marks a mask's cells."""
+    """Updates the times with layer k; returns the number that marks the cells of a mask."""
     values = layer.values
     missing = np.isnan(values)
     if missing.any():
         if not meaning.missing_is_unburnt:
             raise InvalidArgumentError(
                 f"{layer.name}: expected a value in each cell, got none in {missing.sum()} cells, "
-                f"the first {_cell(missing)}; --missing-is-unburnt takes them as unburnt"
+                f"the first {_cell(missing)}; --missing-is-unburnt treats them as unburnt"
             )
         values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
     _check_flags(layer, meaning)
@@ -184,7 +192,7 @@ def _add(
         burning = values == mark
         if not (unburnt | burning).all():
             raise InvalidArgumentError(
-                f"{layer.name}: expected 0 and one other number in all layers, {mark:.6g}, "
+                f"{layer.name}: expected 0 and only one other number in all layers, {mark:.6g}, "
                 f"got {_first(layer, ~(unburnt | burning))}"
             )
         if meaning.kind == "burning":
@@ -197,7 +205,7 @@ def _add(
 
 
 def _check_flags(layer: Layer, meaning: Meaning) -> None:
-    """Refuses numbers that mean another state in the file."""
+    """Refuses numbers to which the file's own attributes give another meaning."""
     for number, word in layer.flags:
         if meaning.kind == "states":
             taken = [state for state, code in enumerate(meaning.codes) if code == number]
@@ -210,7 +218,7 @@ def _check_flags(layer: Layer, meaning: Meaning) -> None:
             raise invalid(
                 f"{layer.name}, flag_meanings",
                 f"{number:.6g} to mean {' or '.join(STATES[state].name for state in taken)}",
-                f"'{word}'; --kind and --codes say what numbers mean",
+                f"'{word}'; --kind and --codes set the meaning of numbers",
             )
 
 
@@ -221,14 +229,18 @@ def _check_order(
     arrival: NDArray[np.float64],
     burnt: NDArray[np.float64],
 ) -> None:
-    """Refuses what cannot follow the layers before."""
+    """Refuses states that cannot follow the previous layers."""
     for wrong, words in (
         (burning & np.isfinite(burnt), "burnt cells to stay burnt, got {} that burn again"),
-        (unburnt & np.isfinite(arrival), "burning cells to burn on, got {} that are unburnt again"),
+        (
+            unburnt & np.isfinite(arrival),
+            "burning cells not to become unburnt, got {} that are unburnt again",
+        ),
     ):
         if wrong.any():
-            told = words.format(wrong.sum())
-            raise InvalidArgumentError(f"{layer.name}: expected {told}, the first {_cell(wrong)}")
+            expected = words.format(wrong.sum())
+            where = f"the first {_cell(wrong)}"
+            raise InvalidArgumentError(f"{layer.name}: expected {expected}, {where}")
 
 
 def _cropped(layer: Layer, meaning: Meaning) -> Layer:
@@ -261,7 +273,7 @@ def _checked(
 
 
 def _at(layers: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The steps of layers; infinite ones stay."""
+    """Converts numbers of layers to steps; infinite ones stay infinite."""
     numbers = np.where(np.isfinite(layers), layers, len(steps)).astype(np.intp)
     return np.append(steps, np.inf)[numbers]
 

@@ -1,4 +1,4 @@
-"""Where cells are: what layers must have in common, and how they become the wanted grid."""
+"""Grids on the ground: checks that layers share one, and resampling to the grid of the world."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,11 +12,11 @@ from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.ground import Ground, is_same, unit_cell
 
 LIKE: Final = 1e-3
-"""Share of a cell by which places may differ."""
+"""Tolerance between the positions of two grids, as a share of a cell."""
 
 Rule = Literal["earliest", "nearest"]
 
-_SQUARE: Final = 0.02  # by how much the sides of a square cell may differ
+_SQUARE: Final = 0.02  # relative tolerance between lengths, such as the sides of a square cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,18 +26,18 @@ class Place:
     shape: tuple[int, int]
     """Rows and columns."""
     corner: tuple[float, float] | None = None
-    """x and y of the north-west corner; None if the file does not say."""
+    """x and y of the north-west corner; None if unknown."""
     cell: tuple[float, float] = (1.0, 1.0)
     """Width and height of a cell, in units of x and y."""
     projection: str | None = None
-    """As well-known text."""
+    """Coordinate reference system as well-known text."""
     metres: float | None = None
-    """Length of a unit of x and y without a projection; None if nothing says it."""
+    """Length of a unit of x and y without a projection, metres; None if unknown."""
 
     def ground(self, down: float = 0.5, right: float = 0.5) -> Ground | None:
-        """The cell at these shares of the way from the first row and column to the last.
+        """Returns a cell's size on the ground; None if it is unknown.
 
-        None if nothing says how large it is on the ground.
+        `down` and `right` choose the cell: 0 is the first row or column, 1 the last.
         """
         (rows, columns), (width, height) = self.shape, self.cell
         if self.corner is None or (self.projection is None and self.metres is None):
@@ -50,12 +50,12 @@ class Place:
         return unit and unit._replace(width=width * unit.width, height=height * unit.height)
 
     def sides(self) -> tuple[float, float]:
-        """Width and height of a cell in the middle, on the ground as far as that is known."""
+        """Returns width and height of the middle cell, on the ground if that is known."""
         ground = self.ground()
         return self.cell if ground is None else (ground.width, ground.height)
 
     def could_be_in_degrees(self) -> bool:
-        """Whether nothing says the unit of x and y, and all of them could be degrees."""
+        """Returns whether the unit of x and y is unknown, and all coordinates could be degrees."""
         if self.corner is None or (self.projection, self.metres) != (None, None):
             return False
         west, south, east, north = _extent(self)
@@ -64,7 +64,7 @@ class Place:
 
 
 def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
-    """Refuses a layer whose cells are not those of the first."""
+    """Refuses a layer whose grid differs from the first layer's."""
     if not is_same(place.projection, first.projection):
         raise invalid(
             name, f"the projection of {first_name}, {_projection(first)}", _projection(place)
@@ -86,13 +86,13 @@ def check_square(place: Place, name: str) -> None:
     elif abs(ground.width / ground.height - 1) <= _SQUARE:
         return
     raise InvalidArgumentError(
-        f"{name}: expected square cells, got {got}; reproject it (gdalwarp -t_srs), or take them "
+        f"{name}: expected square cells, got {got}; reproject it (gdalwarp -t_srs), or treat them "
         "as squares with --oblong"
     )
 
 
 def check_even(place: Place, name: str) -> None:
-    """Refuses a layer whose cells differ in size on the ground, from the middle to the edges."""
+    """Refuses a layer whose cells differ in size on the ground between the middle and the edges."""
     middle = place.ground()
     if middle is None:
         return
@@ -102,31 +102,32 @@ def check_even(place: Place, name: str) -> None:
     if (np.abs(sides / (middle.width, middle.height) - 1) > _SQUARE).any():
         raise InvalidArgumentError(
             f"{name}: expected cells of one size on the ground, got {sides.min():.6g} to "
-            f"{sides.max():.6g} metres; reproject it (gdalwarp -t_srs), take a part "
-            "(gdal_translate -srcwin), or take all as the one in the middle with --oblong"
+            f"{sides.max():.6g} metres; reproject it (gdalwarp -t_srs), use a part "
+            "(gdal_translate -srcwin), or treat all like the middle one with --oblong"
         )
 
 
 def check_unit(place: Place, subject: str, remedy: str) -> None:
-    """Refuses cells of unknown size; without a projection they count in metres if they can."""
+    """Refuses cells of unknown size. Coordinates that cannot be degrees are assumed to be metres.
+    """
     got = _projection(place)
     if place.could_be_in_degrees():
-        got = "no projection, and numbers that may be degrees"
+        got = "no projection, and coordinates that may be degrees"
     elif place.corner is not None and (place.projection is None or place.ground() is not None):
         return
     raise invalid(
-        subject, "cells in metres, or a projection that says their size", f"{got}; {remedy}"
+        subject, "cells in metres, or a projection that gives their size", f"{got}; {remedy}"
     )
 
 
 def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
-    """Refuses a sequence whose world has another grid than the first one's.
+    """Refuses a sequence whose grid differs from the first sequence's.
 
     `mixed` allows cells of another size or projection.
     """
     if place.shape != first.shape:
         raise InvalidArgumentError(
-            f"{name}: expected {_size(first)} cells as the first sequence, got {_size(place)}; "
+            f"{name}: expected {_size(first)} cells as in the first sequence, got {_size(place)}; "
             "use --height and --width"
         )
     if mixed:
@@ -135,26 +136,26 @@ def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
     if not is_same(place.projection, first.projection) or has_place != (first.corner is not None):
         raise InvalidArgumentError(
             f"{name}: expected the projection of the first sequence, {_projection(first)}, got "
-            f"{_projection(place)}; --mixed takes both"
+            f"{_projection(place)}; --mixed allows both"
         )
     sides = np.array([place.sides(), first.sides()])
     if place.corner is not None and (np.abs(sides[0] / sides[1] - 1) > _SQUARE).any():
         of_first, got = (f"{width:.6g} x {height:.6g}" for width, height in sides[::-1])
         raise InvalidArgumentError(
             f"{name}: expected cells of {of_first} on the ground as in the first sequence, got "
-            f"{got}; use --cell or --crop, or take both with --mixed"
+            f"{got}; use --cell or --crop, or allow both with --mixed"
         )
 
 
 def of_world(place: Place, shape: tuple[int, int]) -> Place:
-    """The grid that an input becomes."""
+    """Returns the grid of the world that an input is resampled to."""
     width = place.cell[0] * place.shape[1] / shape[1]
     height = place.cell[1] * place.shape[0] / shape[0]
     return replace(place, shape=shape, cell=(width, height))
 
 
 def part(place: Place, window: tuple[slice, slice]) -> Place:
-    """The grid of these rows and columns."""
+    """Returns the grid of a window of rows and columns."""
     rows, columns = window
     corner = place.corner and (
         place.corner[0] + place.cell[0] * columns.start,
@@ -166,7 +167,7 @@ def part(place: Place, window: tuple[slice, slice]) -> Place:
 
 
 def crop(place: Place, wanted: tuple[int, ...] | None) -> tuple[slice, slice]:
-    """The rows and columns of the input to use."""
+    """Checks a `--crop` window, and returns its rows and columns; None: all."""
     height, width = place.shape
     if wanted is None:
         return slice(0, height), slice(0, width)
@@ -187,7 +188,7 @@ def crop(place: Place, wanted: tuple[int, ...] | None) -> tuple[slice, slice]:
 def target_shape(
     place: Place, *, height: int | None, width: int | None, cell: float | None
 ) -> tuple[int, int]:
-    """Rows and columns of the world."""
+    """Computes rows and columns of the world from the flags."""
     rows, columns = place.shape
     if cell is not None:
         check_unit(place, "--cell", "use --height")
@@ -202,7 +203,7 @@ def target_shape(
     height, width = height or 1, width or 1
     if max(height, width) > MAX_SIDE:
         raise InvalidArgumentError(
-            f"grid: expected at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes, got "
+            f"grid: expected at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum, got "
             f"{height} x {width}; use --height, --width, --cell or --crop"
         )
     if not 1 - _SQUARE <= (columns / width) / (rows / height) <= 1 + _SQUARE:
@@ -216,10 +217,10 @@ def target_shape(
 def resampled(
     times: NDArray[np.float64], shape: tuple[int, int], rule: Rule, *, latest: bool = False
 ) -> NDArray[np.float64]:
-    """Times of larger or smaller cells.
+    """Resamples times to larger or smaller cells.
 
-    `"nearest"` takes the input cell in the middle of each, `"earliest"` the least of all input
-    cells that it overlaps (`latest`: the greatest).
+    With `"nearest"`, a cell gets the time of the input cell in its middle. With `"earliest"`, it
+    gets the smallest time of all input cells that it overlaps (with `latest`, the largest).
     """
     for axis, new in enumerate(shape):
         old = len(times) if axis == 0 else times[0].size
@@ -230,7 +231,7 @@ def resampled(
             times = times.take(at, axis=axis)
         else:
             reduce = np.max if latest else np.min
-            # In whole numbers, so that edges that coincide do not overlap by rounding.
+            # In integers, so that rounding does not make touching cells overlap.
             edges = [(i * old // new, -(-(i + 1) * old // new)) for i in range(new)]
             parts = [
                 reduce(times[(slice(None),) * axis + (slice(*edge),)], axis=axis) for edge in edges
@@ -240,7 +241,7 @@ def resampled(
 
 
 def _extent(place: Place) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top."""
+    """Returns the left, bottom, right and top coordinates."""
     (x, y), (width, height) = place.corner or (0.0, 0.0), place.cell
     rows, columns = place.shape
     return x, y - height * rows, x + width * columns, y

@@ -1,8 +1,8 @@
-"""How large cells are on the ground, by their coordinate reference system (CRS).
+"""The size of cells on the ground, from their coordinate reference system (CRS).
 
-A unit of x and y may be a foot or a degree, and a metre of the map is seldom a metre on the ground:
-in Mercator projections at 60 degrees north it is half a metre. pyproj says where cells are on the
-ellipsoid, and how far apart.
+A unit of x and y may be a foot or a degree. A metre on the map is seldom a metre on the ground: in
+Mercator projections at 60 degrees north it is half a metre. pyproj computes positions and distances
+on the ellipsoid.
 """
 
 from functools import lru_cache

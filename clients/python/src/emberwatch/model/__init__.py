@@ -1,8 +1,8 @@
-"""The hidden Markov model on a grid: what a model file says, as arrays.
+"""The parameters of a model file as arrays: a hidden Markov model on a grid.
 
 Paper section II: states with the transition kernel ``w`` and bias ``b`` of eq. 2, and the
-observation matrix ``O`` of eq. 1. The native module checks files; this module reads
-files that have passed. `emberwatch.belief` applies the parameters to a belief.
+observation matrix ``O`` of eq. 1. The native module checks files, and this module reads the checked
+ones. `emberwatch.belief` applies the parameters to a belief.
 """
 
 from dataclasses import dataclass, fields
@@ -24,28 +24,30 @@ Color = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Description:
-    """States and observations of a model; recorded worlds have a description and no model.
+    """The states and observations of a model, or of recorded worlds, which have no model.
 
-    S is the number of states. O is the number of observed values: the observations in the file,
-    once for each observation matrix of the sensor. Two descriptions are equal if all their fields
-    but `toml` are.
+    S is the number of states. O is the number of observed values: the number of observations in the
+    file times the number of observation matrices of the sensor. Two descriptions are equal if all
+    their fields except `toml` are equal.
     """
 
     name: str
-    """Name shown to people."""
+    """Display name."""
     state_names: tuple[str, ...]
-    """By state."""
+    """One name for each state."""
     state_colors: tuple[Color, ...]
-    """By state."""
+    """One colour for each state."""
     observation_names: tuple[str, ...]
-    """By observed value. Names of rings around the path end in the ring, as in `fire ring 1`."""
+    """One name for each observed value. In rings around the path the ring is appended, as in
+    `fire ring 1`."""
     observation_colors: tuple[Color, ...]
-    """By observed value."""
+    """One colour for each observed value."""
     observation_matrix: NDArray[np.float64]
-    """``O[state, observed value]``, each row a distribution for each of the `n_rings` matrices,
-    shape (S, O)."""
+    """``O[state, observed value]``, shape (S, O). The columns are `n_rings` matrices side by side;
+    each row of each matrix is a distribution."""
     reward: NDArray[np.float64]
-    """What a step pays for each distinct cell that pays by its state, shape (S,)."""
+    """Reward by the state of a cell, shape (S,). A step pays it once for each distinct cell that
+    `pays` names."""
     airspace: Airspace
     """Where robots may fly and what they see."""
     toml: str
@@ -53,7 +55,7 @@ class Description:
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """Reads the text of a file that has been checked."""
+        """Parses the text of a file that has been checked."""
         text = text.removeprefix(BYTE_ORDER_MARK)
         try:
             values = cls._read(text)
@@ -77,17 +79,17 @@ class Description:
 
     @property
     def n_rings(self) -> int:
-        """Observation matrices: of the path, then of each ring around it."""
+        """Number of observation matrices: one for the path, then one for each ring around it."""
         return self.airspace.n_rings
 
     @property
     def pays(self) -> str:
-        """Which distinct cells pay: `"visited"`, or `"seen"`."""
+        """Which distinct cells pay a reward: the `"visited"` or the `"seen"` ones."""
         return self.airspace.pays
 
     @property
     def no_fly(self) -> NDArray[np.bool_] | None:
-        """Where no robot may be, shape (H, W); None: nowhere."""
+        """True in the no-fly cells, shape (H, W); None if there are none."""
         return self.airspace.no_fly
 
     @property
@@ -100,7 +102,7 @@ class Description:
 
     @property
     def target_state(self) -> int:
-        """The state that pays most, the first of them: fire in the wildfire model."""
+        """The state with the largest reward (the first of several): fire in the wildfire model."""
         return int(np.argmax(self.reward))
 
     def __eq__(self, other: object) -> bool:
@@ -115,7 +117,7 @@ class Description:
 
     @staticmethod
     def _read(text: str) -> dict[str, Any]:
-        """All fields but the text."""
+        """Returns the values of all fields except `toml`."""
         return _native.read_description(text)
 
     @staticmethod
@@ -125,32 +127,36 @@ class Description:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Model(Description):
-    """A model; make one with `named` or `from_toml`.
+    """A hidden Markov model of the world; make one with `named` or `from_toml`.
 
-    (KH, KW) is the kernel's size, both odd.
+    (KH, KW) is the size of its kernels; both are odd.
     """
 
     kernels: NDArray[np.float64]
-    """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
-    downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
-    is in, shape (S, S, S, KH, KW). Where there are zones, as many for each, zone by zone: shape
-    (n_zones, ...) or (n_zones * S, ...)."""
+    """The weights ``w[next state, state of the neighbour, row, col]`` of eq. 2. The centre is the
+    cell itself; rows grow downward. A model has one kernel for all cells, shape (1, S, S, KH, KW),
+    or one for each state of the cell itself, shape (S, S, S, KH, KW). With zones, each zone has its
+    own, zone after zone: shape (n_zones, S, S, KH, KW) or (n_zones * S, S, S, KH, KW)."""
     bias: NDArray[np.float64]
-    """``b``, added to each next state's weight, shape (S,)."""
+    """``b`` of eq. 2, which is added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
-    """Distribution of a cell at the start of the burn-in, shape (S,)."""
+    """Distribution of a cell's state at the start of the burn-in, shape (S,)."""
     edge: int | None
-    """The state of the cells outside the grid; None: they add no weight (``edge`` in the file)."""
+    """The state of all cells outside the grid; None: they add no weight (``edge`` in the file)."""
     zone_names: tuple[str, ...]
-    """Of the zones of land; empty where all cells are alike."""
+    """Names of the zones of land; empty if the model has no zones."""
     zone_colors: tuple[Color, ...]
-    """By zone."""
+    """One colour for each zone."""
     zone_map: NDArray[np.uint8] | None
-    """The zone of each cell, shape (H, W); None where all cells are alike."""
+    """The zone of each cell, shape (H, W); None if the model has no zones."""
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
-        """The built-in model of a name, or the model of a file, which is checked first."""
+        """Returns a built-in model by its name, or the model of a file, which is checked first.
+
+        Raises:
+            InvalidArgumentError: If there is no such model, or the file has an error.
+        """
         settings = {"model": utf8("model", name)}
         try:
             check_settings(settings)
@@ -169,18 +175,18 @@ class Model(Description):
             return cls.from_toml(text)
         try:
             text = _native.model_text(fspath(name))
-        except ValueError as error:  # it has changed since
+        except ValueError as error:  # the file has changed since the check
             raise InvalidArgumentError(f"model: {error}") from None
         return cls.from_toml(text)
 
     @classmethod
     def wildfire(cls) -> Self:
-        """The built-in wildfire of the paper's section II, as ``config/models/wildfire.toml``."""
+        """Returns the built-in model of the paper's section II, the model `wildfire`."""
         return cls.checked("wildfire")
 
     @property
     def zones(self) -> Zones | None:
-        """The zones of land; None where all cells are alike."""
+        """The zones of land; None if the model has no zones."""
         if self.zone_map is None:
             return None
         colors = tuple("#{:02x}{:02x}{:02x}".format(*color) for color in self.zone_colors)
@@ -193,7 +199,7 @@ class Model(Description):
 
     @property
     def sees_own_state(self) -> bool:
-        """Whether a cell's weights depend on the state that it is in itself."""
+        """Whether a cell's weights depend on its own state."""
         return len(self.kernels) > max(1, len(self.zone_names))
 
     @staticmethod
@@ -206,6 +212,6 @@ class Model(Description):
 
 
 def color_from_hex(text: str) -> Color:
-    """A colour such as `#c8371b`."""
+    """Parses a colour such as `#c8371b`."""
     red, green, blue = bytes.fromhex(text.removeprefix("#"))
     return red, green, blue

@@ -7,36 +7,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch._native import MAX_RADIUS
-from emberwatch.common.arguments import as_count, told
+from emberwatch.common.arguments import as_count, repr_of
 from emberwatch.errors import invalid
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Airspace:
-    """Where robots may fly, and what their sensor sees from there.
+    """Where robots may fly, what their sensor sees, and which cells pay.
 
-    By default they fly everywhere, and see the cells of their path.
+    By default robots may fly everywhere, and they see the cells of their path.
     """
 
     radius: int = 0
-    """Rows and columns that they see beyond each cell of their path."""
+    """Rows and columns that robots see beyond each cell of their path."""
     n_rings: int = 1
-    """Observation matrices: of the path, then of each ring around it; the last holds beyond. What
-    is observed by matrix m has the value ``m * O / n_rings`` plus that which it has on the path."""
+    """Number of observation matrices: one for the path, then one for each ring around it. The last
+    one also applies to all rings further out. Matrix m adds ``m * O / n_rings`` to the value that
+    the same observation has on the path."""
     pays: str = "visited"
-    """Which distinct cells pay: `"visited"`, or `"seen"`."""
+    """Which distinct cells pay a reward: the `"visited"` or the `"seen"` ones."""
     no_fly: NDArray[np.bool_] | None = None
-    """Where no robot may be, shape (H, W); a move into such a cell leaves it in place."""
+    """True in the no-fly cells, shape (H, W). A robot that moves into one stays where it is."""
 
     def __post_init__(self) -> None:
         as_count(self.radius, "radius", 0, MAX_RADIUS)
         as_count(self.n_rings, "n_rings", 1, self.radius + 1)
         if self.pays not in ("visited", "seen"):
-            raise invalid("pays", "'visited' or 'seen'", told(self.pays))
+            raise invalid("pays", "'visited' or 'seen'", repr_of(self.pays))
         given: Any = self.no_fly
         if given is not None:
             if getattr(given, "dtype", None) != np.bool_ or given.ndim != 2:
-                raise invalid("no_fly", "an array of shape (H, W) and type bool", told(given))
+                raise invalid("no_fly", "an array of shape (H, W) and type bool", repr_of(given))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Airspace) and self._values() == other._values()
@@ -51,12 +52,12 @@ class Airspace:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Zones:
-    """Zones of land, which differ in how states change."""
+    """Zones of land, which differ in their transition kernels."""
 
     names: tuple[str, ...]
-    #: `#rrggbb`.
+    #: One colour for each zone, as `#rrggbb`.
     colors: tuple[str, ...]
-    #: The zone of each cell, by its place in `names`, shape (H, W).
+    #: The zone of each cell, as an index into `names`, shape (H, W).
     map: NDArray[np.uint8]
 
     def __eq__(self, other: object) -> bool:

@@ -1,4 +1,4 @@
-"""Moves of a robot, and the cells that they lead to."""
+"""Moves of a robot, and the cells that they reach."""
 
 from typing import Final, Protocol
 
@@ -12,7 +12,7 @@ DIRECTIONS: Final = np.array(((-1, 0), (1, 0), (0, -1), (0, 1)), np.int64)
 
 
 class Grid(Protocol):
-    """Where robots fly, such as a `WorldSpec` or a `ServerInfo`."""
+    """The grid that robots fly on, such as a `WorldSpec` or a `ServerInfo`."""
 
     @property
     def height(self) -> int: ...
@@ -25,10 +25,10 @@ class Grid(Protocol):
 
 
 def fly(start: ArrayLike, moves: ArrayLike, grid: Grid) -> NDArray[np.int64]:
-    """The cells of a path after each move, `(T, 2)`.
+    """Returns the cell after each move of a path, shape (T, 2), or of n paths, (n, T, 2).
 
-    A move off the grid or into a no-fly cell stays in place. Or those of n paths, `(n, T, 2)`,
-    where `start` is `(n, 2)` and `moves` `(n, T)`.
+    A move off the grid or into a no-fly cell leaves the robot in place. `start` has shape (2,) and
+    `moves` (T,) for one path, (n, 2) and (n, T) for n paths.
     """
     given, cell = np.asarray(moves), np.asarray(start, np.int64)
     cells = np.empty((*given.shape, 2), np.int64)

@@ -1,4 +1,4 @@
-"""Tasks: worlds with a name, fixed completely, and the seeds to test on."""
+"""Tasks: named, completely specified worlds, with the seeds to test on."""
 
 import tomllib
 from dataclasses import dataclass
@@ -13,28 +13,30 @@ from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """The parts of a task that are known before its worlds are made."""
+    """The properties of a task that are known before its worlds exist."""
 
     name: str
+    #: Moves of a path.
     n_moves: int
+    #: Robots of each world.
     robots: int
     #: Steps of an episode.
     max_steps: int
     test_seeds: range
-    #: What the ids of its environments begin with, as `WildfireSmall` in
-    #: `emberwatch/WildfireSmall-v0`; empty: it has none.
+    #: Prefix of the ids of its environments, such as `WildfireSmall` in
+    #: `emberwatch/WildfireSmall-v0`; empty if it has no environments.
     ids: str = ""
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
-        """The built-in task of a name, or the task of a file, which is checked first."""
+        """Returns a built-in task by its name, or the task of a file, which is checked first."""
         check_settings({"task": utf8("task", name)})
         text = _native.built_in("tasks").get(fspath(name))
         return cls.from_toml(Path(name).read_text("utf-8") if text is None else text)
 
     @classmethod
     def from_toml(cls, text: str) -> Self:
-        """Reads the text of a file that has been checked."""
+        """Parses the text of a file that has been checked."""
         file = tomllib.loads(text.removeprefix(BYTE_ORDER_MARK))
         return cls(
             name=file["name"],
@@ -47,6 +49,6 @@ class Task:
 
 
 def built_in_tasks() -> dict[str, Task]:
-    """The built-in tasks, by name."""
+    """Returns the built-in tasks by name."""
     files = _native.built_in("tasks").items()
     return {name: Task.from_toml(text) for name, text in files}

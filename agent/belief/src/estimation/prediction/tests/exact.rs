@@ -14,18 +14,18 @@ struct Exact {
     joint: Vec<f64>,
 }
 
-/// The state of a cell in a joint state: cell 0 is the last digit of its number.
+/// Returns the state of a cell in a joint state, whose number has one ternary digit per cell, cell 0 the lowest.
 fn state(joint: usize, cell: usize) -> usize {
     joint / 3_usize.pow(cell as u32) % 3
 }
 
-/// The probability that a cell is observed as a value.
+/// Returns the probability that a cell in a state is observed as a value.
 fn likelihood(state: usize, value: usize) -> f64 {
     if state == value { 0.9 } else { 0.05 }
 }
 
 impl Exact {
-    /// State 1 in cell 0, else state 0.
+    /// Creates the filter of a grid with cell 0 in state 1 and all other cells in state 0.
     fn new(shape: Shape, weights: Weights<'_>) -> Self {
         let n = 3_usize.pow(shape.n_cells() as u32);
         let next = |joint: usize| {
@@ -74,7 +74,7 @@ impl Exact {
         self.joint.iter_mut().for_each(|p| *p /= total);
     }
 
-    /// Sums the divergence of a belief over all cells.
+    /// Returns the divergence of a belief from the exact one, summed over cells.
     fn divergence_of(&self, belief: &Belief) -> f64 {
         let mut sum = 0.0;
         for cell in 0..self.shape.n_cells() {
@@ -93,7 +93,7 @@ impl Exact {
         sum
     }
 
-    /// Draws the joint state after `joint`.
+    /// Draws the joint state that follows `joint`.
     fn draw(&self, joint: usize, random: &mut impl FnMut() -> f64) -> usize {
         let cells = self.next[joint].iter().rev();
         cells.fold(0, |to, cell| {
@@ -107,9 +107,9 @@ impl Exact {
     }
 }
 
-/// Runs worlds whose first cell starts in state 1, and returns the mean over steps and cells of the Kullback-Leibler
-/// divergence of each kind's beliefs from the exact ones. Frames show each cell with probability `1 / one_in`, and
-/// never for 0.
+/// Simulates worlds whose first cell starts in state 1. Returns the Kullback-Leibler divergence of each kind's beliefs
+/// from the exact beliefs, as the mean over steps and cells. Frames show each cell with probability `1 / one_in`. If
+/// `one_in` is 0, they show no cells.
 pub fn divergences(weights: Weights<'_>, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 3] {
     let mut states = Grid::zeros(shape.dim());
     states[[0, 0]] = 1;

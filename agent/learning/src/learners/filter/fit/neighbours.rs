@@ -1,4 +1,4 @@
-//! What the frames of all worlds say of correlations between neighbours, while the filter is learned.
+//! Estimates correlations between neighbouring cells from the frames of all worlds, while the filter is learned.
 
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::belief::Belief;
@@ -8,21 +8,21 @@ use emberwatch_model::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What is kept of earlier sums with each frame of any world: parameters were worse then.
+/// Weight of earlier sums after each frame of any world. They fade, because earlier parameters were worse.
 const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 
-/// Learns the correlations of the state that pays most.
+/// Learns the correlations of the state with the highest reward.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Neighbours {
     correlations: Correlations,
-    /// The state that paid most when they were learned.
+    /// The state that the correlations refer to.
     state: Option<usize>,
-    /// By world.
+    /// Steps since the last observation of each cell, by robot.
     ages: BTreeMap<u32, Ages>,
 }
 
 impl Neighbours {
-    /// What was learned of a state so far.
+    /// Returns the learned correlations of a state, or the defaults if another state was learned.
     pub fn correlations_of(&self, state: usize) -> Correlations {
         if self.state == Some(state) {
             self.correlations.clone()
@@ -31,17 +31,17 @@ impl Neighbours {
         }
     }
 
-    /// A robot begins an episode in a world of so many cells.
+    /// Begins an episode of a robot.
     pub fn begin(&mut self, robot: u32, n_cells: usize) {
         self.ages.insert(robot, Ages::new(n_cells));
     }
 
-    /// Forgets all worlds; what was learned in them stays.
+    /// Drops all robots. The learned correlations remain.
     pub fn forget_robots(&mut self) {
         self.ages.clear();
     }
 
-    /// A robot's next frame, with the belief before it, unless it is the first.
+    /// Adds a robot's next frame. `predictor` is the belief before it, unless it is the first frame.
     pub fn see(
         &mut self,
         robot: u32,
@@ -65,7 +65,7 @@ impl Neighbours {
         frame.observed().for_each(|(index, _)| ages.see(index));
     }
 
-    /// Whether these are worlds of so many cells.
+    /// Whether all worlds have this number of cells.
     pub fn are_of(&self, n_cells: usize) -> bool {
         self.ages
             .values()

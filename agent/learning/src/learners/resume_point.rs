@@ -1,4 +1,4 @@
-//! Where a checkpoint left a robot.
+//! The saved state of a robot, from which its agent resumes.
 
 use super::base::{Place, place};
 use crate::checkpoint::{check, check_belief};
@@ -10,18 +10,18 @@ use emberwatch_messages::observation::Observation;
 use emberwatch_model::Shape;
 use serde::{Deserialize, Serialize};
 
-/// What a robot saw last, and what its agent believed.
+/// A robot's last observation, and the belief of its agent.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Left {
+pub(super) struct ResumePoint {
     place: Place,
     frame: Vec<u8>,
-    /// All that the estimator remembers.
+    /// The estimator's handover bytes.
     belief: Vec<u8>,
-    /// The estimate p_k, where paths are planned on it.
+    /// The estimate p_k, if paths are planned on it.
     estimate: Option<Belief>,
 }
 
-impl Left {
+impl ResumePoint {
     pub(super) fn of(rollout: &Rollout) -> Self {
         let (agent, observation) = (&rollout.agent, rollout.observation());
         let belief = agent.estimator().handover().map(|it| it.to_bytes());
@@ -33,29 +33,29 @@ impl Left {
         }
     }
 
-    /// Whether a world shows what it showed then.
+    /// Whether a world's observation equals the saved one.
     pub(super) fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    /// Gives an agent what its estimator remembered, and the estimate if its paths are planned on that.
+    /// Restores an agent's estimator, and its estimate if paths are planned on it.
     ///
     /// # Errors
-    /// If it is not of such an estimator.
+    /// If the bytes belong to another kind of estimator.
     pub(super) fn restore(&self, agent: &mut Agent) -> Result<()> {
         let estimator = agent.estimator_mut().handover_mut();
         let is_taken = estimator.is_some_and(|it| it.restore(&self.belief));
         check(
             is_taken,
             "worlds.belief",
-            "that of its estimator",
+            "a belief of its estimator",
             "another",
         )?;
         agent.remember_estimate(self.estimate.as_ref());
         Ok(())
     }
 
-    /// Refuses an estimate of another grid or about other states.
+    /// Checks the grid and the number of states of the estimate.
     pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         let mut estimates = self.estimate.iter();
         estimates.try_for_each(|it| check_belief("worlds.estimate", it, n_states, shape))
@@ -63,8 +63,8 @@ impl Left {
 }
 
 #[cfg(test)]
-impl Left {
-    /// Of a robot whose agent remembers nothing.
+impl ResumePoint {
+    /// Creates a resume point without a belief.
     pub(super) fn blank(observation: &Observation) -> Self {
         Self {
             place: place(observation),
