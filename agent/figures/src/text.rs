@@ -1,4 +1,4 @@
-//! How wide texts are. Layout counts with the widths of Noto Sans; an SVG tells each text's width, so that viewers with
+//! How wide texts are. Layout counts with the widths of Noto Sans; an SVG states each text's width, so that viewers with
 //! another font stretch it to fit.
 
 use crate::palette::{Color, INK, MUTED};

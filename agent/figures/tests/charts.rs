@@ -7,7 +7,8 @@ use ndarray::{Array2, Array3};
 use roxmltree::Document;
 
 const BLUE: Color = Color(0x00, 0x72, 0xb2);
-/// Expects XML, finite numbers, texts that stay on the page, and a white rim; gives the texts.
+
+/// Checks that a page is XML with finite numbers, and that its texts stay on it; returns the texts.
 fn check(svg: &str) -> Vec<String> {
     assert!(!svg.contains("NaN") && !svg.contains("inf\""), "{svg}");
     let document = Document::parse(svg).expect("XML");

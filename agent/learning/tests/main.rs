@@ -1,4 +1,5 @@
 //! One program: each would link candle.
 
 mod learned_filter;
+mod own_kernels;
 mod rollout;
