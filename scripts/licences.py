@@ -1,4 +1,4 @@
-"""Checks that every dependency comes from crates.io under one of the licences below."""
+"""Checks that every external dependency comes from crates.io under one of the licences below."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOURCE = "registry+https://github.com/rust-lang/crates.io-index"
 
 def allowed(expression: str) -> bool:
     """Returns whether an SPDX expression can be met. `/` is an older way to write OR."""
-    words = re.findall(r"[()]|AND|OR|[^\s()]+(?: WITH \S+)?", expression.replace("/", " OR "))
+    words = re.findall(r"[()]|AND|OR|[^\s()]+(?: WITH [^\s()]+)?", expression.replace("/", " OR "))
     operators = {"AND": "and", "OR": "or", "(": "(", ")": ")"}
     return bool(eval(" ".join(operators.get(word) or str(word in ALLOWED) for word in words)))
 

@@ -69,6 +69,7 @@ fn a_checkpoint_keeps_hidden_vectors_goes_on_and_is_acted_on() {
     let rows = place.learn("out", &format!("{WORLD} --steps 20"));
     let stored: SavedNetwork = place.contents("out").state().expect("its state");
     let transitions = stored.dqn.transitions;
+    assert!(transitions.len() > 10, "{}", transitions.len());
     for pair in transitions.windows(2) {
         assert_eq!((pair[0].next.len(), &pair[0].next), (4, &pair[1].input));
     }

@@ -149,7 +149,7 @@ run SERVER --policy clairvoyant_beam => only `compare` has them",
 }
 
 #[test]
-fn status_and_a_second_server_are_told_of_the_first() {
+fn status_and_a_second_server_report_the_first() {
     let server = Server::start(&format!("{SMALL} --worlds 2 --seed 40"));
     let words = format!("already running, as pid {}", server.program.pid());
     let flags = format!("--instance {}", server.instance.name());

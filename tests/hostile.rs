@@ -36,6 +36,18 @@ fn attack(n_messages: u64) {
 }
 
 #[test]
+fn each_refusal_is_counted_once() {
+    let server = Server::start(FLAGS);
+    let wire = Wire::open(&server.instance);
+    for count in 1..=10 {
+        let refused = wire.status_of(step_header(1, 6), &step_body(&[0], &[0; 6]));
+        assert_eq!(refused.0, Status::NoLease);
+        wire.control(control_header(1), b"nonsense");
+        assert_eq!(server.status().n_refused, 2 * count);
+    }
+}
+
+#[test]
 fn random_messages_change_nothing_for_others() {
     attack(5_000);
 }
@@ -266,7 +278,7 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
 }
 
 #[test]
-fn messages_of_any_length_are_answered_in_short() {
+fn messages_of_any_length_get_short_replies() {
     let longest = |(begin, unit, end, status): (&str, &str, &str, Status)| {
         let room = MAX_CONTROL_BYTES - begin.len() - end.len();
         let text = [begin, &unit.repeat(room / unit.len()), end].concat();

@@ -187,11 +187,10 @@ fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
     let (_folder, file) = new_file();
     let recorder = start_recorder(&instance, &file, "--truth");
     recorder.wait_for_words("no server yet");
-    for (seed, flags) in [
-        (11, SMALL),
-        (12, "--height 3 --width 4 --moves 2 --burn-in 20"),
-    ] {
+    let mut expected = Vec::new();
+    for (seed, flags) in [(11, SMALL), (12, "--task small")] {
         let server = Server::start_on(&instance, &format!("{flags} --seed {seed} --publish-truth"));
+        expected.push(server.info());
         fly_on(&mut server.acquire(0..1), seed, 3);
         recorder.until(|| {
             let last = frames(&read(&file).0).pop();
@@ -201,18 +200,18 @@ fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
     }
     stop(recorder).check_says("servers=2");
     let mut seed = 10;
-    let mut heights = Vec::new();
+    let mut servers = Vec::new();
     for record in read_whole(&file) {
         match record.event {
             Event::Server(info) => {
                 seed += 1;
-                heights.push(info.height);
+                servers.push(*info);
             }
             Event::Frame(sample) => assert_eq!(sample.header.result.seed, seed),
             Event::Truth(sample) => assert_eq!(sample.header.seed, seed),
         }
     }
-    assert_eq!(heights, [5, 3]);
+    assert_eq!(servers, expected);
 }
 
 #[test]

@@ -161,6 +161,16 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
         refused(&server, &format!("restore {path} --takeover"), words);
         assert_eq!(server.observe(0), before);
     }
+    let wire = Wire::open(&server.instance);
+    let request = Request::Restore {
+        lease: wire.acquire(0..1).lease,
+        first_world: 0,
+        n_worlds: 1,
+        from: 0,
+        path: folder.write("other", &damaged),
+    };
+    assert_eq!(wire.ask(&request).status(), Status::BadFile);
+    assert_eq!(server.observe(0), before);
     for (path, words) in [
         ("/no/such/file", "snapshot file /no/such/file"),
         ("/dev/zero", "expected a regular file"),

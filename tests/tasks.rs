@@ -130,6 +130,10 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
     let pipe = folder.word("pipe");
     let made = std::process::Command::new("mkfifo").arg(&pipe).status();
     assert!(made.expect("mkfifo").success());
+    let of_pipe = mine("small").replace("wildfire-small", "pipe");
+    let of_pipe = folder.write("of_pipe.toml", of_pipe);
+    let words = "model: expected a regular file, got a pipe";
+    check(SERVER, &format!("--task {of_pipe}"), words);
     let table =
         "--task small --height 3 => height: expected to be left out, as the task decides it, got 3
 --task small --start corner => start: expected to be left out, as the task decides it

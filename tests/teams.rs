@@ -175,8 +175,12 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
 fn a_path_that_is_given_up_is_never_flown() {
     let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
     let [first, second] = [0..2, 2..4].map(|robots| Flyer::new(&server, robots));
+    let stranger = Wire::open(&server.instance);
+    let observe = || stranger.step(observe_header(0..TEAM), &[]).1;
+    let before = observe();
     let given_up = first.send(0);
     second.wait_for_paths(2);
+    assert_eq!(observe(), before, "a path that waits is not shown");
     drop(given_up);
     second.wait_for_paths(0);
     // Closes the connection of a client that waits.
@@ -371,9 +375,13 @@ fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
     assert_eq!(flown_by(&single, "--team"), together);
     assert_eq!(flown_by(&[0..1, 1..4], "--team"), together);
     // Agents that plan independently fly over the same cells.
-    let (_, alone) = flown_by(&single, "");
+    let (paths, alone) = flown_by(&single, "");
     assert!(together.1 > 1.2 * alone, "{} and {alone}", together.1);
-    flown_by(&single, "--share");
+    let (shared, _) = flown_by(&single, "--share");
+    assert_ne!(
+        shared, paths,
+        "shared frames change the beliefs, and so the paths"
+    );
     let server = Server::start(&format!("{FLAGS} --publish-truth"));
     let check = |flags: &str, words: &str| check(AGENT, &format!("{flags} {}", on(&server)), words);
     let robots = "expected a part of the world's robots 0..4, got";

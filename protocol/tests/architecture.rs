@@ -123,6 +123,7 @@ fn the_index_of_documents_is_complete() {
 
 #[test]
 fn every_test_file_is_in_its_program() {
+    let mut n_programs = 0;
     for name in crates() {
         let is_crate_of_tests = name == "tests";
         let folder = root()
@@ -131,6 +132,7 @@ fn every_test_file_is_in_its_program() {
         let Ok(program) = std::fs::read_to_string(folder.join("main.rs")) else {
             continue;
         };
+        n_programs += 1;
         for entry in std::fs::read_dir(folder).expect("a folder") {
             let file = entry.expect("a file").file_name().display().to_string();
             let is_module = |stem| {
@@ -140,6 +142,7 @@ fn every_test_file_is_in_its_program() {
             assert!(is_in, "{name}: {file} is not in main.rs");
         }
     }
+    assert!(n_programs >= 9, "{n_programs} programs of tests");
 }
 
 #[test]

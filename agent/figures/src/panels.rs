@@ -165,3 +165,28 @@ impl Zoom {
         cells.div_ceil(self.stride) * self.pixels
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(shape: (usize, usize), n_panels: usize, columns: usize) {
+        let layout = Layout::new(shape, n_panels, (30.0, 1140.0));
+        assert_eq!(layout.columns, columns, "{layout:?}");
+        let (width, height) = layout.panel_size();
+        assert!(
+            width >= 1.0 && height >= 0.5 && width <= 1140.0,
+            "{layout:?}"
+        );
+        let corner = layout.corner(columns - 1, 0.0);
+        assert!(corner.0 >= 30.0 && corner.0 + width <= 1170.5, "{layout:?}");
+    }
+
+    #[test]
+    fn panels_stay_on_the_page_for_every_grid() {
+        check((64, 64), 6, 3);
+        check((5, 40), 6, 2);
+        check((4096, 4096), 6, 3);
+        check((1, 1), 5, 3);
+    }
+}

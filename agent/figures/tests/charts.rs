@@ -7,6 +7,7 @@ use ndarray::{Array2, Array3};
 use roxmltree::Document;
 
 const BLUE: Color = Color(0x00, 0x72, 0xb2);
+
 /// Checks for valid XML, finite numbers, and texts inside the page's margin. Returns the texts.
 fn check(svg: &str) -> Vec<String> {
     assert!(!svg.contains("NaN") && !svg.contains("inf\""), "{svg}");

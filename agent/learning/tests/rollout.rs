@@ -58,6 +58,29 @@ const CELLS: [Cell; 3] = [
 ];
 
 #[test]
+fn missed_steps_equal_steps_with_empty_frames() {
+    let [mut late, mut hovering] = [0; 2].map(|_| robot("beam_exploit", &CELLS[..1]));
+    let empty = |step| {
+        let mut seen = seen(step, &CELLS[..1]);
+        seen.observation.frame = Frame::empty(shape());
+        seen
+    };
+    for step in 1..4 {
+        hovering.plan();
+        hovering.see(empty(step)).expect("possible");
+        hovering.agent.predict();
+        if step < 3 {
+            late.agent.predict();
+        }
+    }
+    late.see(empty(3)).expect("possible");
+    late.agent.predict();
+    assert_eq!(late.agent.belief(), hovering.agent.belief());
+    assert_eq!(late.observation(), hovering.observation());
+    assert_eq!(late.plan(), hovering.plan());
+}
+
+#[test]
 fn paths_come_by_robot_and_each_agent_sees_its_own() {
     let new = || {
         vec![

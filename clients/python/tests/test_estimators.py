@@ -1,6 +1,7 @@
 """Beliefs of every kind equal the Rust agent's, for one world or many; bad input is refused."""
 
 import re
+import subprocess
 import textwrap
 import types
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from failures import fails, refuses
 from numpy.typing import NDArray
+from processes import find
 
 import emberwatch
 from emberwatch import _native, belief
@@ -324,6 +326,24 @@ def test_an_impossible_frame_names_its_world() -> None:
     with fails("impossible_frame", match=r"^frame: cell \(0, 1\)"):
         one.correct(np.array([[255, 2]], np.uint8))
     assert (one.belief == prior).all()
+
+
+def test_an_autoencoder_knows_only_its_grid(tmp_path: Path) -> None:
+    settings = tmp_path / "agent.toml"
+    settings.write_text("[autoencoder]\nwindow = 2\n")
+    command = [find("emberwatch-agent"), "train", "--learner=autoencoder", "--height=8"]
+    command += ["--width=8", "--steps=6", "--moves=4", f"--out={tmp_path / 'out'}"]
+    command += [f"--config={settings}"]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    checkpoint = tmp_path / "out" / "checkpoint.safetensors"
+    kept = belief.load(checkpoint, height=8, width=8)
+    assert kept.kind == "autoencoder"
+    kept.correct(np.full((8, 8), 2, np.uint8))
+    kept.predict()
+    assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4)
+    for model in (None, MODEL):
+        with refuses("checkpoint: expected .*16 x 16"):
+            belief.load(checkpoint, **GRID, model=model)
 
 
 def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -79,7 +79,7 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
     ("name", "keywords"),
     [
         (WILDFIRE, {"observation": "robot"}),
-        (MOVES, {"observation": "move"}),
+        (MOVES, {"observation": "move", "reward": "move"}),
         (OBJECTIVE, {"prior": "uniform", "estimator": "spatial_filter"}),
         *ALL.items(),
     ],

@@ -104,11 +104,12 @@ pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     layout.fields.iter().flat_map(of_field).collect()
 }
 
-/// Returns the bytes of a worked example. Compares each number's bytes with the value written next to them.
-pub fn worked_example(name: &str) -> Vec<u8> {
+/// Returns the bytes of a worked example. Checks the names of its fields, and each value against its bytes.
+pub fn worked_example(name: &'static str) -> Vec<u8> {
     let mut blocks = fences("hex").into_iter();
     let (_, text) = blocks.find(|(title, _)| title.trim() == name).expect(name);
     let mut bytes = Vec::new();
+    let mut names = Vec::new();
     for line in text.lines() {
         let (hex, fields) = line.split_once("  | ").expect("hex | fields");
         let (offset, hex) = hex.split_once("  ").expect("offset, hex");
@@ -117,18 +118,47 @@ pub fn worked_example(name: &str) -> Vec<u8> {
         assert_eq!(groups.clone().count(), fields.clone().count(), "{line}");
         for (group, field) in groups.map(bytes_of_hex).zip(fields) {
             let (name, value) = field.split_once(" = ").expect("name = value");
-            let mut wide = [0; 8];
-            wide[..group.len().min(8)].copy_from_slice(&group[..group.len().min(8)]);
-            let number = match name {
-                "reward" | "marginal" => f64::from_le_bytes(wide).to_string(),
-                _ => u64::from_le_bytes(wide).to_string(),
-            };
-            let is_number = !name.starts_with("path") && !name.starts_with("frame");
-            assert!(!is_number || number == value, "{number} in {line}");
+            assert_eq!(shown(name, &group), value, "{line}");
+            names.push(name);
             bytes.extend(group);
         }
     }
+    let structs = match name {
+        "StepReply" => vec!["StepReply", "WorldResult", "RobotResult", "RobotResult"],
+        other => vec![other],
+    };
+    let fields = structs
+        .into_iter()
+        .flat_map(|name| documented_struct(name).0.fields);
+    let fields: Vec<String> = fields.map(|field| field.name).collect();
+    assert_eq!(names[..fields.len()], fields, "fields of {name}");
     bytes
+}
+
+/// Returns a field's value as the worked example writes it.
+fn shown(name: &str, bytes: &[u8]) -> String {
+    let words = |word: fn(u8) -> String| {
+        let words: Vec<String> = bytes.iter().map(|byte| word(*byte)).collect();
+        words.join(" ")
+    };
+    if name.starts_with("path") {
+        return words(|byte| ["up", "down", "left", "right"][usize::from(byte)].into());
+    }
+    if name.starts_with("frame") {
+        return words(|byte| {
+            if byte == 255 {
+                "-".into()
+            } else {
+                byte.to_string()
+            }
+        });
+    }
+    let mut wide = [0; 8];
+    wide[..bytes.len()].copy_from_slice(bytes);
+    match name {
+        "reward" | "marginal" => f64::from_le_bytes(wide).to_string(),
+        _ => u64::from_le_bytes(wide).to_string(),
+    }
 }
 
 fn bytes_of_hex(text: &str) -> Vec<u8> {

@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn tables_are_distributions_and_weights() {
+    fn tables_are_valid_and_gradients_agree_with_differences() {
         for (n_matrices, n_values) in [(1, 4), (2, 2)] {
             let dimensions = Dimensions {
                 n_matrices,

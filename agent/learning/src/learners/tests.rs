@@ -93,7 +93,7 @@ fn check_basis(mut learner: impl Learner, basis: BasisKind) {
 }
 
 #[test]
-fn learners_plan_on_the_belief_that_settings_say() {
+fn agents_of_learners_hold_the_belief_that_settings_choose() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
         let config = &config(basis);
         let learner = FilterLearner::new(dimensions(false), worlds(), config);
