@@ -1,6 +1,6 @@
 """Tries the first steps of a user of the installed package. `scripts/wheel` removes compilers from PATH.
 
-Runs the Python code of README.md, which needs Pillow.
+Runs the example of docs/environments/wildfire.md, which needs Pillow.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ def check_versions() -> None:
         assert output(find(name), "--version").split() == [name, version]
 
 
-def check_readme() -> None:
-    """The Python code of README.md draws a picture."""
-    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def check_example() -> None:
+    """The example of docs/environments/wildfire.md draws a picture."""
+    page = (ROOT / "docs/environments/wildfire.md").read_text("utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     assert code is not None
     exec(code[1], {})
     assert Path("wildfire.png").stat().st_size > 1000
@@ -93,7 +94,7 @@ def main() -> None:
     for check in (
         check_place,
         check_versions,
-        check_readme,
+        check_example,
         check_vector,
         check_training,
         check_dashboard,

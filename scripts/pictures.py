@@ -2,7 +2,7 @@
 
 The package and Pillow must be installed.
 
-The picture of Wildfire is the one that README.md's Python code draws.
+The picture of Wildfire is the one that the example on its page draws.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ def save(name: str, picture: Any) -> None:
 
 
 def wildfire() -> None:
-    """Draws the picture of README.md."""
-    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    """Draws the picture of the example in docs/environments/wildfire.md."""
+    page = (FOLDER / "wildfire.md").read_text("utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     assert code is not None
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         exec(code[1], {})

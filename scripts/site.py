@@ -40,7 +40,7 @@ OF_REPOSITORY = re.compile(r"^All documents: .*?\n\n", re.MULTILINE | re.DOTALL)
 HOME = "---\nhide: [navigation]\n---\n\n"
 
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
-#: The language of a fence, and words after it, which are only for tests.
+#: The opening of a fence: its language, and further words that are only for tests.
 INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")

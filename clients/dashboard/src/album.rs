@@ -134,7 +134,7 @@ impl Album {
         };
         let (_, height, width) = published.belief.dim();
         if (height, width) != entry.shape.dim() {
-            return true; // It has another grid, so it never fits.
+            return true; // It has another grid, so it can never be shown.
         }
         // Of several agents on a world, the page shows the one with the lowest robot, while it publishes beliefs.
         let has_priority = |(first, at): (u32, Instant)| {

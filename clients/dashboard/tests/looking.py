@@ -44,7 +44,7 @@ class Look:
     """A page under test. `allowed` are patterns of complaints that the test provokes."""
 
     def __init__(self, page: Page) -> None:
-        """Collects everything that goes wrong."""
+        """Starts recording the page's errors and warnings."""
         self.page = page
         # Only tests read pixels back, about whose slowness the browser warns.
         self.allowed = ["willReadFrequently"]

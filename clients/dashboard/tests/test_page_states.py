@@ -95,7 +95,7 @@ def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_p
         programs.agent(server.instance, steps=5)
         while beliefs.receive(PATIENCE).step < 5:
             pass
-        # Soon after the last belief, because a belief is shown for only some seconds.
+        # Steps soon after the last belief, because a belief is shown for only some seconds.
         lease = client.acquire(takeover=True)
         for _ in range(3):
             lease.step([0, 1])

@@ -47,7 +47,7 @@ def work(pipe: Connection, instance: str, process: int, n_worlds: int) -> None:
 
 
 def main() -> None:
-    """Measures each number of processes."""
+    """Measures the rates for each number of processes."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--worlds", type=int, default=8, help="worlds per process")

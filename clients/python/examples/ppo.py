@@ -61,8 +61,7 @@ class Network(nn.Module):
 
 
 def symmetries() -> list[tuple[int, bool, torch.Tensor]]:
-    """Returns the square's symmetries: quarter turns, mirrored first or not, and moves
-    afterwards."""
+    """Returns the square's symmetries: quarter turns, a mirror flag, and the moves' new numbers."""
     found = []
     for mirrored in (False, True):
         for turns in range(4):

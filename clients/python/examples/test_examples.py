@@ -84,3 +84,15 @@ def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -
 def test_every_example_is_run() -> None:
     files = {path.name for path in FOLDER.glob("*.py")} - {Path(__file__).name}
     assert files == {name for name, _, _ in EXAMPLES}
+
+
+def test_the_readme_trains_and_scores_a_policy(tmp_path: Path) -> None:
+    page = (FOLDER.parents[2] / "README.md").read_text("utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
+    assert code is not None
+    short = code[1].replace("500_000", "2_048").replace("steps=100", "steps=5")
+    done = subprocess.run(
+        [sys.executable, "-c", short], capture_output=True, text=True, timeout=900, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert re.search(r"ppo: \d\S* \+- \S+ a step on 32 test worlds", done.stdout), done.stdout

@@ -37,7 +37,8 @@ impl Pool {
         }
     }
 
-    /// In a forked child, forgets the parent's threads. They do not run here, and dropping the pool would wait for them.
+    /// In a forked child, forgets the parent's threads. They do not run here, and dropping the pool would wait for
+    /// them.
     fn forget_others(&mut self) {
         if self.pid != std::process::id() {
             std::mem::forget(self.threads.take());

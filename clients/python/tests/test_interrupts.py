@@ -83,7 +83,7 @@ def places(call: Callable[[], object]) -> int:
 
 
 def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
-    """Interrupts a call at a place. The error keeps its traceback, as in a notebook."""
+    """Interrupts a call at its n-th place for signals. Keeps the traceback, as notebooks do."""
     kind = (KeyboardInterrupt, Alarm)[n & 1]
     sys.setprofile(Signal(n, kind))
     try:

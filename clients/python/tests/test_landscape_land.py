@@ -187,8 +187,7 @@ def test_the_command_says_what_it_made(tmp_path: Path) -> None:
     assert done.stdout.splitlines() == [
         f"{out}: 4 x 5 cells, zones: 1",
         f"{dem}: cells of 30 x 30 metres on the ground; steepest slope 10.0 degrees",
-        f"{dem}: heights taken as metres, as nothing says their unit; --height-unit ft changes "
-        "that",
+        f"{dem}: heights in metres (assumed, as the raster names no unit; --height-unit sets it)",
     ]
     assert out.read_text().startswith("# python -m emberwatch.landscape land: 'dem.tif'; model ")
 
@@ -228,25 +227,25 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
     closed.write_text("no_fly = [[0, 0, 1]]\n" + zoned.read_text())
     many = array(f / "many.npy", np.arange(300).reshape(15, 20))
     return {
-        "rasters: expected ELEVATION, --zones or --no-fly, got none": (),
+        "rasters: expected at least one of ELEVATION, --zones and --no-fly, got none": (),
         f"{f}/none.tif: expected a file or folder, got none": (f / "none.tif",),
         f"{f}/a.png: expected one of .tif, ": (array(f / "a.npy", FUEL).rename(f / "a.png"),),
-        "got no place on the ground; say --cell METRES, or its projection": (npy,),
+        "got no place on the ground; give --cell METRES, or set its projection": (npy,),
         "--cell: expected 30 metres, as ": (dem, "--cell=90"),
         "--cell: expected at least 0.001 metres, such as 30 or '98.4 ft' (m, ": (npy, "--cell=0"),
         "got '30 furlongs'": (npy, "--cell=30 furlongs"),
-        "--cell: expected ELEVATION beside it, got none": ("--zones", fuel, "--cell=30"),
-        "--oblong: expected ELEVATION beside it": ("--zones", fuel, "--oblong"),
-        "--unburnable: expected --zones beside it": (dem, "--unburnable=3"),
-        f"--unburnable: expected values that are in {fuel}, got 9": (
+        "--cell: applies only with ELEVATION": ("--zones", fuel, "--cell=30"),
+        "--oblong: applies only with ELEVATION": ("--zones", fuel, "--oblong"),
+        "--unburnable: applies only with --zones": (dem, "--unburnable=3"),
+        f"--unburnable: expected values that occur in {fuel}, got 9": (
             "--zones", fuel, "--unburnable=1,9",
         ),
         "--slope-step: expected 0.1 to 90 degrees, got 0.0": (dem, "--slope-step=0"),
         "--wind-speed: expected 0 to 100 m/s, got nan": (dem, "--wind-speed=nan"),
-        "wind: expected a --wind-speed above 0 and --wind-from (or --wind-towards), or neit": (
+        "wind: expected both a --wind-speed above 0 and --wind-from (or --wind-towards), or ne": (
             dem, "--wind-speed=3",
         ),
-        "or neither, got one of them": (dem, "--wind-towards=3"),
+        "or neither, got only one of them": (dem, "--wind-towards=3"),
         "--wind-towards: expected -360 to 360 degrees, got inf": (
             dem, "--wind-speed=3", "--wind-towards=inf",
         ),
@@ -256,22 +255,22 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "--missing-zone: expected at most 1000000000000000, got 9": (
             "--zones", fuel, f"--missing-zone={'9' * 400}",
         ),
-        "--missing-zone: expected --zones beside it": (dem, "--missing-zone=0"),
+        "--missing-zone: applies only with --zones": (dem, "--missing-zone=0"),
         "hole.npy: expected a number in each cell, got none in 1 cells, the first in row 1, col": (
             "--zones", array(f / "hole.npy", hole),
         ),
         "column 2; --missing-zone N gives them the number N": ("--zones", f / "hole.npy"),
-        "column 2; fill them (gdal_fillnodata), or take a part": (f / "hole.npy", "--cell=30"),
+        "column 2; fill them (gdal_fillnodata), or use a part": (f / "hole.npy", "--cell=30"),
         "hole.tif: expected a height in each cell, got none in 1 cells, the first in row 1, col": (
             geotiff(f / "hole.tif", hole),
         ),
-        "expected heights of -1000 to 10000 metres, got -9999; say --nodata if it means no": (
+        "expected heights of -1000 to 10000 metres, got -9999; give --nodata if it means no": (
             array(f / "low.npy", low), "--cell=30",
         ),
-        "expected at least 2 x 2 cells, as slopes are between cells, got 1 x 1": (
+        "expected at least 2 x 2 cells, as a slope needs two neighbours, got 1 x 1": (
             array(f / "one.npy", [[1.0]]), "--cell=30",
         ),
-        "expected heights in one of m, km, dm, cm, mm, ft, us-ft, got 'm2 s-2'; say --height-u": (
+        "expected heights in one of m, km, dm, cm, mm, ft, us-ft, got 'm2 s-2'; give --height-": (
             netcdf(f / "geopotential.nc", z=EASTWARD, unit="m2 s-2"),
         ),
         "expected square cells, got 30 x 60 metres on the ground; ": (
@@ -296,8 +295,8 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "--state: expected one of unburnt, burning, burnt, got 'ash'": (dem, "--state=ash"),
         "expected a kernel by which 'burnt' spreads to neighbours": (dem, "--state=burnt"),
         "--state: expected the state that spreads, as no state pays": (dem, "--model", unpaid),
-        'model "wildfire": expected no no_fly, got some': (dem, "--model", closed),
-        "--unburnable: expected no bias but of 'normal', got one of 'fire'": (
+        'model "wildfire": expected a base model without `no_fly`, got': (dem, "--model", closed),
+        "--unburnable: expected a model in which only 'normal' has a bias, got one in which 'f": (
             "--zones", fuel, "--unburnable=1", "--model", biased,
         ),
     }  # fmt: skip
@@ -307,7 +306,7 @@ def test_refusals_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     out, mine = ["--out", tmp_path / "out" / "land.toml"], tmp_path / "mine.toml"
     mine.write_text("mine")
     rows = {words: (*flags, *out) for words, flags in refusals(tmp_path).items()}
-    rows["one; --force replaces it"] = (tmp_path / DEM, "--out", mine)
+    rows["mine.toml exists already; --force replaces it"] = (tmp_path / DEM, "--out", mine)
     rows["a .toml"] = (tmp_path / DEM, "--out", tmp_path / "a.txt")
     for words, flags in rows.items():
         with pytest.raises(SystemExit) as stopped:

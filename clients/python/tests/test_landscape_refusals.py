@@ -112,12 +112,12 @@ CASES: list[tuple[str, Case]] = [
     ("expected rasters in this folder, got none", lambda f: (f, *MASKS)),
     (".npz, got '.grd'", lambda f: (text(f / "fire.grd", ""), *MASKS)),
     ("got '.txt'", lambda f: (folder_with(f, "notes.txt"), *MASKS)),
-    ("a.tif: expected each file once, got it twice",
+    ("a.tif: expected each file once, got this one twice",
         lambda f: (geotiff(f / "a.tif"), f / "." / "a.tif", *MASKS)),
     ("expected a NetCDF file, got", lambda f: (text(f / "a.nc", "CDF\1"), *ARRIVALS)),
     ("expected an ESRI ASCII grid, got", lambda f: (text(f / "a.asc", "ncols 3\nrows"), *ARRIVALS)),
     ("a.asc: expected 12 numbers for 3 x 4 cells, got 14", ascii_file("20.0", "20.0 20.0")),
-    ("a.asc: expected numbers, got 'x'; NODATA_value names a word for no value",
+    ("a.asc: expected numbers, got 'x'; NODATA_value can define a word for no value",
         ascii_file("35.0", "x")),
     ("expected a NumPy file, got", lambda f: (text(f / "a.npz", "hello"), *MASKS)),
     ("(layers, rows, columns), got object (1,)",
@@ -139,8 +139,8 @@ CASES: list[tuple[str, Case]] = [
         lambda f: (netcdf(f / "a.nc", at=ARRIVAL, wind=ARRIVAL), *ARRIVALS)),
     ("a.nc (at), got 'lat'",
         lambda f: (netcdf(f / "a.nc", at=ARRIVAL), *ARRIVALS, "--variable", "lat")),
-    ("which has no variables, got 'at'", arrivals("--variable", "at")),
-    ("expected a variable of time, rows and columns, got it over level",
+    ("has no variables, got 'at'; leave the flag out", arrivals("--variable", "at")),
+    ("expected a variable with the dimensions time, rows and columns, got one with level",
         lambda f: (netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True),
         *MASKS)),
     ("b.tif: expected 3 x 4 cells as in ",
@@ -164,59 +164,61 @@ CASES: list[tuple[str, Case]] = [
         lambda f: (geotiff(f / "a.tif", ONE, ONE, nodata=0), *MASKS)),
     ("band 2: expected a value in each cell, got none in 3 cells",
         layers(STATES, ONE, np.where(ONE == 1, np.nan, 0))),
-    ("band 2: expected burning cells to burn on, got 3 that are unburnt again, the fir",
+    ("band 2: expected burning cells not to become unburnt, got 3 that are unburnt again",
         layers(MASKS, ONE, NONE)),
     ("band 3: expected burnt cells to stay burnt, got 3 that burn again",
         layers(BURNING, ONE, NONE, ONE)),
-    ("band 3: expected burning cells to burn on, got 3 that are unburnt again",
+    ("band 3: expected burning cells not to become unburnt, got 3 that are unburnt again",
         layers(STATES, ONE, 2 * ONE, NONE)),
     ("expected a later time than 600, got 300", at(0, 600, 300, 900)),
     ("band 2: expected a time, got nan", at(0, float("nan"), 1200, 1800)),
-    ("expected steps of 600 in time, got 1200", at(0, 600, 1200, 2400)),
+    ("expected times 600 apart, like the first ones, got 1200", at(0, 600, 1200, 2400)),
     ("band 1: expected a later time than 2020-08-02 01:00:00+00:00, got 2020-08-01 00:00:00",
         lambda f: (*days(f, "hours since 2020-08-02", "hours since 2020-08-01"), *MASKS)),
     ("expected times in 'hours since 2020-08-01' (standard) as in ",
         lambda f: (*days(f, "hours since 2020-08-01", "hours since start"), *MASKS)),
     ("a.nc: expected times in 'hours' (standard) as in ",
         lambda f: (*days(f, "hours"), netcdf(f / "a.nc", mask=masks()[3]), *MASKS)),
-    ("tells the times of its layers and --step chooses among them, got 2",
+    ("--every: applies only to layers without times, got --every 2: ",
         lambda f: (days(f, "hours", None)[0], *MASKS, "--every", 2)),
-    ("--unit: expected none, as ", layers(MASKS, NONE, ONE, flags=("--unit", "s"))),
+    ("has no times, got --unit s; leave the flag out",
+        layers(MASKS, NONE, ONE, flags=("--unit", "s"))),
     ("--unit: expected h, as in ", lambda f: (days(f, "hours", None)[0], *MASKS, "--unit", "s")),
-    ("band 2: expected 0 and one other number in all layers, 1, got 2 in row 0, column 0",
+    ("band 2: expected 0 and only one other number in all layers, 1, got 2 in row 0, column 0",
         layers(MASKS, ONE, 2 * ONE)),
     ("band 2: expected the codes 0, 1, 2, got 3 in row 0, column 0", layers(STATES, ONE, 3 * ONE)),
-    ("expected times of at least 0, got -9999 in row 0, column 3; if that means never",
+    ("expected times of at least 0, got -9999 in row 0, column 3; if it means never",
         arrivals(nodata=None)),
-    ("--begin: expected --kind arrival beside it, got states",
+    ("--begin: applies only with --kind arrival, got --kind states",
         layers(STATES, ONE, flags=("--begin", 2))),
     ("--begin: expected a number, got nan", arrivals("--begin", "nan")),
     ("expected cells that burn, got none", arrivals(bands=[np.full((3, 4), NEVER)])),
     ("cells that burn, got none", layers(MASKS, NONE, NONE)),
-    ("expected a variable of time, rows and columns, got it over member",
+    ("expected a variable with the dimensions time, rows and columns, got one with member",
         lambda f: (netcdf(f / "a.nc", at=np.zeros((2, 3, 4)), times=[0, 1], over=("member", "y",
         "x")), *MASKS)),
     ("grid: expected the proportions of 3 x 4 cells, got 2 x 3; use --crop",
         arrivals("--height", 2)),
-    ("--begin: expected --kind arrival beside it, got mask",
+    ("--begin: applies only with --kind arrival, got --kind mask",
         lambda f: (geotiff(f / "a.tif"), *MASKS, "--begin", 0)),
-    ("--step: expected a share of 50, the last time, got ", arrivals("--step", "1e-310 s")),
-    ("--resample: expected cells that burn on 1 x 1 cells, got none",
+    ("--step: too short for times up to 50, got ", arrivals("--step", "1e-310 s")),
+    ("--resample: no cell burns on the grid of 1 x 1 cells; use 'earliest'",
         lambda f: (stack(f, ONE, ONE), *MASKS, "--resample=nearest", "--height=1",
         "--crop=0,1,3,3")),
     ("expected at least 2 steps, got 1", layers(MASKS, ONE)),
     ("bytes of states, got 4999999899 steps of 3 x 4",
         arrivals(bands=[np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)])),
-    ("at most 4096 x 4096 cells, as the server takes", lambda f: (large(f), *MASKS)),
-    ("at most 4096 x 4096 cells, as the server takes, got 4097 x 5463", arrivals("--height", 4097)),
+    ("at most 4096 x 4096 cells, the server's maximum", lambda f: (large(f), *MASKS)),
+    ("at most 4096 x 4096 cells, the server's maximum, got 4097 x 5463",
+        arrivals("--height", 4097)),
     ("expected the proportions of 3 x 4 cells, got 3 x 3", arrivals("--height", 3, "--width", 3)),
     ("--crop: expected TOP,LEFT,HEIGHT,WIDTH within 3 x 4 cells, got 1,0,3,4",
         arrivals("--crop", "1,0,3,4")),
-    ("projection that says their size, got no place on the ground; use --height",
+    ("projection that gives their size, got no place on the ground; use --height",
         lambda f: (array(f, masks()), *MASKS, "--cell", 60)),
-    ("--cell: expected neither --height nor --width beside it",
+    ("--cell: cannot be combined with --height or --width",
         arrivals("--cell", 60, "--height", 3)),
-    ("b.tif: expected 3 x 4 cells as the first sequence, got 2 x 4",
+    ("b.tif: expected 3 x 4 cells as in the first sequence, got 2 x 4",
         lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", ARRIVAL[:2]), *ARRIVALS)),
     ("b.tif: expected cells of 30 x 30 on the ground as in the first sequence, got 31 x 31",
         lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", cell=(31, 31)), *ARRIVALS)),
@@ -227,13 +229,13 @@ CASES: list[tuple[str, Case]] = [
         *ARRIVALS)),
     ("--unit: expected s, min, h or d, as ", lambda f: (geotiff(f / "a.tif"), *ARRIVALS[:-2])),
     ("--unit: expected s, as in ", lambda f: (netcdf(f / "a.nc", at=ARRIVAL, unit="s"), *ARRIVALS)),
-    ("--burning: expected the steps that a cell burns, as --kind arrival does not",
+    ("--burning: required with --kind arrival: the number of steps that a cell burns",
         lambda f: (geotiff(f / "a.tif"), *ARRIVALS[:4])),
-    ("--burning: expected --kind arrival or mask beside it, got states",
+    ("--burning: applies only with --kind arrival or mask, got --kind states",
         layers(STATES, ONE, flags=("--burning", 2))),
     ("--step: expected a number and s, min, h or d, such as '10 min', got '10'",
         lambda f: (stack(f, ONE), "--kind", "states", "--step", "10")),
-    ("--picture: expected a .png, got ", lambda f: arrivals("--picture", f / "a.gif")(f)),
+    ("--picture: expected a .png file, got ", lambda f: arrivals("--picture", f / "a.gif")(f)),
     ("--picture: expected a file, got the folder ",
         lambda f: arrivals("--picture", folder(f / "a.png"))(f)),
     (r"has its letters, such as LC_ALL=C.UTF-8, got '\udcff'", arrivals("--name", "\udcff")),
@@ -247,7 +249,7 @@ CASES: list[tuple[str, Case]] = [
         lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,1")),
     ("argument --crop: expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got 1,0,x,4",
         arrivals("--crop", "1,0,x,4")),
-    ("argument --every: expected a whole number of 1 to 999999999, got 0",
+    ("argument --every: expected a whole number, 1 to 999999999, got 0",
         lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 0)),
 ]  # fmt: skip
 
@@ -285,15 +287,15 @@ def test_output_that_is_there_or_cannot_be_written_is_named(
     for there in (out, out.with_suffix(".toml")):
         there.write_text("mine")
         line = refused((file, *ARRIVALS, "--out", out), capsys)
-        assert f"--out: expected no {there}, got one; --force replaces it" in line
+        assert f"--out: {there} exists already; --force replaces it" in line
         assert there.read_text() == "mine"
         there.unlink()
     picture = tmp_path / "a.png"
     picture.write_text("mine")
     line = refused((file, *ARRIVALS, "--out", out, "--picture", picture), capsys)
-    assert f"--picture: expected no {picture}, got one; --force replaces it" in line
+    assert f"--picture: {picture} exists already; --force replaces it" in line
     line = refused((file, *ARRIVALS, "--out", tmp_path / "world.zip"), capsys)
-    assert "--out: expected a .npz, got " in line
+    assert "--out: expected a .npz file, got " in line
     picture.unlink()
     assert "a.tif" in refused((file, *ARRIVALS, "--out", file / "world.npz"), capsys)
     flags = (*ARRIVALS, "--out", out, "--picture", file / "a.png")
@@ -310,7 +312,7 @@ def test_a_missing_library_names_the_extra(
     ):
         monkeypatch.setitem(sys.modules, name, None)
         line = refused((file, *ARRIVALS, "--out", tmp_path / "world.npz"), capsys)
-        assert f"expected {name} to read it with" in line
+        assert f"reading it needs {name}, got: " in line
         assert line.endswith("pip install emberwatch[landscape]")
 
 

@@ -23,8 +23,8 @@ FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
 DEGREE = 111_200.0
 SECOND = 1 / 3600
 LAT_60 = math.cos(math.radians(60))
-SAY = "got none; say --height-unit ft"
-MAY_BE_DEGREES = "no projection, and numbers that may be degrees; say --cell METRES, or its project"
+SAY = "got none; give --height-unit ft"
+MAY_BE_DEGREES = "no projection, and coordinates that may be degrees; give --cell METRES, or set"
 SINUSOIDAL = "+proj=sinu +R=6371007.181 +units=m"
 
 
@@ -129,7 +129,7 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, *flags: object) ->
 
 
 def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assumed = "heights taken as metres, as nothing says their unit; --height-unit ft changes that"
+    assumed = "heights in metres (assumed, as the raster names no unit; --height-unit sets it)"
     model, dem = tmp_path / "new" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
     made(tmp_path, dem)
     assert assumed in notes(capsys) and f"# {assumed}" in model.read_text()
@@ -137,14 +137,14 @@ def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFix
         with rasterio.open(dem, "r+") as file:
             file.units = (unit,)
         made(tmp_path, dem)
-        assert f"heights in {words}, as the raster says" in notes(capsys)
+        assert f"heights in {words} (from the raster)" in notes(capsys)
     made(tmp_path, dem, "--height-unit=cm")
-    words = "heights in centimetres, as --height-unit says, not in US survey feet, as the raster"
+    words = "heights in centimetres (from --height-unit instead of the raster's US survey feet)"
     assert words in notes(capsys)
     made(tmp_path, netcdf(tmp_path / "dem.nc", z=EASTWARD, unit="1"))
     assert assumed in notes(capsys)
     made(tmp_path, geotiff(tmp_path / "no.tif", EASTWARD, crs=None))
-    words = "cells of 30 x 30 metres, as nothing says another unit (--cell does); steepest slope 10"
+    words = "cells of 30 x 30 metres, as the raster names no other unit (--cell sets the size); st"
     assert words in notes(capsys)
 
 
@@ -181,7 +181,7 @@ def test_cells_of_no_known_size_are_refused(
     flags = "--kind=arrival --unit=min --burning=2 --cell=60".split()
     with pytest.raises(SystemExit):
         main([str(fire), *flags, "--step=10 min", "--out", str(tmp_path / "fire.npz")])
-    assert "numbers that may be degrees; use --height" in capsys.readouterr().err
+    assert "coordinates that may be degrees; use --height" in capsys.readouterr().err
     place = {"crs": "EPSG:3857", "corner": (0, 9e6), "cell": (20_000, 20_000)}
     mercator = geotiff(tmp_path / "web.tif", np.zeros((40, 40)), **place)
     words = "web.tif: expected cells of one size on the ground, got "
@@ -193,7 +193,7 @@ def test_a_grid_turned_from_true_north_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made(tmp_path, geotiff(tmp_path / "c.tif", EASTWARD, crs="EPSG:3979", corner=(-2e6, 8e5)))
-    assert "north is up here, which is 27 degrees west of true north" in notes(capsys)
+    assert "the grid's north is 27 degrees west of true north" in notes(capsys)
     made(tmp_path, geotiff(tmp_path / "utm.tif", EASTWARD, corner=(3e5, 4e6)))
     assert "north" not in notes(capsys)
 
@@ -206,7 +206,7 @@ def test_cells_without_a_value_in_a_mask_are_free(
     mask = geotiff(tmp_path / "towns.tif", towns, nodata=255, dtype="uint8")
     model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), "--no-fly", mask)
     np.testing.assert_array_equal(model["no_fly"], towns == 1)
-    assert f"{mask}: robots may not be in 6 cells; of the others 14 have no value" in notes(capsys)
+    assert f"{mask}: 6 no-fly cells; 14 of the other cells have no value" in notes(capsys)
 
 
 def test_cells_without_a_zone_get_the_number_of_a_flag(tmp_path: Path) -> None:
@@ -275,10 +275,10 @@ def test_cells_of_a_recorded_world_are_metres_on_the_ground(
     ):  # fmt: skip
         file = geotiff(tmp_path / "fire.tif", fire, crs=crs, corner=corner, cell=(side_, side_))
         assert world(tmp_path, file, 60) == (6, 8), crs
-        assert "taken as metres" not in notes(capsys)
+        assert "assumed that cells" not in notes(capsys)
     file = geotiff(tmp_path / "fire.tif", fire, crs=None, cell=(30, 30))
     assert world(tmp_path, file, 60) == (6, 8)
-    assert "cells taken as metres, as nothing says their unit" in notes(capsys)
+    assert "assumed that cells are measured in metres, as the files name no unit" in notes(capsys)
 
 
 def mapped(path: Path, unit: str, factor: float, corner: tuple[float, float], **mapping: Any):
@@ -309,9 +309,9 @@ def test_a_grid_mapping_says_how_large_cells_of_a_netcdf_file_are(
         assert cells is not None
         assert [float(one) for one in cells.groups()] == pytest.approx([size] * 2, rel=5e-3)
     file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, crs_wkt=CRS("EPSG:4326").to_wkt())
-    words = "expected coordinates in degrees, as its grid mapping is, got metres"
+    words = "expected coordinates in degrees, the unit of its grid mapping, got metres"
     assert words in refused(capsys, tmp_path, file)
     file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, grid_mapping_name="mine")
-    words = "a projection that says their size, got mine; say --cell METRES"
+    words = "a projection that gives their size, got mine; give --cell METRES"
     assert words in refused(capsys, tmp_path, file)
     made(tmp_path, file, "--cell=60")

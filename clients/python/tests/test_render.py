@@ -106,7 +106,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
     ({"robots": [(1, 1), (2, 0)]}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
     ({"paths": [[(0, 0), (-1, 0)]]}, r"path: expected cells .* got \(-1, 0\)"),
-    ({"paths": [[(0, 0), (1, 1)]]}, "path: expected neighbours"),
+    ({"paths": [[(0, 0), (1, 1)]]}, "path: expected consecutive cells to be neighbours"),
     ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
     ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
 ]

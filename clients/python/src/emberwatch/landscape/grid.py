@@ -108,8 +108,7 @@ def check_even(place: Place, name: str) -> None:
 
 
 def check_unit(place: Place, subject: str, remedy: str) -> None:
-    """Refuses cells of unknown size. Coordinates that cannot be degrees are assumed to be metres.
-    """
+    """Refuses cells of unknown size; assumes metres if coordinates cannot be degrees."""
     got = _projection(place)
     if place.could_be_in_degrees():
         got = "no projection, and coordinates that may be degrees"

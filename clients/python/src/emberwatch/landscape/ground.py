@@ -13,16 +13,16 @@ import numpy as np
 from emberwatch.errors import invalid
 from emberwatch.landscape.libraries import library
 
-#: Ends of the lines that are measured, over the radius of the Earth: about 600 m apart.
+#: Length of the measured lines as a share of the radius of the Earth: about 600 m.
 _SHARE: Final = 1e-4
-_RADIUS: Final = 6.371e6  # metres
-#: Lengths on maps that differ by less, as in UTM zones and State Planes, count as those on the
-#: ground: cells of 30 m are of 30 m.
+_RADIUS: Final = 6.371e6  # radius of the Earth, metres
+#: Maps whose lengths differ by less from the ground, as in UTM zones and State Planes, count as
+#: exact: cells of 30 m stay cells of 30 m.
 _EXACT: Final = 2e-3
 
 
 class Ground(NamedTuple):
-    """A cell on the ground."""
+    """The size and direction of a cell on the ground."""
 
     width: float
     """Metres."""
@@ -36,12 +36,12 @@ class Ground(NamedTuple):
 
 @lru_cache(maxsize=64)
 def unit_cell(projection: str, x: float, y: float) -> Ground | None:
-    """A cell of one unit of the CRS at x, y; None for a CRS that pyproj does not know."""
+    """Measures a cell of one unit of the CRS at x, y; None for a CRS that pyproj does not know."""
     crs = _horizontal(projection)
     if crs is None:
         return None
     base, unit = _base(crs), _factor(crs)
-    if not base.is_geographic:  # of engineers: a plane, anywhere
+    if not base.is_geographic:  # an engineering CRS: a plane without a position on the Earth
         return Ground(unit, unit)
     step = _SHARE * (1.0 if crs.is_geographic else _RADIUS) / unit
     ends = x + step * np.array([-0.5, 0.5, 0, 0]), y + step * np.array([0, 0, -0.5, 0.5])
@@ -61,13 +61,13 @@ def unit_cell(projection: str, x: float, y: float) -> Ground | None:
 
 
 def unit_of(projection: str) -> tuple[float, bool] | None:
-    """The length of a unit of x and y, in metres or in radians, and whether it is an angle."""
+    """Returns the length of a unit of x and y, in metres or radians, and whether it is an angle."""
     crs = _horizontal(projection)
     return None if crs is None else (_factor(crs), bool(crs.is_geographic))
 
 
 def vertical_unit(projection: str) -> tuple[float, str] | None:
-    """The length of a unit of height in metres, and its name; None if the CRS has no heights."""
+    """Returns the length of a unit of height in metres, and its name; None without heights."""
     crs = _parsed(projection)
     for axis in () if crs is None else crs.axis_info:
         if axis.direction == "up":
@@ -76,7 +76,7 @@ def vertical_unit(projection: str) -> tuple[float, str] | None:
 
 
 def is_same(projection: str | None, other: str | None) -> bool:
-    """Whether both are one horizontal CRS, in whatever words."""
+    """Returns whether two texts describe the same horizontal CRS."""
     if projection is None or other is None or projection == other:
         return projection == other
     crs, second = _horizontal(projection), _horizontal(other)
@@ -87,7 +87,7 @@ def is_same(projection: str | None, other: str | None) -> bool:
 
 @lru_cache(maxsize=64)
 def _parsed(projection: str) -> Any | None:
-    """None for words that are no CRS to pyproj."""
+    """Parses well-known text; None if pyproj does not know the CRS."""
     pyproj = library("pyproj", "projection")
     try:
         return pyproj.CRS.from_wkt(projection)
@@ -103,7 +103,7 @@ def _horizontal(projection: str) -> Any | None:
 
 
 def _base(crs: Any) -> Any:
-    """The CRS of latitudes and longitudes that this one is a projection or a rotation of."""
+    """Returns the CRS of latitudes and longitudes that a projected or rotated CRS is based on."""
     while crs.source_crs is not None:
         crs = crs.source_crs
     return crs

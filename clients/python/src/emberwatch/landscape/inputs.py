@@ -1,4 +1,4 @@
-"""The files of each sequence, and the reader of each format. One layer is in memory at a time."""
+"""The files of each sequence, and the reader of each format. Holds one layer in memory."""
 
 import os
 import re
@@ -19,14 +19,15 @@ _READERS: Final = {
     ".npy": numpy_file.read,
     ".npz": numpy_file.read,
 }
-#: Files about others, which GDAL reads with them if they have their names.
-_BESIDE: Final = (".prj", ".tfw", ".xml")
+#: Auxiliary files, which GDAL reads together with the raster of the same name.
+_AUXILIARY: Final = (".prj", ".tfw", ".xml")
 
 
 def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
-    """The files of each sequence: of each folder, by the numbers in their names, and the rest.
+    """Returns the files of each sequence.
 
-    `one_file_each` makes each file a sequence of its own.
+    Each folder is a sequence, ordered by the numbers in its file names. All files given by name are
+    one more sequence. `one_file_each` makes each file a separate sequence.
     """
     found, loose = list[list[Path]](), list[Path]()
     for path in inputs:
@@ -46,28 +47,28 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
         if file.suffix.lower() not in _READERS:
             raise invalid(file, f"one of {', '.join(_READERS)}", f"'{file.suffix}'")
         if os.path.realpath(file) in known:
-            raise invalid(file, "each file once", "it twice")
+            raise invalid(file, "each file once", "this one twice")
         known.add(os.path.realpath(file))
     return [[file] for file in files] if one_file_each else found
 
 
 def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:
-    """The layers of these files, in order; a file is open until its last, or until closed."""
+    """Yields the layers of files in order. Each file is closed after its last layer."""
     for file in files:
         with closing(_READERS[file.suffix.lower()](file, choice)) as layers:
             yield from layers
 
 
 def _layers(files: Iterable[Path]) -> list[Path]:
-    """All but hidden files and those about a layer, by its name (`fire.tif.ovr`) or ending."""
+    """Drops hidden and auxiliary files, by their name (`fire.tif.ovr`) or ending."""
     files = [file for file in files if not file.name.startswith(".")]
     layers = [file for file in files if file.suffix.lower() in _READERS]
     names = tuple(f"{file.stem}." for file in layers)
     others = [file for file in files if not file.name.startswith(names)]
-    return layers + [file for file in others if file.suffix.lower() not in _BESIDE]
+    return layers + [file for file in others if file.suffix.lower() not in _AUXILIARY]
 
 
 def _by_number(file: Path) -> list[tuple[int, str]]:
-    """Orders `step_2` before `step_10`."""
+    """Returns a sort key that orders `step_2` before `step_10`."""
     parts = re.findall(r"\d+|\D+", file.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -1,4 +1,4 @@
-"""`python -m emberwatch.landscape land`: a model file with zones from elevation and wind."""
+"""`python -m emberwatch.landscape land`: makes a model file with zones of elevation and wind."""
 
 import argparse
 import tomllib
@@ -28,23 +28,24 @@ from emberwatch.model import Model
 _NAME: Final = "python -m emberwatch.landscape land"
 _EXAMPLES: Final = """
 examples:
-  # Fire climbs, and follows a wind of 5 m/s to the east-north-east:
+  # Fire climbs slopes, and follows a wind of 5 m/s to the east-north-east:
   python -m emberwatch.landscape land dem.tif --wind-speed 5 --wind-towards 20 --out hills.toml
-  # Heights in feet, and a wind from the west-south-west as weather reports name it:
+  # Heights in feet, and a wind from the west-south-west:
   python -m emberwatch.landscape land dem.tif --height-unit ft --wind-speed 5 --wind-from WSW \\
       --out hills.toml
-  # Zones of your own, of which 7 and 8 are rivers, and where robots may not be:
+  # Your own zones, with rivers in zones 7 and 8, and no-fly cells over towns:
   python -m emberwatch.landscape land --zones fuel.tif --unburnable 7,8 --no-fly towns.tif \\
       --out fuels.toml
 """
-#: Larger maps are in a `.npy` file beside the model file, which may have 16 MiB.
+#: Maximum number of cells of a map in the model file, which may have 16 MiB. Larger maps are
+#: written to a `.npy` file.
 _MOST_INLINE: Final = 1 << 16
-_MOST_NUMBER: Final = 10**15  # of a zone; doubles hold all whole numbers up to it
-_MOST_WIND: Final = 100.0  # m/s: more than any hurricane
+_MOST_NUMBER: Final = 10**15  # maximum number of a zone; doubles represent all integers up to it
+_MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Makes what the flags name; else exits with code 2 and what is wrong."""
+    """Makes the model file that the flags describe; exits with code 2 and a message on an error."""
     parser = _parser()
     flags = parser.parse_args(arguments)
     try:
@@ -56,8 +57,8 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a model file with zones of rasters: GeoTIFF (.tif), ESRI ASCII grid "
-        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md has all rules, "
+        description="Make a model file with zones from rasters: GeoTIFF (.tif), ESRI ASCII grid "
+        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md describes all rules, "
         "docs/model-file.md the formula.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -68,60 +69,60 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--cell",
         metavar="METRES",
-        help="side of a cell on the ground, where the raster does not say it; '98.4 ft' is in feet",
+        help="side of a cell on the ground, if the raster does not state it; '98.4 ft' for feet",
     )
     add(
         "--height-unit",
         choices=tuple(METRES),
-        help="what heights count [as the raster says, else m]",
+        help="unit of the heights [the raster's, or m]",
     )
-    add("--oblong", action="store_true", help="take cells that are not square or differ in size")
-    add("--slope-step", type=float, metavar="DEGREES", help="of the classes of slope [5]")
-    add("--wind-speed", type=float, default=0.0, metavar="M/S", help="[0: no wind]")
+    add("--oblong", action="store_true", help="allow cells that are not square or differ in size")
+    add("--slope-step", type=float, metavar="DEGREES", help="width of the classes of slope [5]")
+    add("--wind-speed", type=float, default=0.0, metavar="M/S", help="speed of the wind [0]")
     add(
         "--wind-towards",
         type=float,
         metavar="DEGREES",
-        help="where the wind blows to, from the east towards the north: 0 is to the east, 90 to "
-        "the north",
+        help="direction to which the wind blows, in degrees from the east towards the north: 0 is "
+        "to the east, 90 to the north",
     )
     add(
         "--wind-from",
         metavar="POINT|DEGREES",
-        help="instead: where the wind comes from, as weather reports say it: N, NNE, ..., or "
-        "degrees clockwise from the north",
+        help="instead of --wind-towards: where the wind comes from, as in weather reports: N, "
+        "NNE, ..., or degrees clockwise from the north",
     )
-    add("--zones", type=Path, metavar="RASTER", help="whole numbers: each is a zone of its own")
+    add("--zones", type=Path, metavar="RASTER", help="whole numbers, each a separate zone")
     add(
         "--missing-zone",
         type=int,
         metavar="N",
-        help="the number of cells of --zones that have none",
+        help="zone of the cells that have no value in --zones",
     )
-    add("--unburnable", type=_values, metavar="N,N", help="values of --zones that never burn")
+    add("--unburnable", type=_values, metavar="N,N", help="zones of --zones that never burn")
     add(
         "--no-fly",
         type=Path,
         metavar="RASTER",
-        help="a number other than 0 where robots may not be",
+        help="cells with a number other than 0 are no-fly cells",
     )
     add(
         "--model",
         default="wildfire-burnout",
         metavar="NAME|FILE",
-        help="the model whose kernels each zone gets [wildfire-burnout]",
+        help="the base model, whose kernels are adapted to each zone [wildfire-burnout]",
     )
     add("--state", metavar="NAME", help="the state that spreads [the one that pays most]")
     add(
         "--base-wind",
         action="store_true",
-        help="keep the model's own directions; else ELEVATION or wind take their place: "
-        "neighbours at one distance first get the mean of their weights",
+        help="keep the base model's preferred directions. Without this flag, ELEVATION or wind "
+        "replace them: neighbours at the same distance first get the mean of their weights",
     )
-    add("--variable", metavar="NAME", help="of NetCDF or .npz files that have several")
-    add("--band", type=int, metavar="N", help="of rasters that have several")
-    add("--nodata", type=float, action="append", metavar="X", help="a number for no value")
-    add("--name", help="of the model [the output's]")
+    add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
+    add("--band", type=int, metavar="N", help="the band, if a raster has several")
+    add("--nodata", type=float, action="append", metavar="X", help="a number that means no value")
+    add("--name", help="name of the model [the output file's]")
     add("--force", action="store_true", help="replace the output")
     return parser
 
@@ -161,21 +162,23 @@ def _make(flags: argparse.Namespace) -> None:
     for note in notes:
         print(shown(f"{flags.elevation}: {note}"))
     if "no_fly" in layers:
-        print(shown(f"{flags.no_fly}: {_told_no_fly(layers['no_fly'])}"))
+        print(shown(f"{flags.no_fly}: {_no_fly_summary(layers['no_fly'])}"))
 
 
 def _check_flags(flags: argparse.Namespace) -> None:
     if flags.out.suffix != ".toml":
-        raise invalid("--out", "a .toml", flags.out)
+        raise invalid("--out", "a .toml file", flags.out)
     if (flags.elevation, flags.zones, flags.no_fly) == (None, None, None):
-        raise InvalidArgumentError("rasters: expected ELEVATION, --zones or --no-fly, got none")
+        raise InvalidArgumentError(
+            "rasters: expected at least one of ELEVATION, --zones and --no-fly, got none"
+        )
     needs = dict.fromkeys(("cell", "height_unit", "oblong", "slope_step"), "elevation")
     needs |= dict.fromkeys(("unburnable", "missing_zone"), "zones")
     for flag, needed in needs.items():
         value = getattr(flags, flag)
         if value is not None and value is not False and getattr(flags, needed) is None:
             word = "ELEVATION" if needed == "elevation" else "--zones"
-            raise invalid(f"--{flag.replace('_', '-')}", f"{word} beside it", "none")
+            raise InvalidArgumentError(f"--{flag.replace('_', '-')}: applies only with {word}")
     flags.slope_step = 5.0 if flags.slope_step is None else flags.slope_step
     if not 0.1 <= flags.slope_step <= 90.0:
         raise invalid("--slope-step", "0.1 to 90 degrees", flags.slope_step)
@@ -186,7 +189,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
 
 
 def _check_wind(flags: argparse.Namespace) -> None:
-    """Also finds where the wind blows to, whichever flag says it."""
+    """Checks the wind's flags, and sets `wind_towards` from either of them."""
     if not 0.0 <= flags.wind_speed <= _MOST_WIND:
         raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
     if None not in (flags.wind_towards, flags.wind_from):
@@ -199,8 +202,8 @@ def _check_wind(flags: argparse.Namespace) -> None:
         flags.wind_towards = (270.0 - degrees) % 360.0
     if (flags.wind_speed > 0.0) != (flags.wind_towards is not None):
         raise InvalidArgumentError(
-            "wind: expected a --wind-speed above 0 and --wind-from (or --wind-towards), or "
-            "neither, got one of them"
+            "wind: expected both a --wind-speed above 0 and --wind-from (or --wind-towards), or "
+            "neither, got only one of them"
         )
     flags.wind_towards = flags.wind_towards or 0.0
     if not -360.0 <= flags.wind_towards <= 360.0:
@@ -208,7 +211,7 @@ def _check_wind(flags: argparse.Namespace) -> None:
 
 
 def _base(flags: argparse.Namespace) -> Table:
-    """The model whose kernels the zones get; also finds the state that spreads."""
+    """Returns the base model's file; sets `flags.state` to the state that spreads."""
     model = Model.named(flags.model)
     if flags.state is None:
         flags.state = model.state_names[model.target_state]
@@ -218,7 +221,7 @@ def _base(flags: argparse.Namespace) -> Table:
 
 
 def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
-    """The rasters by their flags, of one grid."""
+    """Reads the rasters, by the name of their flag; refuses different grids."""
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     layers = dict[str, Layer]()
     for key in ("elevation", "zones", "no_fly"):
@@ -234,7 +237,7 @@ def _check_grid(layer: Layer, first: Layer) -> None:
     if (height, width) != (rows, columns):
         expected = f"{height} x {width} cells as in {first.name}"
         raise invalid(layer.name, expected, f"{rows} x {columns}")
-    # NumPy's files do not say where their cells are.
+    # NumPy files do not state the positions of their cells.
     if layer.place.corner is not None and first.place.corner is not None:
         check_same(layer.place, layer.name, first.place, first.name)
 
@@ -242,18 +245,21 @@ def _check_grid(layer: Layer, first: Layer) -> None:
 def _zones(
     flags: argparse.Namespace, layers: dict[str, Layer], rise: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.uint8], list[Zone]]:
-    """The zone of each cell, and the zones."""
+    """Computes the zone of each cell, and the zones."""
     values = _whole(layers["zones"], flags.missing_zone) if "zones" in layers else None
     unburnable = flags.unburnable or ()
     missing = set(unburnable).difference(() if values is None else values.flat)
     if missing:
-        raise invalid("--unburnable", f"values that are in {flags.zones}", min(missing))
+        raise invalid("--unburnable", f"values that occur in {flags.zones}", min(missing))
     shape = next(iter(layers.values())).place.shape
     return zones(rise, values, shape=shape, step=flags.slope_step, unburnable=unburnable)
 
 
 def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
-    """Polygons burnt into a raster leave the rest without a value: robots may be there."""
+    """Returns the map of no-fly cells, by its key in the model file.
+
+    Cells without a value are free, as polygons burnt into a raster leave the rest without a value.
+    """
     if "no_fly" not in layers:
         return {}
     cells = np.nan_to_num(layers["no_fly"].values, nan=0.0) != 0.0
@@ -262,11 +268,11 @@ def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
     return {"no_fly": cells.astype(np.uint8)}
 
 
-def _told_no_fly(layer: Layer) -> str:
+def _no_fly_summary(layer: Layer) -> str:
     missing = np.isnan(layer.values)
     n_closed = np.count_nonzero(layer.values[~missing])
-    free = f"; of the others {missing.sum()} have no value" if missing.any() else ""
-    return f"robots may not be in {n_closed} cells{free}"
+    free = f"; {missing.sum()} of the other cells have no value" if missing.any() else ""
+    return f"{n_closed} no-fly cells{free}"
 
 
 def _layer(file: Path, choice: Choice) -> Layer:
@@ -278,7 +284,7 @@ def _layer(file: Path, choice: Choice) -> Layer:
     (layer,) = found
     height, width = layer.place.shape
     if max(height, width) > MAX_SIDE:
-        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes"
+        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum"
         raise invalid(layer.name, most, f"{height} x {width}")
     return layer
 
@@ -300,7 +306,10 @@ def _whole(layer: Layer, missing_zone: int | None) -> NDArray[np.int64]:
 def _map(
     key: str, cells: NDArray[np.uint8], flags: argparse.Namespace, contents: dict[Path, Fill]
 ) -> list[list[int]] | str:
-    """What stands in the model file; a large map is the name of a file, put into `contents`."""
+    """Returns the value of a map in the model file: its rows, or the name of a file if it is large.
+
+    Adds that file to `contents`.
+    """
     if cells.size <= _MOST_INLINE:
         return cells.tolist()
     file = flags.out.with_suffix(f".{key}.npy")
@@ -310,7 +319,7 @@ def _map(
 
 
 def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
-    """A comment that says what the file was made of."""
+    """Returns a comment that names the sources of the file."""
     files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
     wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
     return f"{_NAME}: {files}; model {ascii(flags.model)}; wind of {wind}"

@@ -1,4 +1,4 @@
-"""A layer: numbers with the place of their cells; and what the readers of all formats share."""
+"""Layers: numbers with the positions of their cells; and helpers of the readers of all formats."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.schedule import Clock, Time
 
-MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
+MOST_CELLS: Final = 1 << 27  # maximum number of cells of a layer: 1 GiB of doubles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
-    """What to take of each file."""
+    """The variable, band and missing values to read from each file, from the flags."""
 
     variable: str | None = None
     band: int | None = None
@@ -31,30 +31,30 @@ class Layer:
     name: str
     """File and band, for errors."""
     values: NDArray[np.float64]
-    """Shape (rows, columns), the first row in the north; NaN where the file has no value."""
+    """Shape (rows, columns), the first row in the north; NaN in cells without a value."""
     place: Place
     clock: Clock = Clock()
-    """What a number counts, if it is a time."""
+    """The unit of the values, if they are times."""
     flags: tuple[tuple[float, str], ...] = ()
-    """What single numbers mean, as far as the file says."""
+    """The meanings of single numbers, if the file has them."""
     time: Time | None = None
-    """When the layer is, if the file says."""
+    """The time of the layer, if the file has it."""
 
 
 def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:
-    """The wanted one of a file's variables, or the only one."""
+    """Returns the wanted variable of a file, or the only one."""
     if wanted is not None and wanted in names:
         return wanted
     known = ", ".join(sorted(names)) or "none"
     if wanted is not None:
-        raise invalid("--variable", f"one of {file} ({known})", f"'{wanted}'")
+        raise invalid("--variable", f"a variable of {file} ({known})", f"'{wanted}'")
     if len(names) != 1:
         raise invalid(file, "one variable", f"{len(names)} ({known}); choose with --variable")
     return names[0]
 
 
 def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
-    """The bands to read, counted from 1."""
+    """Returns the numbers of the bands to read, counted from 1."""
     if choice.band is None:
         return range(1, count + 1)
     if not 1 <= choice.band <= count:
@@ -63,7 +63,10 @@ def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
 
 
 def is_missing(stored: NDArray[Any], nodata: Sequence[float]) -> NDArray[np.bool_]:
-    """Where a file has one of these numbers, each rounded as the file has rounded its own."""
+    """Returns a mask of the cells that hold one of the `nodata` numbers.
+
+    The numbers are rounded to the type of the file's numbers first.
+    """
     missing = np.zeros(stored.shape, np.bool_)
     for number in nodata:
         with np.errstate(over="ignore"):
@@ -72,6 +75,6 @@ def is_missing(stored: NDArray[Any], nodata: Sequence[float]) -> NDArray[np.bool
 
 
 def check_cells(file: Path, height: int, width: int) -> None:
-    """Refuses layers that are too large, before they are read."""
+    """Refuses a layer that is too large, before it is read."""
     if height * width > MOST_CELLS:
         raise invalid(file, f"at most {MOST_CELLS} cells", f"{height} x {width}")

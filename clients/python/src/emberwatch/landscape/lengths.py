@@ -1,4 +1,4 @@
-"""Units of length, in the spellings of files and people."""
+"""Units of length, and their spellings in files and flags."""
 
 import re
 from typing import Final, NamedTuple
@@ -8,13 +8,13 @@ from emberwatch.errors import invalid
 METRES: Final = {
     "m": 1.0, "km": 1e3, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200 / 3937,
 }  # fmt: skip
-"""The length of each unit."""
+"""The length of each unit in metres."""
 NAMES: Final = {
     "m": "metres", "km": "kilometres", "dm": "decimetres", "cm": "centimetres",
     "mm": "millimetres", "ft": "international feet", "us-ft": "US survey feet",
 }  # fmt: skip
 
-#: Without spaces, and with `m` and `ft` for metre and foot in any number.
+#: Other spellings of units, without spaces, and with `m` and `ft` for metre(s) and foot or feet.
 _SPELLINGS: Final = {
     "kilom": "km", "decim": "dm", "centim": "cm", "millim": "mm", "internationalft": "ft",
     "usft": "us-ft", "ftus": "us-ft", "ussurveyft": "us-ft", "surveyft": "us-ft",
@@ -22,15 +22,15 @@ _SPELLINGS: Final = {
 
 
 class Side(NamedTuple):
-    """The side of a cell as a flag says it."""
+    """The side of a cell from a flag."""
 
     metres: float
     unit: str
-    """One of `METRES`."""
+    """The unit in the flag, a key of `METRES`."""
 
 
 def unit_named(words: str) -> str | None:
-    """One of `METRES`; None for other words."""
+    """Parses the name of a unit to a key of `METRES`; None for other words."""
     short = re.sub(r"[ _.()-]", "", words.lower())
     short = re.sub(r"met(?:re|er)s?", "m", re.sub("foot|feet", "ft", short))
     short = _SPELLINGS.get(short, short)

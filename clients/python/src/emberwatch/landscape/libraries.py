@@ -1,4 +1,4 @@
-"""The libraries that the extra `landscape` installs, imported when they are needed."""
+"""Imports of the libraries of the extra `landscape`, when they are needed."""
 
 import importlib
 from typing import Any
@@ -7,11 +7,10 @@ from emberwatch.errors import InvalidArgumentError
 
 
 def library(name: str, subject: object) -> Any:
-    """Imports a module; `subject` is what needs it, such as a file."""
+    """Imports a module; `subject` names what needs it in the error, such as a file."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InvalidArgumentError(
-            f"{subject}: expected {name} to read it with, got: {error}; "
-            "pip install emberwatch[landscape]"
+            f"{subject}: reading it needs {name}, got: {error}; pip install emberwatch[landscape]"
         ) from None

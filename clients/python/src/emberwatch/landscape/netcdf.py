@@ -1,7 +1,7 @@
-"""NetCDF files as layers.
+"""Reader of NetCDF files.
 
-What the CF conventions say of a variable and its coordinates is applied here, in `axes` and in
-`packing`, or refused by name.
+This module, `axes` and `packing` apply the CF conventions to a variable and its coordinates.
+Attributes that are not supported are refused by name.
 """
 
 import math
@@ -22,16 +22,16 @@ from emberwatch.landscape.libraries import library
 from emberwatch.landscape.packing import Attributes, attributes, unpacked
 from emberwatch.landscape.schedule import Clock, Time
 
-#: Attributes that name what is about another variable.
+#: Attributes that name auxiliary variables.
 _ABOUT: Final = ("bounds", "cell_measures", "climatology", "coordinates", "grid_mapping")
-#: Attributes by which numbers mean something else than cells at times.
+#: Attributes that are not supported, as they change the meaning of dimensions or times.
 _NOT_READ: Final = ("climatology", "compress", "coordinate_interpolation")
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
-    """The times of a variable; the file is open until the last of them, or until closed."""
+    """Yields a layer for each time of a variable. The file is closed after the last layer."""
     netcdf4 = library("netCDF4", file)
-    # Latin-1 keeps all bytes of the path, whatever the locale is.
+    # Latin-1 keeps all bytes of the path in any locale.
     path = os.fsencode(file.absolute()).decode("latin-1")
     try:
         with netcdf4.Dataset(path, encoding="latin-1") as dataset:
@@ -43,17 +43,17 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
             yield from _layers(file, variables[name], choice)
     except InvalidArgumentError:
         raise
-    except Exception as error:  # of netCDF4 and NumPy, for damaged bytes
+    except Exception as error:  # any type: netCDF4 and NumPy differ on damaged bytes
         words = getattr(error, "strerror", None) or error
         raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
 
 
 def _variables(dataset: Any) -> list[Any]:
-    """Those of numbers with rows and columns, but those about others."""
+    """Returns the numeric variables with rows and columns, without auxiliary variables."""
     dataset.set_auto_maskandscale(False)
     every = list(_all(dataset))
-    told = [attributes(variable) for variable in every]
-    words = " ".join(str(given.get(key, "")) for given in told for key in _ABOUT)
+    tables = [attributes(variable) for variable in every]
+    words = " ".join(str(given.get(key, "")) for given in tables for key in _ABOUT)
     about = {word.rpartition("/")[2] for word in words.replace(": ", " ").split()}
     return [
         variable
@@ -109,7 +109,7 @@ def _check_attributes(file: Path, *variables: Any) -> None:
 
 
 def _place(file: Path, variable: Any, axes: dict[str, Axis]) -> tuple[Place, tuple[slice, slice]]:
-    """Where the cells are, and how rows and columns are turned to the north-west."""
+    """Returns the grid of a variable, and slices that put the north-west cell first."""
     shape = variable.shape[axes["Y"].position], variable.shape[axes["X"].position]
     check_cells(file, *shape)
     if 0 in variable.shape:
@@ -141,19 +141,19 @@ def _place(file: Path, variable: Any, axes: dict[str, Axis]) -> tuple[Place, tup
 
 
 def _check_straight(file: Path, variable: Any, axes: dict[str, Axis]) -> None:
-    """Refuses rows and columns that are curves on the ground."""
+    """Refuses rows and columns with two-dimensional coordinates, which are curves on the ground."""
     sides = {axes["X"].name, axes["Y"].name}
     for found in auxiliary(variable):
         if sides <= {*found.dimensions} and letter_of(file, found) in ("X", "Y"):
             raise invalid(
                 file,
-                "coordinates of one dimension",
-                f"{found.name} over {', '.join(found.dimensions)}; reproject it",
+                "coordinates with one dimension",
+                f"{found.name} with {', '.join(found.dimensions)}; reproject it",
             )
 
 
 def _mapping(variable: Any, column: str) -> Attributes:
-    """The attributes of the grid mapping: the only one, or that of the columns."""
+    """Returns the attributes of the grid mapping: the only one, or the columns' grid mapping."""
     words = str(attributes(variable).get("grid_mapping", "")).split()
     name = named = ""
     for word in words:
@@ -166,7 +166,10 @@ def _mapping(variable: Any, column: str) -> Attributes:
 
 
 def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str | None:
-    """As well-known text, or in the words of a grid mapping that pyproj does not know."""
+    """Returns the projection as well-known text.
+
+    A grid mapping that pyproj does not know becomes a text of its attributes, only to be compared.
+    """
     pyproj = library("pyproj", file)
     text = mapping.get("crs_wkt") or mapping.get("spatial_ref")
     if text:
@@ -176,27 +179,30 @@ def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str 
     name = mapping.get("grid_mapping_name", "grid mapping")
     try:
         return pyproj.CRS.from_cf({"projected_crs_name": name} | dict(mapping)).to_wkt()
-    except Exception:  # of pyproj, for attributes of any name and kind
-        told = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
-        return f'"{name}" {told}'
+    except Exception:  # any type: pyproj may fail on any unexpected attribute
+        words = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
+        return f'"{name}" {words}'
 
 
 def _share(file: Path, projection: str | None, unit: str) -> float:
-    """What metres or degrees are multiplied by to be in the unit of the projection."""
+    """Returns the factor that converts metres or degrees to the unit of the projection."""
     known = None if projection is None else unit_of(projection)
     if known is None or not unit:
         return 1.0
     length, is_angle = known
     if is_angle != (unit == "degrees"):
         words = ("metres", "degrees") if is_angle else ("degrees", "metres")
-        raise invalid(file, f"coordinates in {words[1]}, as its grid mapping is", words[0])
+        raise invalid(file, f"coordinates in {words[1]}, the unit of its grid mapping", words[0])
     return (math.radians(1.0) if is_angle else 1.0) / length
 
 
 def _times(
     file: Path, variable: Any, time: Axis | None
 ) -> tuple[NDArray[np.float64] | None, Clock]:
-    """When the layers are, along a dimension or of a scalar; None if the file does not say."""
+    """Returns the times of the layers and their clock, from a dimension or a scalar coordinate.
+
+    The times are None if the file has none.
+    """
     if time is not None:
         found = time.coordinate
     else:
@@ -209,7 +215,7 @@ def _times(
 
 
 def _is_time(file: Path, scalar: Any) -> bool:
-    """A forecast has other times, such as that of its reference."""
+    """Returns whether a scalar is the time of the layer, not, for example, a reference time."""
     standard_name = attributes(scalar).get("standard_name", "time")
     return standard_name == "time" and letter_of(file, scalar) == "T"
 

@@ -1,4 +1,4 @@
-"""NumPy files as layers: the whole array is in memory."""
+"""Reader of NumPy files, which holds the whole array in memory."""
 
 import math
 import zipfile
@@ -21,11 +21,11 @@ from emberwatch.landscape.layers import (
     is_missing,
 )
 
-MOST_BYTES: Final = 1 << 32  # of an array
+MOST_BYTES: Final = 1 << 32  # maximum size of an array, bytes
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
-    """The layers of its one array, or of that of a name."""
+    """Yields the layers of the only array in a file, or of the array of the chosen name."""
     array = _array(file, choice)
     array = array.reshape(-1, *array.shape[-2:])
     for band in choose_bands(file, len(array), choice):
@@ -49,18 +49,19 @@ def _array(file: Path, choice: Choice) -> NDArray[Any]:
                     with archive.open(members[name]) as member:
                         return _checked_array(file, member)
             if choice.variable is not None:
-                raise invalid(
-                    "--variable", f"none for {file}, which has one array", f"'{choice.variable}'"
+                raise InvalidArgumentError(
+                    f"--variable: {file} has only one array, without a name, got "
+                    f"'{choice.variable}'; leave the flag out"
                 )
             return _checked_array(file, opened)
     except InvalidArgumentError:
         raise
-    except Exception as error:  # of NumPy, zipfile, zlib and tokenize, for damaged bytes
+    except Exception as error:  # any type: NumPy, zipfile, zlib and tokenize on damaged bytes
         raise InvalidArgumentError(f"{file}: expected a NumPy file, got: {error}") from None
 
 
 def _checked_array(file: Path, opened: IO[bytes]) -> NDArray[Any]:
-    """The array, whose header is checked before its values are read."""
+    """Reads an array, after a check of its header."""
     opened.seek(0)
     version = read_magic(opened)
     header = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}.get(version)

@@ -1,4 +1,4 @@
-"""What the numbers of a NetCDF variable mean, as its attributes say."""
+"""Decoding of the packed numbers of a NetCDF variable, from its attributes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -12,11 +12,11 @@ from emberwatch.landscape.libraries import library
 
 Attributes = Mapping[str, Any]
 
-_ROUNDED: Final = 1e-3  # share of a packed unit by which an unpacked limit may be rounded
+_ROUNDED: Final = 1e-3  # tolerance of unpacked limits, which are rounded, as a share of a unit
 
 
 def attributes(variable: Any) -> dict[str, Any]:
-    """All that a variable says of itself."""
+    """Returns all attributes of a variable."""
     return {name: variable.getncattr(name) for name in variable.ncattrs()}
 
 
@@ -24,7 +24,7 @@ def attributes(variable: Any) -> dict[str, Any]:
 def unpacked(
     name: str, stored: NDArray[Any], given: Attributes, nodata: Sequence[float] = ()
 ) -> NDArray[np.float64]:
-    """The numbers that were packed; NaN where one is missing or beyond a limit."""
+    """Decodes packed numbers; NaN for missing numbers and numbers beyond a limit."""
     if stored.dtype.kind not in "iuf":
         raise invalid(name, "real numbers", stored.dtype)
     stored, given = _signed(name, stored, given)
@@ -35,7 +35,7 @@ def unpacked(
     values = packed * (scale[0] if scale.size else 1.0) + (offset[0] if offset.size else 0.0)
     wide = np.result_type(*scale, *offset) if scale.size or offset.size else None
     for key, limit, sign in _limits(name, given):
-        # A limit has the type, and so the unit, of the packed numbers or of the unpacked ones.
+        # The type of a limit shows whether it is a packed or an unpacked number.
         are_whole = {limit.dtype.kind, stored.dtype.kind} <= {"i", "u"}
         if wide is not None and limit.dtype == wide != stored.dtype:
             slack = _ROUNDED * abs(float(scale[0])) if scale.size else 0.0
@@ -52,10 +52,10 @@ def unpacked(
 
 
 def _signed(name: str, stored: NDArray[Any], given: Attributes) -> tuple[NDArray[Any], Attributes]:
-    """Numbers and attributes with the sign that `_Unsigned` gives them, in our byte order."""
+    """Returns numbers and attributes in native byte order, with the sign from `_Unsigned`."""
     stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
     kind = stored.dtype
-    if kind.itemsize > 1:  # what was never written; each byte may be a number
+    if kind.itemsize > 1:  # the default fill value; single bytes have none
         fill = library("netCDF4", name).default_fillvals[kind.str[1:]]
         given = {"_FillValue": np.array(fill, kind)} | dict(given)
     sign = {"true": "u", "false": "i"}.get(str(given.get("_Unsigned")).lower())
@@ -69,7 +69,7 @@ def _signed(name: str, stored: NDArray[Any], given: Attributes) -> tuple[NDArray
 
 
 def _limits(name: str, given: Attributes) -> Iterator[tuple[str, Any, int]]:
-    """The attribute, its number, and 1 for an upper limit or -1 for a lower one."""
+    """Yields the limits: attribute, number, and 1 for an upper limit or -1 for a lower one."""
     both = _numbers(name, given, "valid_range", 2)
     if both.size == 1:
         raise invalid(f"{name}, valid_range", "two numbers", both[0])

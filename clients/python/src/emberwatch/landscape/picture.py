@@ -1,4 +1,4 @@
-"""A picture of a sequence: steps from the first to the last, and how many cells burn."""
+"""A picture of a sequence: some of its steps, and a curve of the burning cells."""
 
 from typing import Any, Final, cast
 
@@ -9,14 +9,14 @@ from PIL import Image, ImageDraw, ImageFont
 from emberwatch.landscape.fire import BURNING, BURNT
 from emberwatch.landscape.world import COLORS, STATES
 
-_COLUMNS, _ROWS = 4, 2  # of panels
+_COLUMNS, _ROWS = 4, 2  # number of panels
 _SIDE, _GAP, _LINE, _CURVE = 220, 12, 20, 110  # pixels
 _PAPER, _INK, _EDGE = (0xFF, 0xFF, 0xFF), (0x33, 0x33, 0x33), (0x99, 0x99, 0x99)
 _TEXT: Final = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13))
 
 
 def draw(sequences: list[NDArray[np.uint8]], title: str) -> Image.Image:
-    """All sequences, one below the other."""
+    """Draws all sequences, one below the other."""
     parts = [
         _draw_one(states, title if len(sequences) == 1 else f"{title}, sequence {number}")
         for number, states in enumerate(sequences)
@@ -52,16 +52,16 @@ def _draw_one(states: NDArray[np.uint8], title: str) -> Image.Image:
 
 
 def _draw_curve(pen: Any, states: NDArray[np.uint8], corner: tuple[int, int], width: int) -> None:
-    """The share of cells that burn and that are burnt, over the steps."""
+    """Draws the shares of burning and of burnt cells over the steps."""
     left, top = corner
     at = np.linspace(0, len(states) - 1, width).round().astype(int)
     shares = {state: (states == state).mean(axis=(1, 2)) for state in (BURNING, BURNT)}
     most = max(1e-9, *(float(share.max()) for share in shares.values()))
     pen.rectangle((left, top, left + width, top + _CURVE), None, _EDGE)
-    told = list[str]()
+    maxima = list[str]()
     for state, share in shares.items():
         ys = top + _CURVE - share[at] / most * (_CURVE - 4)
         points = [(left + x, round(float(y))) for x, y in enumerate(ys)]
         pen.line(points, COLORS[state], 2)
-        told.append(f"{STATES[state].name} at most {100 * float(share.max()):.1f} %")
-    pen.text((left, top + _CURVE + 2), f"share of cells: {', '.join(told)}", _INK, _TEXT)
+        maxima.append(f"{STATES[state].name} at most {100 * float(share.max()):.1f} %")
+    pen.text((left, top + _CURVE + 2), f"share of cells: {', '.join(maxima)}", _INK, _TEXT)

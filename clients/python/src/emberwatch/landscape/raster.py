@@ -1,4 +1,4 @@
-"""GeoTIFF and ESRI ASCII grids as layers, read by GDAL through rasterio."""
+"""Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rasterio."""
 
 import contextlib
 import warnings
@@ -16,22 +16,22 @@ from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands
 from emberwatch.landscape.libraries import library
 from emberwatch.landscape.schedule import Clock
 
-#: First words of the lines before an ESRI ASCII grid's numbers.
+#: First words of the header lines of an ESRI ASCII grid.
 _ASCII_HEADER: Final = frozenset(
     "ncols nrows xllcorner yllcorner xllcenter yllcenter cellsize dx dy nodata_value".split()
 )
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
-    """The bands; the file is open until the last of them, or until closed."""
+    """Yields the bands of a file, which is closed after the last one."""
     if choice.variable is not None:
-        raise invalid(
-            "--variable", f"none for {file}, which has no variables", f"'{choice.variable}'"
+        raise InvalidArgumentError(
+            f"--variable: {file} has no variables, got '{choice.variable}'; leave the flag out"
         )
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
     rasterio, errors = library("rasterio", file), library("rasterio.errors", file)
-    # What has no place is a grid without one; GDAL's other warnings are of no use to people.
+    # A file without a position is a valid grid, and GDAL's other warnings do not help users.
     with warnings.catch_warnings(action="ignore"):
         try:
             with rasterio.open(Path(utf8("file", file.absolute())), driver=driver) as source:
@@ -53,12 +53,12 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
 
 
 def _place(file: Path, source: Any) -> Place:
-    """Where the cells are; a file that does not say so has the identity as its transform."""
+    """Returns the grid of a file. The identity as transform means that it has no position."""
     check_cells(file, source.height, source.width)
     (height, width), transform, crs = source.shape, source.transform, source.crs
     if transform.is_identity:
         return Place(shape=source.shape)
-    # Over the whole extent: rotations by tiny angles are rounding.
+    # Measured over the whole extent, as rotations by tiny angles are rounding errors.
     skewed = abs(transform.b) * height, abs(transform.d) * width
     if skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e):
         raise invalid(file, "rows from west to east", "a rotated grid")
@@ -79,13 +79,13 @@ def _values(file: Path, source: Any, band: int, nodata: Sequence[float]) -> NDAr
     values = stored.data.astype(np.float64) * source.scales[band - 1] + source.offsets[band - 1]
     values[stored.mask | is_missing(stored.data, nodata)] = np.nan
     southward, eastward = source.transform.e < 0, source.transform.a > 0
-    if source.transform.is_identity:  # the first row is the first
+    if source.transform.is_identity:  # no position: the rows stay in their order
         return values
     return values[:: 1 if southward else -1, :: 1 if eastward else -1].copy()
 
 
 def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArray[np.float64]:
-    """The numbers of an ASCII grid; GDAL fills up or cuts them, and takes words as 0."""
+    """Parses an ASCII grid. GDAL would pad or cut its numbers, and read words as 0."""
     rows, never = list[NDArray[np.float64]](), ""
     with file.open(encoding="ascii", errors="replace") as lines:
         for line in lines:
@@ -100,7 +100,7 @@ def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArr
         raise invalid(file, wanted, values.size)
     with contextlib.suppress(ValueError):
         nodata = (*nodata, float(never))
-    with np.errstate(over="ignore"):  # as 32 bits, of which the header may have fewer digits
+    with np.errstate(over="ignore"):  # compared as 32 bits, as the header may round its number
         values[is_missing(values.astype(np.float32), nodata)] = np.nan
     return values.reshape(shape)
 
@@ -110,5 +110,5 @@ def _number(file: Path, word: str, never: str) -> float:
         return np.nan if word == never else float(word)
     except ValueError:
         raise invalid(
-            file, "numbers", f"'{word[:40]}'; NODATA_value names a word for no value"
+            file, "numbers", f"'{word[:40]}'; NODATA_value can define a word for no value"
         ) from None

@@ -1,4 +1,4 @@
-"""What times in files count (`hours since 2020-08-01`), and in which step each layer shows."""
+"""Times in files, such as `hours since 2020-08-01`, and the step that first shows each layer."""
 
 import math
 import re
@@ -13,17 +13,17 @@ from emberwatch.errors import InvalidArgumentError, invalid
 SECONDS: Final = {
     "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9
 }  # fmt: skip
-"""Of each unit."""
+"""The length of each unit in seconds."""
 EVEN: Final = 1e-3
-"""Share of a step by which times may differ, as 32-bit numbers do."""
+"""Tolerance of times, as a share of a step: 32-bit numbers are rounded."""
 
 _SPELLINGS: Final = {
     "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d",
     "msec": "ms", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
 }  # fmt: skip
-#: Calendars whose dates are ours.
+#: Calendars whose dates are Gregorian from the year `_GREGORIAN` on.
 _CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
-_GREGORIAN: Final = 1583  # the first year in which they mean the same days
+_GREGORIAN: Final = 1583  # the first year in which these calendars agree
 _DATE: Final = re.compile(
     r"(\d{4})-(\d{1,2})-(\d{1,2})(?:[T ]+(\d{1,2})(?::(\d{1,2}))?(?::(\d{1,2})(?:\.\d*)?)?)?"
     r"\s*(?:Z|UTC|GMT|([+-])(\d{1,2})(?::?(\d{2}))?)?"
@@ -31,18 +31,18 @@ _DATE: Final = re.compile(
 
 
 class Clock(NamedTuple):
-    """What the times in a file count, in its words."""
+    """The unit and origin of times, in the words of the file."""
 
     words: str = ""
     calendar: str = "standard"
 
     def unit(self) -> str | None:
-        """One of `SECONDS`; None if the file does not say."""
+        """Returns the unit, a key of `SECONDS`; None if the file does not have it."""
         unit = _unit(self.words.partition(" since ")[0])
         return unit if unit in SECONDS else None
 
     def date(self, seconds: float) -> datetime | None:
-        """So long after the count was 0."""
+        """Returns the date `seconds` after time 0; None if the date of time 0 is unknown."""
         epoch = self.epoch()
         try:
             return None if epoch is None else epoch + timedelta(seconds=seconds)
@@ -50,7 +50,7 @@ class Clock(NamedTuple):
             return None
 
     def epoch(self) -> datetime | None:
-        """When the count is 0; None if the file does not say, or in another calendar."""
+        """Returns the date of time 0; None if it is missing or in another calendar."""
         parts = _DATE.fullmatch(self.words.partition(" since ")[2].strip())
         if parts is None or self.calendar.lower() not in _CALENDARS:
             return None
@@ -62,32 +62,32 @@ class Clock(NamedTuple):
             ahead = timedelta(hours=int(hours), minutes=int(minutes))
             zone = timezone(-ahead if sign == "-" else ahead)
             return datetime(*numbers, tzinfo=zone).astimezone(UTC)
-        except (OverflowError, ValueError):  # no such day, or one beyond the years 1 to 9999
+        except (OverflowError, ValueError):  # not a day, or outside the years 1 to 9999
             return None
 
 
 class Time(NamedTuple):
-    """When a layer is."""
+    """The time of a layer."""
 
     value: float
     clock: Clock
 
 
 class Schedule:
-    """The times of layers, one after the other."""
+    """The times of the layers of one fire, in order."""
 
     def __init__(self, *, step: float, every: int, unit: str | None) -> None:
-        """Before the first layer. `step`: in seconds; `unit`: None if the files say."""
+        """Starts without layers. `step`: seconds; `unit`: the wanted unit, None for the file's."""
         self._step, self._every, self._wanted = step, every, unit
         self._first_name, self._clock = "", None
         self._unit: str | None = None
-        self._told = ""
+        self._last_time = ""
         self._times = list[float]()
         self.begin: datetime | None = None
-        """When step 0 is, if the files say."""
+        """The date of step 0, if the files have it."""
 
     def add(self, name: str, time: Time | None) -> None:
-        """Refuses a layer that is not later than those before."""
+        """Adds a layer; refuses one that is not later than the previous layers."""
         unit = None if time is None else unit_of(time.clock, self._wanted, name)
         clock = None if time is None else time.clock
         if not self._times:
@@ -103,12 +103,12 @@ class Schedule:
         self._times.append(seconds if date is None else date.timestamp())
         if len(self._times) == 1:
             self.begin = date
-        told = str(date or f"{time.value:.6g}")
-        self._check_order(name, told)
-        self._told = told
+        shown_time = str(date or f"{time.value:.6g}")
+        self._check_order(name, shown_time)
+        self._last_time = shown_time
 
     def steps(self) -> tuple[NDArray[np.float64], int]:
-        """The first step that shows each layer, and how many steps there are."""
+        """Returns the first step that shows each layer, and the number of steps."""
         if self._unit is None:
             after, step = np.arange(len(self._times), dtype=np.float64), self._every
         else:
@@ -119,14 +119,17 @@ class Schedule:
     def _check_flags(self) -> None:
         if self._unit is not None and self._every != 1:
             raise InvalidArgumentError(
-                f"--every: expected none, as {self._first_name} tells the times of its layers and "
-                f"--step chooses among them, got {self._every}"
+                f"--every: applies only to layers without times, got --every {self._every}: "
+                f"{self._first_name} has the time of each layer, and --step chooses among them"
             )
         if self._clock is None and self._wanted is not None:
-            raise invalid("--unit", f"none, as {self._first_name} has no times", self._wanted)
+            raise InvalidArgumentError(
+                f"--unit: {self._first_name} has no times, got --unit {self._wanted}; leave the "
+                "flag out"
+            )
 
     def _check_clock(self, name: str, clock: Clock | None) -> None:
-        """Refuses times that cannot be compared with those of the first layer."""
+        """Refuses times that cannot be compared with the first layer's time."""
         both = clock, self._clock
         if any(one is None or one.unit() is None or one.epoch() is None for one in both):
             first, got = (
@@ -135,21 +138,21 @@ class Schedule:
             )
             raise invalid(name, f"{first} as in {self._first_name}", got)
 
-    def _check_order(self, name: str, told: str) -> None:
+    def _check_order(self, name: str, shown_time: str) -> None:
         if len(self._times) < 2:
             return
         step, first = self._times[-1] - self._times[-2], self._times[1] - self._times[0]
         if step <= 0:
-            raise invalid(name, f"a later time than {self._told}", told)
+            raise invalid(name, f"a later time than {self._last_time}", shown_time)
         if self._unit is None and abs(step - first) > EVEN * first:
             raise InvalidArgumentError(
-                f"{name}: expected steps of {first:.6g} in time, got {step:.6g}; --unit says what "
-                "the times count"
+                f"{name}: expected times {first:.6g} apart, like the first ones, got {step:.6g}; "
+                "to allow this, give the unit of times with --unit"
             )
 
 
 def length(text: str) -> float:
-    """Seconds of a length of time such as `10 min`."""
+    """Parses a length of time such as `10 min` to seconds."""
     number, _, unit = text.strip().partition(" ")
     try:
         seconds = float(number) * SECONDS[_unit(unit)]
@@ -161,24 +164,24 @@ def length(text: str) -> float:
 
 
 def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """The first step that is not before each time, counted from 0; infinite ones stay."""
+    """Returns the first step at or after each time, counted from 0; infinite times stay."""
     with np.errstate(over="ignore"):
         steps = np.ceil(times / step - EVEN)
     if (np.isinf(steps) & np.isfinite(times)).any():
         raise InvalidArgumentError(
-            f"--step: expected a share of {times[np.isfinite(times)].max():.6g}, the last time, "
-            f"got {step:.6g}"
+            f"--step: too short for times up to {times[np.isfinite(times)].max():.6g}, got "
+            f"{step:.6g}"
         )
     return steps
 
 
 def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
-    """What the times count, as the flag or the file says."""
+    """Returns the unit of times from the flag or the file; refuses two different units."""
     in_file = clock.unit()
     if None not in (wanted, in_file) and wanted != in_file:
         raise invalid("--unit", f"{in_file}, as in {name}", wanted)
     if wanted is None and in_file is None and clock.words.strip() not in ("", "1"):
-        got = f"'{clock.words}'; --unit says what they count"
+        got = f"'{clock.words}'; give the unit with --unit"
         raise invalid(name, "times in days or smaller units", got)
     return wanted or in_file
 

@@ -1,4 +1,4 @@
-"""Slope, aspect and wind of land: which cells are alike, and how fire spreads over them.
+"""Zones of land with similar slope and aspect, and the spread of fire over slopes and in wind.
 
 Alexandridis, Vakalis, Siettos and Bafas (2008), "A cellular automata model for forest fire spread
 prediction", Applied Mathematics and Computation 204, 191-201, doi 10.1016/j.amc.2008.06.046.
@@ -16,11 +16,11 @@ from emberwatch.errors import InvalidArgumentError
 from emberwatch.landscape.compass import facing
 
 MAX_ZONES: Final = 256
-"""As many as the byte of a cell in a map of zones tells apart."""
+"""Number of different bytes: a map of zones has one byte for each cell."""
 
-_A: Final = 0.078  # per degree of slope
-_C1, _C2 = 0.045, 0.131  # per m/s of wind
-_WATER: Final = "#6d8594"  # what never burns
+_A: Final = 0.078  # coefficient of slope, per degree
+_C1, _C2 = 0.045, 0.131  # coefficients of wind, per m/s
+_WATER: Final = "#6d8594"  # colour of zones that never burn
 _ASPECTS: Final = (
     "east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east"
 )  # fmt: skip
@@ -33,15 +33,15 @@ class Zone:
     name: str
     color: str
     rise: NDArray[np.float64]
-    """Metres per metre to the east and to the north, shape (2,): the mean of its cells."""
+    """Mean slope of its cells, metres per metre to the east and to the north, shape (2,)."""
     burns: bool = True
 
 
 def gradient(elevation: NDArray[np.float64], width: float, height: float) -> NDArray[np.float64]:
-    """Metres of rise per metre to the east and to the north, shape (2, H, W).
+    """Returns the slope of each cell in metres per metre, to the east and north, shape (2, H, W).
 
-    `elevation`: shape (H, W), in metres, the first row in the north; `width` and `height`: of a
-    cell on the ground, in metres. Central differences, one-sided at the edges.
+    `elevation`: heights in metres, shape (H, W), the first row in the north. `width` and `height`:
+    size of a cell on the ground in metres. Uses central differences, one-sided at the edges.
     """
     southward, eastward = np.gradient(elevation, height, width)
     return np.stack([eastward, -southward])
@@ -55,11 +55,12 @@ def zones(
     step: float,
     unburnable: Sequence[int] = (),
 ) -> tuple[NDArray[np.uint8], list[Zone]]:
-    """The zone of each cell, shape (H, W), and the zones.
+    """Groups cells into zones; returns the zone of each cell, shape (H, W), and the zones.
 
-    `rise`: as `gradient` makes it; cells are alike if their slopes round to the same multiple of
-    `step` degrees and they rise to the same of eight aspects. `values`: shape (H, W); cells of
-    different values are never alike, and those of the values `unburnable` never burn.
+    `rise`: the slopes, as from `gradient`. Two cells are in the same zone if their slopes round to
+    the same multiple of `step` degrees, and rise in the same of eight directions. `values`: shape
+    (H, W); cells with different values are in different zones, and cells whose value is in
+    `unburnable` never burn.
     """
     labels = np.zeros(shape, np.int64) if values is None else values
     slopes = np.zeros((2, *shape)) if rise is None else rise
@@ -89,15 +90,15 @@ def zones(
 def factors(
     rise: NDArray[np.float64], speed: float, towards: float, size: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """What slope and wind multiply the weight of a burning neighbour with, shape (KH, KW).
+    """Returns the factors of slope and wind for the weights of burning neighbours, (KH, KW).
 
-    `rise`: to the east and to the north, shape (2,); `speed`: of the wind, in m/s; `towards`: where
-    it blows to, in degrees from the east towards the north; `size`: of the kernel, whose centre
-    gets 1.
+    `rise`: slope to the east and to the north, shape (2,). `speed`: wind speed in m/s. `towards`:
+    the direction to which the wind blows, in degrees from the east towards the north. `size`: size
+    of the kernel; the factor of its centre is 1.
     """
     rows, columns = np.indices(size) - np.reshape(size, (2, 1, 1)) // 2
     distance = np.hypot(rows, columns)
-    # Fire comes from the neighbour: from one below, it goes north.
+    # Fire moves from the neighbour to the cell: from a neighbour below, it moves north.
     directions = np.stack([-columns, rows]) / np.where(distance > 0, distance, 1.0)
     slope = np.degrees(np.arctan(np.tensordot(rise, directions, 1)))
     wind = np.cos(np.radians(towards)), np.sin(np.radians(towards))
@@ -109,11 +110,11 @@ def factors(
 def _kinds(
     labels: NDArray[np.int64], slopes: NDArray[np.float64], step: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Value, steps of slope and aspect of each kind of cell, shape (Z, 3); and each cell's kind."""
+    """Returns value, slope in steps and aspect of each zone, shape (Z, 3), and each cell's zone."""
     steps = np.rint(np.degrees(np.arctan(np.hypot(*slopes))) / step).astype(np.int64)
     aspects = np.rint(np.arctan2(slopes[1], slopes[0]) / (np.pi / 4)).astype(np.int64) % 8
     values, places = np.unique(labels, return_inverse=True)
-    # One number a cell: NumPy takes about 30 times as long for rows of three.
+    # One number for each cell, as NumPy takes about 30 times as long for rows of three numbers.
     keys = (places.ravel(), steps.ravel(), np.where(steps > 0, aspects, 0).ravel())
     sizes = values.size, int(steps.max()) + 1, 8
     kinds, cells = np.unique(np.ravel_multi_index(keys, sizes), return_inverse=True)
@@ -128,13 +129,16 @@ def _slope_name(degrees: float, aspect: int) -> str:
 
 
 def _color(degrees: float, aspect: int) -> str:
-    """Aspect as hue; the steeper, the darker and the less grey. Muted, as states lie over it."""
+    """Returns a zone's colour: hue by aspect, darker and less grey if steeper.
+
+    All are muted, so that the colours of states stand out.
+    """
     steep = min(degrees / 40, 1.0)
     return _hex(aspect / 8, 0.7 - 0.3 * steep, 0.1 + 0.25 * steep if degrees > 0 else 0.0)
 
 
 def _of_value(value: int) -> str:
-    """Hues by the golden ratio: values side by side differ most."""
+    """Returns the colour of a value. Hues step by the golden ratio, so that close values differ."""
     return _hex(value * 0.618034 % 1.0, 0.6, 0.2)
 
 

@@ -1,4 +1,4 @@
-"""A model file with zones, made of a base model without: each zone gets kernels of its own."""
+"""Model files with zones, made from a base model without zones: each zone gets its own kernels."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -15,28 +15,29 @@ Table = dict[str, Any]
 
 
 def check_base(base: Table, zones: Sequence[Zone], state: str, *, is_changed: bool) -> None:
-    """Refuses a base whose kernels do not fit; `is_changed`: whether slope or wind count."""
+    """Refuses an unsuitable base model; `is_changed`: whether slope or wind change its kernels."""
     subject, names = f"model {quoted(base['name'])}", [entry["name"] for entry in base["states"]]
     for key in ("zones", "zone_map", "no_fly"):
         if key in base:
-            raise invalid(subject, f"no {key}", "some")
+            raise invalid(subject, f"a base model without `{key}`", "one with it")
     if state not in names:
         raise invalid("--state", f"one of {', '.join(names)}", f"'{state}'")
     if is_changed and not any(_spreads(entry, state) for entry in base["kernel"]):
         expected = f"a kernel by which '{state}' spreads to neighbours"
-        raise invalid(subject, expected, "none; --state names another state")
+        raise invalid(subject, expected, "none; choose another state with --state")
     biased = [entry["name"] for entry in base["states"][1:] if entry.get("bias", 0.0) > 0.0]
     if biased and not all(zone.burns for zone in zones):
-        raise invalid("--unburnable", f"no bias but of '{names[0]}'", f"one of '{biased[0]}'")
+        expected = f"a model in which only '{names[0]}' has a bias"
+        raise invalid("--unburnable", expected, f"one in which '{biased[0]}' has a bias")
 
 
 def kernels(
     base: Table, zone: Zone, state: str, speed: float, towards: float, *, is_even: bool
 ) -> list[Table]:
-    """The kernel entries of a zone.
+    """Returns the kernel entries of a zone.
 
-    Slope and wind change how `state` spreads to neighbours. `is_even`: neighbours at one distance
-    first get the mean of their weights.
+    Slope and wind change the spread of `state` to neighbours. `is_even`: whether neighbours at the
+    same distance first get the mean of their weights.
     """
     entries = list[Table]()
     for entry in base["kernel"] if zone.burns else _to_first_state(base):
@@ -45,14 +46,14 @@ def kernels(
             weights = _even(weights)
         if _spreads(entry, state):
             weights *= factors(zone.rise, speed, towards, weights.shape)
-        # Nobody knows more than six digits of a fire.
+        # Six digits are more precise than any knowledge of a fire.
         rows = [[float(f"{weight:.6g}") for weight in row] for row in weights.tolist()]
         entries.append({"zone": zone.name} | entry | {"weights": rows})
     return entries
 
 
 def toml(model: Mapping[str, Any]) -> str:
-    """The text of a model file: tables stand last, as TOML demands."""
+    """Returns the text of a model file. Tables come last, as TOML requires."""
     lines, tables = list[str](), list[str]()
     for key, value in model.items():
         match value:
@@ -62,15 +63,15 @@ def toml(model: Mapping[str, Any]) -> str:
                 for table in cast("list[Table]", value):
                     tables += ["", f"[[{key}]]", *_items(table)]
             case [list(), *_]:
-                rows = [f"  {_told(row)}," for row in cast("list[Any]", value)]
+                rows = [f"  {_value(row)}," for row in cast("list[Any]", value)]
                 lines += [f"{key} = [", *rows, "]"]
             case _:
-                lines.append(f"{key} = {_told(value)}")
+                lines.append(f"{key} = {_value(value)}")
     return "\n".join(lines + tables) + "\n"
 
 
 def _spreads(entry: Table, state: str) -> bool:
-    """Whether by this entry neighbours in a state bring cells of other states into it."""
+    """Returns whether an entry makes cells of other states change to `state` by its neighbours."""
     weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
     weights[weights.shape[0] // 2, weights.shape[1] // 2] = 0.0
     return entry["from"] == entry["to"] == state != entry.get("own") and bool(weights.any())
@@ -84,7 +85,7 @@ def _even(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _to_first_state(base: Table) -> list[Table]:
-    """Kernels by which a cell becomes the first state, whatever is around it."""
+    """Returns kernels that move a cell to the first state, whatever its neighbours are."""
     names = [state["name"] for state in base["states"]]
     height, width = base["kernel_size"]
     weights = np.zeros((height, width))
@@ -98,10 +99,10 @@ def _to_first_state(base: Table) -> list[Table]:
 
 
 def _items(table: Mapping[str, Any]) -> list[str]:
-    return [f"{key} = {_told(value)}" for key, value in table.items()]
+    return [f"{key} = {_value(value)}" for key, value in table.items()]
 
 
-def _told(value: Any) -> str:
+def _value(value: Any) -> str:
     match value:
         case bool():
             return str(value).lower()
@@ -110,6 +111,6 @@ def _told(value: Any) -> str:
         case dict():
             return f"{{ {', '.join(_items(cast('Table', value)))} }}"
         case list():
-            return f"[{', '.join(map(_told, cast('list[Any]', value)))}]"
+            return f"[{', '.join(map(_value, cast('list[Any]', value)))}]"
         case _:
             return repr(value)

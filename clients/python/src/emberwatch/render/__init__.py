@@ -1,8 +1,8 @@
-"""Pictures of one world: what was seen along the path, beside the truth where it is known.
+"""Pictures of one world: the last frame, the path, and the hidden states if they are known.
 
-`rgb_array` and `ansi` are pure: arrays in, a picture or a text out. `Screen` shows either to
-people, for ``render_mode="human"``. The path of one robot is dark or light, whichever is further
-from the colours below it, and the robot a circle of both; each robot of a team has a colour.
+`rgb_array` returns an image, and `ansi` a text. `Screen` shows either to people, for
+``render_mode="human"``. The path of a single robot is dark or light, whichever has more contrast to
+the colours below it, and the robot is a circle of both. Each robot of a team has its own colour.
 """
 
 import contextlib
@@ -27,24 +27,25 @@ from emberwatch.render.palette import Palette as Palette
 from emberwatch.render.scenery import Scenery
 
 _EDGE = (0xB4, 0xB4, 0xB4)
-_LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
+_LONG_SIDE = 512  # default length of a panel's longer side, pixels; approximate
 _GAP = 8  # pixels between panels
-LEAST_LINE_SCALE = 3  # pixels a cell needs to show its colour beside a line
-_LEAST_RIM_SCALE = 12  # the same with a rim around the line
-_TINT = 0.45  # share of white in visited cells too small for a line
-_LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # pixels of the robot's mark
-_MOST_WIDE_ROWS = 32  # rows that fit a terminal at one line each
+LEAST_LINE_SCALE = 3  # minimum side of a cell in pixels, to show its colour next to a line
+_LEAST_RIM_SCALE = 12  # minimum side of a cell in pixels, for a rim around the line
+_TINT = 0.45  # share of white in visited cells that are too small for a line
+_LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # range of the radius of a robot's mark, pixels
+_MOST_WIDE_ROWS = 32  # maximum number of rows that fit a terminal with one line for each
 _NOTHING = Scenery()
 _SYMBOLS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz+/"
 
 _LOG = logging.getLogger(__name__)
 
 Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
-"""Visited cells (row, column) in order, shape (n, 2); each a neighbour of the last, or the same."""
+"""Visited cells (row, column) in order, shape (n, 2). Each is a neighbour of the previous one, or
+equal to it."""
 
 
 class Picture:
-    """What to draw, checked."""
+    """The checked contents of a picture."""
 
     def __init__(
         self,
@@ -55,15 +56,15 @@ class Picture:
         truth: NDArray[np.uint8] | None = None,
         scenery: Scenery = _NOTHING,
     ) -> None:
-        """Takes what is known of a world.
+        """Checks the contents.
 
         Args:
-            frame: Observed values, 255 where nothing was observed; shape (H, W).
+            frame: Observed values, 255 in unobserved cells, shape (H, W).
             robots: The cell (row, column) of each robot to draw.
             palette: The colours.
-            paths: Visited cells in order, of each robot that flew.
-            truth: Hidden states, shape (H, W).
-            scenery: What lies on its grid.
+            paths: The visited cells of each robot that flew, in order.
+            truth: The hidden states, shape (H, W); None: unknown.
+            scenery: The zones and no-fly cells of the grid.
         """
         if frame.ndim != 2 or not frame.size:
             raise invalid("frame", "shape (H, W)", frame.shape)
@@ -82,33 +83,35 @@ class Picture:
             if jumps.any():
                 at = int(np.argmax(jumps))
                 got = [tuple(cell) for cell in path[at : at + 2].tolist()]
-                raise invalid("path", "neighbours one after the other", got)
+                raise invalid("path", "consecutive cells to be neighbours", got)
 
     def painted(self) -> NDArray[np.uint8]:
-        """The colour of each cell of the frame, shape (H, W, 3)."""
+        """Returns the colour of each cell of the frame, shape (H, W, 3)."""
         colors = self.palette.paint_frame(self.frame)
         return self.scenery.tint(colors, self.frame, self.palette.unobserved)
 
     def color_of(self, robot: int) -> Color | None:
-        """The colour of a robot of a team; None if it is alone."""
+        """Returns the colour of a robot of a team; None for a single robot."""
         return ROBOTS[divmod(robot, len(ROBOTS))[1]] if len(self.robots) > 1 else None
 
 
 def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
-    """Draws a frame with path and robot, and the truth beside it (below it on wide grids).
+    """Draws a frame with paths and robots, and the hidden states next to it (below on wide grids).
 
-    The path is a line, or a tint where cells are below 3 pixels. The size depends on the grid, the
-    scale and whether there is a truth, on nothing else; it is even both ways, for video codecs.
+    A path is a line, or a tint if cells are smaller than 3 pixels. The size of the image depends
+    only on the grid, the scale, and whether hidden states are known. Width and height are even, as
+    video codecs require.
 
     Args:
-        scale: Side of a cell in pixels, at least 1; the default makes panels about 512 long.
+        picture: The contents.
+        scale: Side of a cell in pixels, at least 1. None: panels with a longer side of about 512.
 
     Returns:
-        Shape (height, width, 3), red, green, blue.
+        An image of shape (height, width, 3): red, green, blue.
     """
     palette = picture.palette
     height, width = picture.frame.shape
-    if scale is None:  # even, where cells can be
+    if scale is None:  # an even number, unless cells are too small
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
         raise invalid("scale", "at least 1 pixel", scale)
@@ -133,12 +136,12 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
 
 
 def ansi(picture: Picture, *, color: bool = True) -> str:
-    """Draws the same for a terminal, the truth at the right, without a line break at the end.
+    """Draws the same for a terminal, hidden states on the right, without a final line break.
 
-    In colour (24 bits), a cell is two characters, or on grids of more than 32 rows half of one,
-    which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
-    or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path, ``x`` for a
-    no-fly cell or a space.
+    With colour (24 bits), a cell is two characters. On grids of more than 32 rows it is half a
+    character, and the path is a tint. Without colour, a cell is two ASCII characters. The first is
+    the value as ``0-9A-Za-z+/``, or ``.`` for an unobserved cell. The second is ``@`` for a robot,
+    ``*`` for a path, ``x`` for a no-fly cell, otherwise a space.
     """
     palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
     grids = [(picture.frame, picture.painted(), cells)]
@@ -158,31 +161,32 @@ def ansi(picture: Picture, *, color: bool = True) -> str:
 
 
 class Screen:
-    """Shows pictures to people: in a window, else in the terminal, else not at all.
+    """A window, or the terminal, that shows pictures to people.
 
     A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
-    pygame has one per process. Without it, the standard output must be a terminal. Without either,
-    a warning is logged once and nothing is shown. Closable the window ends only the show.
+    pygame has one window per process. Without a window, pictures go to the standard output if it is
+    a terminal. Without either, a warning is logged once, and nothing is shown. If the user closes
+    the window, the program continues without pictures.
     """
 
     def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
-        """Opens nothing yet; `fps`: most pictures a second, by waiting; 0 does not wait."""
+        """Opens no window yet. `fps`: maximum number of pictures per second; 0: no limit."""
         self._title, self._fps = title, fps
         self._next: float | None = None
         self._window: Any = None
         self._pygame = _pygame_with_display()
-        #: Where pictures go.
+        #: Where pictures are shown.
         self.kind: Literal["window", "terminal", "nothing"] = "window"
         if self._pygame is None:
             self.kind = "terminal" if sys.stdout.isatty() else "nothing"
         if self.kind == "nothing":
             _LOG.warning(
-                "render_mode 'human' shows nothing: there is no display with pygame installed, and "
-                "the output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
+                "render_mode 'human' shows nothing: it needs pygame and a display, or a terminal "
+                "as standard output; use 'rgb_array' or 'ansi' to get pictures"
             )
 
     def show(self, picture: Picture) -> None:
-        """Draws in place of the last picture."""
+        """Replaces the shown picture; waits first if the last one is too recent for `fps`."""
         if self.kind == "window":
             self._show_in_window(rgb_array(picture))
         elif self.kind == "terminal":
@@ -192,8 +196,8 @@ class Screen:
         self._pace()
 
     def close(self) -> None:
-        """Closes the window, if there is one; later pictures are not shown. May be called again."""
-        # Another screen of this process may have taken the window over.
+        """Closes the window, if any. Later pictures are not shown. May be called again."""
+        # Another screen of this process may use the window by now.
         if self._window is not None and self._pygame.display.get_surface() is self._window:
             self._pygame.display.quit()
         self._window, self.kind = None, "nothing"
@@ -224,7 +228,7 @@ def _cells(places: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
 
 
 def _visited(picture: Picture) -> NDArray[np.intp]:
-    """The cells of all paths."""
+    """Returns the cells of all paths."""
     return np.concatenate([_cells([]), *picture.paths])
 
 
@@ -245,9 +249,9 @@ def _draw_path(
     color: Color | None,
     scale: int,
 ) -> None:
-    """A line through the cells' middles, and a square where it begins.
+    """Draws a line through the cells' middles, with a square where it begins.
 
-    In each cell's colour, dark or light, or in one `color`.
+    The line has the colour of each cell in `colors`, dark or light, or one `color`.
     """
     if not len(cells):
         return
@@ -275,7 +279,7 @@ def _draw_path(
 def _draw_robot(
     image: NDArray[np.uint8], robot: tuple[int, int], color: Color | None, scale: int
 ) -> None:
-    """A circle around a dot, or a disc of one `color`, at least as large as can be seen."""
+    """Draws a dot in a ring, or a disc of one `color`, large enough to be seen on small cells."""
     row, col = ((2 * at + 1) * scale / 2 - 0.5 for at in robot)
     radius = min(_MOST_RADIUS, max(_LEAST_RADIUS, 0.46 * scale))
     top, left = max(0, int(row - radius)), max(0, int(col - radius))
@@ -288,7 +292,7 @@ def _draw_robot(
 
 
 def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
-    """Panels along an axis with a gap between, both sides rounded up to even."""
+    """Joins panels along an axis with gaps between them; rounds both sides up to even numbers."""
     shape = list(panels[0].shape)
     shape[axis] = _GAP
     gap = np.full(shape, _EDGE, dtype=np.uint8)
@@ -314,7 +318,7 @@ def _ascii_lines(values: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator
 
 
 def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
-    """Lines of cells two characters wide, on the cell's colour."""
+    """Yields lines in which a cell is two characters on the cell's colour."""
     wide = {" ": "  ", "*": "··", "@": "()", "x": "xx"}
     for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
         cells: list[tuple[str, str]] = []
@@ -325,7 +329,7 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
 
 
 def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator[str]:
-    """Lines of cells half a character high: the upper one in front, the lower one behind it."""
+    """Yields lines of two rows: the upper cell is the foreground, the lower the background."""
     colors = colors.copy()
     colors[tuple(robots.T)] = LIGHT
     for row in range(0, len(colors), 2):
@@ -339,14 +343,14 @@ def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator
 
 
 def _styled(cells: list[tuple[str, str]]) -> str:
-    """Texts with their style, which is written only where it changes."""
+    """Joins texts with their style, which is written only where it changes."""
     runs = itertools.groupby(cells, key=lambda cell: cell[0])
     texts = (f"\x1b[{style}m" + "".join(text for _, text in run) for style, run in runs)
     return "".join(texts) + "\x1b[0m"
 
 
 def _pygame_with_display() -> Any:
-    """Pygame with its display ready, or None."""
+    """Returns pygame with an initialised display; None if there is no display or no pygame."""
     if not any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")):
         return None
     try:

@@ -1,6 +1,7 @@
-"""The colours of pictures: the model's own, and marks that stand out from them.
+"""The colours of pictures: the model's colours, and marks that stand out from them.
 
-Lightness distinguishes marks from cells, also in grey and under every colour blindness.
+Marks differ from cells in lightness, so that they are visible in grey and with any colour
+blindness.
 """
 
 from dataclasses import dataclass
@@ -16,48 +17,49 @@ from emberwatch.errors import invalid
 from emberwatch.model import Color, Description, color_from_hex
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
-"""Marks on light cells."""
+"""Colour of marks on light cells."""
 
 LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
-"""Marks on dark cells."""
+"""Colour of marks on dark cells."""
 
-# The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
+# The three colours of the wildfire model, then Okabe and Ito (2008) with brown instead of orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
 # As on the dashboard: light, so that a dark edge makes each stand out from every cell.
 _ROBOTS = ("5EE6C8", "FF9AD5", "B9F04A", "8FD0FF", "FFA64D", "C9A8FF", "F5F09A", "D9C2A0")
-_GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed
+_GREYS = (0x30, 0x60, 0x98, 0xE2)  # candidates for unobserved cells
 ROBOTS: Final[tuple[Color, ...]] = tuple(map(color_from_hex, _ROBOTS))
-"""Of the robots of a team, in turn."""
+"""The colours of the robots of a team, repeated in turn."""
 _APART = (
     3 * 60 * 60
-)  # squared distance at which colours can be distinguished, as in the Rust figures
+)  # squared distance at which two colours can be distinguished, as in the Rust figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Palette:
-    """Colours of states, of observations, and of cells where nothing was observed."""
+    """The colours of states, observed values, unobserved cells and paths."""
 
     states: tuple[Color, ...]
-    """By state."""
+    """One colour for each state."""
     observations: tuple[Color, ...]
-    """By observed value."""
+    """One colour for each observed value."""
     unobserved: Color
-    """A grey unlike the others."""
+    """A grey that differs from all other colours."""
     path: Color
-    """Of a path over observed cells: dark or light, whichever is further from all of them."""
+    """Colour of a path over observed cells: dark or light, whichever has more contrast to them."""
 
     @classmethod
     def of(cls, source: Description | int, *, on_paper: bool = False, n_rings: int = 1) -> Self:
-        """The described colours, or of a number of observations eight colours in turn.
+        """Makes a palette of described colours, or for a number of observed values.
 
-        `on_paper` makes what was not observed light if it can be, as the page around it. The
-        observations of a sensor's outer rings have the colours of the first `1 / n_rings` of all.
+        Without a description, eight colours are repeated in turn. `on_paper` prefers a light colour
+        for unobserved cells, like the page around them. With `n_rings` observation matrices, the
+        observed values of each matrix have the colours of the first one.
         """
         if isinstance(source, Description):
             states, n_observations = source.state_colors, source.n_observations
             colors = source.observation_colors
         else:
-            # However many there may be.
+            # Enough colours for any number of states.
             states = tuple(map(color_from_hex, islice(cycle(_COLORS), MAX_VALUES)))
             n_observations, colors = source, states
         observations = (colors[: n_observations // n_rings] * n_rings)[:n_observations]
@@ -69,25 +71,25 @@ class Palette:
         )
 
     def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of a frame (H, W)."""
+        """Returns the colours (H, W, 3) of a frame (H, W)."""
         return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
 
     def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of hidden states (H, W)."""
+        """Returns the colours (H, W, 3) of hidden states (H, W)."""
         return _paint(truth, dict(enumerate(self.states)))
 
 
 def mark_on(*colors: Color) -> Color:
-    """Dark or light: the one with more contrast to the colour that it has least contrast to.
+    """Returns dark or light, whichever has the larger minimum contrast to the given colours.
 
-    Contrast ratios and luminances are those of the Web Content Accessibility Guidelines 2.1.
+    Contrast ratio and luminance are defined in the Web Content Accessibility Guidelines 2.1.
     """
     lights = _luminances(np.array(colors))
     return DARK if lights.min() * lights.max() > _MIDDLE else LIGHT
 
 
 def mark_on_each(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`mark_on` of each of many colours, shape (n, 3)."""
+    """Returns `mark_on` for each of many colours, shape (n, 3)."""
     is_light = _luminances(colors) ** 2 > _MIDDLE
     return np.where(is_light[:, None], DARK, LIGHT).astype(np.uint8)
 
@@ -106,12 +108,12 @@ def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.ui
     unknown = np.isin(values, list(colors), invert=True)
     if unknown.any():
         got = int(values[unknown][0])
-        raise invalid("picture", f"values out of {sorted(colors)}", got)
+        raise invalid("picture", f"values in {sorted(colors)}", got)
     return table[values]
 
 
 def _grey_unlike(colors: tuple[Color, ...], greys: tuple[int, ...]) -> Color:
-    """The first grey that is well apart from all colours, else the one furthest from them."""
+    """Returns the first grey that is distinguishable from all colours, or the most distant one."""
 
     def nearest(grey: int) -> int:
         return min(sum((channel - grey) ** 2 for channel in color) for color in colors)

@@ -1,8 +1,8 @@
-"""What lies on a world's grid whatever happens there: zones of land and no-fly cells.
+"""The constant parts of a world's picture: zones of land and no-fly cells.
 
-What was not observed has the colour of its zone, muted; thin lines go around zones, unless there
-are many, hatches over no-fly cells, and a line around what robots saw, if that is more than their
-path. All lines are dark or light, whichever the pixel below is not.
+Unobserved cells have the muted colour of their zone. Thin lines surround zones, unless there are
+many. Hatches cover no-fly cells. A line surrounds the observed cells if robots see more than their
+path. Each pixel of a line is dark on a light pixel, and light on a dark one.
 """
 
 from dataclasses import dataclass, replace
@@ -16,33 +16,34 @@ from emberwatch.model import Color, color_from_hex
 from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.render.palette import mark_on_each
 
-#: Most zones that have lines around them and names in legends; more would cover what is below.
+#: Maximum number of zones with lines and names in legends; more lines would hide the cells.
 MOST_ZONES: Final = 8
 
-_TINT = 0.4  # share of a zone's colour: states and observations, in full colours, stay apart
-_LEAST_LINE_SCALE = 3  # pixels a cell needs to show its colour beside a line
-_LEAST_HATCH, _MOST_HATCH = 3, 10  # pixels from line to line
+_TINT = 0.4  # share of a zone's colour; states and observations have full colours and stay distinct
+_LEAST_LINE_SCALE = 3  # minimum side of a cell in pixels, to show its colour next to a line
+_LEAST_HATCH, _MOST_HATCH = 3, 10  # range of the distance between hatch lines, pixels
 
 _Cell = TypeVar("_Cell", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenery:
-    """Zones, no-fly cells, and whether robots see beyond their path; by default, none of it."""
+    """The zones and no-fly cells of a grid, and the range of the sensor. Empty by default."""
 
     n_rings: int = 1
-    """Observation matrices: the observations of each are as many, in the same colours."""
+    """Number of observation matrices. All have the same observations, in the same colours."""
     sees_beyond: bool = False
+    """Whether robots see cells beyond their path."""
     no_fly: NDArray[np.bool_] | None = None
-    """Where no robot may be, shape (H, W)."""
+    """True in the no-fly cells, shape (H, W); None if there are none."""
     zones: NDArray[np.uint8] | None = None
-    """The zone of each cell, shape (H, W)."""
+    """The zone of each cell, shape (H, W); None without zones."""
     zone_names: tuple[str, ...] = ()
     zone_colors: tuple[Color, ...] = ()
 
     @classmethod
     def of(cls, air: Airspace, land: Zones | None) -> Self:
-        """What robots may fly over and see, and the zones of the land."""
+        """Makes the scenery of an airspace and the zones of its land."""
         common = cls(n_rings=air.n_rings, sees_beyond=air.radius > 0, no_fly=air.no_fly)
         if land is None:
             return common
@@ -50,7 +51,7 @@ class Scenery:
         return replace(common, zones=land.map, zone_names=land.names, zone_colors=colors)
 
     def tints(self, unobserved: Color) -> tuple[Color, ...]:
-        """The colour of what was not observed, by zone."""
+        """Returns the colour of unobserved cells for each zone."""
         colors = np.array(self.zone_colors).reshape(-1, 3) * _TINT
         mixed = np.rint(colors + np.array(unobserved) * (1 - _TINT)).astype(int)
         return tuple((red, green, blue) for red, green, blue in mixed.tolist())
@@ -58,14 +59,14 @@ class Scenery:
     def tint(
         self, colors: NDArray[np.uint8], frame: NDArray[np.uint8], unobserved: Color
     ) -> NDArray[np.uint8]:
-        """The colours (H, W, 3) of a frame (H, W), with those of zones where it has no value."""
+        """Replaces the colours (H, W, 3) of unobserved cells of a frame by those of their zones."""
         if self.zones is None:
             return colors
         tints = np.array(self.tints(unobserved), np.uint8)[self.zones]
         return np.where((frame == UNOBSERVED)[:, :, None], tints, colors)
 
     def draw(self, image: NDArray[np.uint8], frame: NDArray[np.uint8], scale: int) -> None:
-        """Draws all lines over a picture of so many pixels a cell."""
+        """Draws all lines over a picture; `scale`: side of a cell in pixels."""
         rows, cols = np.ogrid[: image.shape[0], : image.shape[1]]
         lines = np.zeros(image.shape[:2], np.bool_)
         if self.no_fly is not None:
@@ -80,7 +81,7 @@ class Scenery:
 
 
 def _last_pixels(zones: NDArray[np.uint8], scale: int) -> NDArray[np.bool_]:
-    """The pixels of cells that border on another zone to the right or below."""
+    """Returns the mask of the pixels that border on another zone to the right or below."""
     pixels = _enlarge(zones, scale)
     border = np.zeros(pixels.shape, np.bool_)
     if scale >= _LEAST_LINE_SCALE:
@@ -90,7 +91,7 @@ def _last_pixels(zones: NDArray[np.uint8], scale: int) -> NDArray[np.bool_]:
 
 
 def _around(seen: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
-    """The pixels of other cells that border on seen ones."""
+    """Returns the mask of the pixels of unseen cells that border on seen cells."""
     pixels = _enlarge(seen, scale)
     near = pixels.copy()
     for _ in range(max(1, scale // 12) if scale >= _LEAST_LINE_SCALE else 0):

@@ -1,4 +1,4 @@
-"""`python -m emberwatch.render.film`: flags in, a GIF or a PNG out."""
+"""`python -m emberwatch.render.film`: makes a GIF or a PNG of a recording."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from emberwatch.render.film.page import Page
 
 _NAME = "python -m emberwatch.render.film"
-_PAUSE_MILLIS = 1000  # that the last picture and that of a gap are shown at least
-_MOST_PIXELS = 1 << 30  # of all pictures: Pillow holds them until the file is written
-_MOST_SIMULATED = 100_000  # steps for a first belief: more change nothing
-_MOST_NAMED = 6  # runs of steps in an error
+_PAUSE_MILLIS = 1000  # minimum duration of the last picture and of pictures of gaps
+_MOST_PIXELS = 1 << 30  # maximum of all pictures together, which Pillow holds in memory
+_MOST_SIMULATED = 100_000  # maximum burn-in of a first belief; longer ones do not change it
+_MOST_NAMED = 6  # maximum number of runs of steps in an error
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Makes what the flags ask for; else exits with what is wrong, with code 2 for flags or 1."""
+    """Makes the film or still. On an error, exits with a message: code 2 for flags, otherwise 1."""
     parser = _parser()
     flags = parser.parse_args(arguments)
     selection = _selection(flags, parser.error)
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         model = _model(flags.model, server)
         begin = None if model is None else partial(_begin, flags.prior, model, server)
         page = Page(server, model, world=flags.world, scale=flags.scale, has_truth=has_truth)
-        with warnings.catch_warnings(action="ignore"):  # in the survey already
+        with warnings.catch_warnings(action="ignore"):  # `_survey` has reported them
             recorded = steps(recording.read(flags.recording, world=flags.world))
             _write(flags, page, n_scenes, scenes(recorded, selection, begin))
     except (EmberwatchError, OSError) as error:
@@ -58,20 +58,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a film or a still of a recording: what is hidden, what the robots saw, "
-        "and what the known model's filter makes of it.",
+        description="Make a film or a still of a recording: the hidden states, the robots' frames, "
+        "and the belief of the known model's filter.",
     )
     add = parser.add_argument
-    add("recording", type=Path, help="what `emberwatch-server record` wrote")
+    add("recording", type=Path, help="a recording of `emberwatch-server record`")
     add("--out", type=Path, required=True, metavar="FILE", help="a .gif, or with --step a .png")
     add("--step", type=int, metavar="K", help="make a still of this step")
     add("--from", type=int, default=0, metavar="K", help="first step to show [0]")
     add("--to", type=int, default=math.inf, metavar="K", help="last step to show [the last]")
-    add("--every", type=int, default=1, metavar="N", help="show every so many steps [1]")
-    add("--fps", type=float, default=10.0, metavar="N", help="pictures a second, 0.1 to 50 [10]")
-    add("--world", type=int, default=0, metavar="N", help="the world [0]")
-    add("--scale", type=int, metavar="N", help="pixels of a cell's side [a panel of about 200]")
-    add("--model", metavar="FILE", help="a model file, where the recording's server hid its model")
+    add("--every", type=int, default=1, metavar="N", help="show every N-th step [1]")
+    add("--fps", type=float, default=10.0, metavar="N", help="pictures per second, 0.1 to 50 [10]")
+    add("--world", type=int, default=0, metavar="N", help="number of the world [0]")
+    add("--scale", type=int, metavar="N", help="side of a cell in pixels [panels of about 200]")
+    add("--model", metavar="FILE", help="a model file, if the recording's server hid its model")
     priors = ("simulated", "initial", "uniform")
     add(
         "--prior", choices=priors, default="simulated", help="the filter's first belief [simulated]"
@@ -80,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _selection(flags: argparse.Namespace, error: Callable[[str], NoReturn]) -> Selection:
-    """The steps to show, all flags checked; a still is a film of one step."""
+    """Checks the flags, and returns the steps to show; a still is a film of one step."""
     values: dict[str, Any] = vars(flags)
     for name, least, most in (
         ("step", 0, math.inf),
@@ -98,12 +98,15 @@ def _selection(flags: argparse.Namespace, error: Callable[[str], NoReturn]) -> S
     if flags.step is None:
         return Selection(first=values["from"], last=flags.to, every=flags.every)
     if (values["from"], flags.to, flags.every) != (0, math.inf, 1):
-        error("--step: expected none of --from, --to and --every beside it")
+        error("--step: cannot be combined with --from, --to or --every")
     return Selection(first=flags.step, last=flags.step, every=1)
 
 
 def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo, bool, int]:
-    """The server, whether hidden states are shown, the number of scenes; says what is missing."""
+    """Reads the recording once, and prints warnings about missing parts.
+
+    Returns the server, whether hidden states are recorded, and the number of scenes.
+    """
     worlds, episodes = set[int](), set[int]()
     runs = list[tuple[int, int]]()
     server: ServerInfo | None = None
@@ -131,7 +134,7 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
     if server is None and not worlds and caught:
         raise EmberwatchError(str(caught[-1].message), "recording")
     if server is None:
-        raise invalid("--world", f"one of those recorded, {sorted(worlds)}", flags.world)
+        raise invalid("--world", f"a recorded world, {sorted(worlds)}", flags.world)
     if n_steps == 0:
         known = ", ".join(f"{first} to {last}" for first, last in runs[:_MOST_NAMED])
         more = ", ..." if len(runs) > _MOST_NAMED else ""
@@ -155,7 +158,7 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
 
 
 def _model(path: str | None, server: ServerInfo) -> Model | None:
-    """The model that the server revealed, or else that of the file."""
+    """Returns the model that the server revealed, otherwise the model of the file, if any."""
     if server.model is not None:
         return Model.from_toml(server.model)
     model = None if path is None else Model.named(path)
@@ -168,43 +171,43 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
 
 
 def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Belief:
-    """The filter before the frame of step k, the first that is known."""
+    """Makes the filter before the frame of step k, the first recorded step."""
     burn_in = min(server.burn_in + k, _MOST_SIMULATED)
     grid = {"height": server.height, "width": server.width, "burn_in": burn_in}
     return known(model, prior=prior_of(prior, model, **grid))
 
 
 def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterator[Scene]) -> None:
-    """Writes beside the file, then renames, so that it is never half a film."""
+    """Writes a temporary file next to the output and renames it, so that the output is complete."""
     (width, height), out = page.size, flags.out
     if n_scenes * width * height > _MOST_PIXELS:
         most = _MOST_PIXELS // (width * height)
         raise invalid("--every, --scale", f"at most {most} pictures of this size", n_scenes)
     out.parent.mkdir(parents=True, exist_ok=True)
-    beside = out.with_name(f".{out.name}.{os.getpid()}")
+    temporary = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         if flags.step is not None:
-            page.draw(next(scene for scene in scenes if not scene.is_gap)).save(beside, "PNG")
+            page.draw(next(scene for scene in scenes if not scene.is_gap)).save(temporary, "PNG")
         else:
             pictures = _pictures(page, scenes, n_scenes, flags.fps)
             next(pictures).save(
-                beside,
+                temporary,
                 "GIF",
                 save_all=True,
                 append_images=pictures,
                 loop=0,
-                optimize=True,  # keeps of each picture what changed
+                optimize=True,  # stores only the changed part of each picture
                 palette=page.palette.getpalette(),
             )
-        os.replace(beside, out)
+        os.replace(temporary, out)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     size = f"{width} x {height} pixels, {out.stat().st_size} bytes"
     print(shown(f"{out}: {n_scenes} pictures of {size}"))
 
 
 def _pictures(page: Page, scenes: Iterator[Scene], n_scenes: int, fps: float) -> Iterator[Image]:
-    """Scenes drawn, with how long each is shown; the last and those of gaps stay for a while."""
+    """Draws scenes and sets how long each is shown; the last one and gaps are shown longer."""
     for number, scene in enumerate(scenes, 1):
         image = page.indexed(page.draw(scene))
         millis = 10 * round(100 / fps)  # the unit of GIF

@@ -1,4 +1,4 @@
-"""A scene as a picture: truth, path, belief and entropy, and what their colours mean."""
+"""Pictures of scenes: hidden states, path, belief and entropy, with legends."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,16 +19,16 @@ from emberwatch.render.palette import DARK, LIGHT, ROBOTS, Palette
 from emberwatch.render.scenery import MOST_ZONES, Scenery
 
 _MARGIN, _GAP, _LINE, _SWATCH = 14, 16, 20, 11  # pixels
-_TOP = 68  # of the panels, below step and titles
-_LEAST_ROOM = 150  # of a panel, for its title and legend
-_LONG_SIDE, _MOST_SCALE = 200, 20  # of a panel, and of a cell, unless a scale is given
-_MOST_SIDE, _MOST_AREA = 65_535, 1 << 26  # of a picture; the side is what a GIF can tell
+_TOP = 68  # y of the panels, below step and titles, pixels
+_LEAST_ROOM = 150  # minimum width of a panel's column, for its title and legend, pixels
+_LONG_SIDE, _MOST_SCALE = 200, 20  # default side of a panel, and maximum default side of a cell
+_MOST_SIDE, _MOST_AREA = 65_535, 1 << 26  # maximum side (the GIF format's) and area of a picture
 _INK, _WARNING, _EDGE = (0x33, 0x33, 0x33), (0xD5, 0x5E, 0x00), (0x66, 0x66, 0x66)
-_SHADES = 24  # of a probability: more make larger files and can hardly be distinguished
+_SHADES = 24  # number of shades of a probability; more make larger files without visible gain
 # ColorBrewer's YlGnBu (Apache-2.0): its lightness falls evenly.
 _RAMP = "ffffd9 edf8b1 c7e9b4 7fcdbb 41b6c4 1d91c0 225ea8 253494 081d58".split()
 
-_FINE = 4  # texts are drawn this many times larger, then reduced
+_FINE = 4  # factor by which texts are drawn larger, and then reduced
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13 * _FINE))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(16 * _FINE))
 
@@ -41,12 +41,12 @@ class _Panel:
     palette: Palette
     marks: list[tuple[_Mark, str]]
     cells: Callable[[Scene], NDArray[np.uint8] | None]
-    """The numbers of the cells' colours; None where that is not recorded."""
+    """Returns the numbers of the cells' colours; None if a scene has no data for the panel."""
     has_path: bool = False
 
 
 class Page:
-    """The layout of a film, and how it is drawn."""
+    """The layout of a film, which draws its scenes."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Page:
         scale: int | None,
         has_truth: bool,
     ) -> None:
-        """Lays out and draws what all pictures of a world share; no model leaves the belief out."""
+        """Draws the parts that all pictures share; without a model, the belief is left out."""
         height, width = server.height, server.width
         described = server.recorded_states or model
         self._name = f"{described.name if described else 'hidden model'}, world {world}"
@@ -110,7 +110,7 @@ class Page:
         return image
 
     def indexed(self, image: Image.Image) -> Image.Image:
-        """A picture in the film's one palette."""
+        """Converts a picture to the film's palette."""
         return image.quantize(palette=self.palette, dither=Image.Dither.NONE)
 
     def _lefts(self) -> list[int]:
@@ -134,7 +134,7 @@ class Page:
         image.paste(Image.fromarray(pixels[:height, :width]), (left, _TOP))
 
     def _placed(self, marks: list[tuple[_Mark, str]]) -> list[tuple[_Mark, str, tuple[int, int]]]:
-        """Marks and names with their places, on as many lines as they need."""
+        """Returns the marks and names of a legend with their positions, on one or more lines."""
         x = y = 0
         placed: list[tuple[_Mark, str, tuple[int, int]]] = []
         for mark, name in marks:
@@ -177,7 +177,10 @@ def _write(
     font: ImageFont.FreeTypeFont = _TEXT,
     ink: Color = _INK,
 ) -> None:
-    """Draws large and reduces, which keeps letters apart; `at`: left edge, middle."""
+    """Writes text with its left edge and middle at `at`.
+
+    It is drawn large and then reduced, which keeps the letters apart.
+    """
     mask = Image.new("L", (_FINE * (_length(text, font) + 2), 2 * int(font.size)))
     draw, bold = ImageDraw.Draw(mask), 1 if font is _TITLE else 0
     draw.text((0, mask.height / 2), text, 255, font, "lm", stroke_width=bold)
@@ -190,7 +193,7 @@ def _length(text: str, font: ImageFont.FreeTypeFont = _TEXT) -> int:
 
 
 def _fit(text: str, room: float) -> str:
-    """The text, shortened where it is wider than the room."""
+    """Returns the text, shortened if it is wider than `room` pixels."""
     if _length(text) <= room:
         return text
     while text and _length(f"{text}…") > room:
@@ -199,7 +202,7 @@ def _fit(text: str, room: float) -> str:
 
 
 def _film_palette(palette: Palette, scenery: Scenery) -> Image.Image:
-    """All colours of cells, marks and letters, few enough for a GIF; of many zones the first."""
+    """Returns the colours of cells, marks and text: at most 256, so the last zones may lack one."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
     marks = np.array([DARK, LIGHT, _EDGE, *ROBOTS, *palette.states, *_ramp(_SHADES)])
@@ -221,7 +224,7 @@ def _panels(
     states = list[tuple[_Mark, str]](zip(palette.states, names[0], strict=False))
     seen = list[tuple[_Mark, str]](zip(palette.observations, names[1], strict=False))
     if has_truth and seen == states:
-        seen = []  # said once
+        seen = []  # the legend of the hidden states names the same colours
     truth = _Panel(
         title="truth (hidden)",
         palette=replace(palette, observations=palette.states),
@@ -258,7 +261,7 @@ def _panels(
 
 
 def _land(palette: Palette, scenery: Scenery) -> list[tuple[_Mark, str]]:
-    """Marks of what was not seen, by its zone, and of no-fly cells."""
+    """Returns the legend of unseen cells, by zone, and of no-fly cells."""
     names = scenery.zone_names
     marks: list[tuple[_Mark, str]] = []
     if not names:
@@ -278,7 +281,7 @@ def _levels(shares: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _ramp(n_colors: int) -> tuple[Color, ...]:
-    """Colours from light to dark."""
+    """Returns colours from light to dark."""
     anchors = np.array([list(bytes.fromhex(color)) for color in _RAMP])
     at = np.linspace(0, len(anchors) - 1, n_colors)
     channels = [np.interp(at, range(len(anchors)), anchors[:, i]).round() for i in range(3)]
@@ -286,14 +289,14 @@ def _ramp(n_colors: int) -> tuple[Color, ...]:
 
 
 def _width(mark: _Mark) -> int:
-    """Width of a mark and the space behind it, pixels."""
+    """Returns the width of a mark and the space after it, pixels."""
     if mark == "words":
         return 0
     return 12 + 64 + 6 if mark == "scale" else _SWATCH + 5
 
 
 def _small_print(scene: Scene) -> tuple[str, Color]:
-    """What a scene must not hide, and its colour."""
+    """Returns a text on the limits of a scene, such as missing steps, and its colour."""
     if scene.is_gap:
         first = scene.k - (scene.step.n_lost or 0) + 1
         lost = f"step {first} is" if first == scene.k else f"steps {first} to {scene.k} are"

@@ -1,4 +1,4 @@
-"""Records in, scenes out: the known model's filter runs along, also where steps are missing."""
+"""Scenes of a recording: the known model's filter follows the records, also over missing steps."""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -14,9 +14,10 @@ from emberwatch.client.replies import ServerInfo
 from emberwatch.errors import EmberwatchError
 from emberwatch.model.moves import fly
 
-# After a longer gap the belief begins again: a fire depends on the last 5,500 steps or so.
+# Maximum number of missing steps over which the belief is predicted. After a longer gap it starts
+# again: a fire depends on about the last 5,500 steps.
 _MOST_LOST = 10_000
-_MOST_WAITING = 1 << 26  # cells of hidden states that wait for their frames
+_MOST_WAITING = 1 << 26  # maximum number of cells of hidden states that wait for their frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,9 +26,9 @@ class Step:
 
     Attributes:
         server: The server that simulated it.
-        frame: What the robots saw and flew, and the step's result.
-        truth: Hidden states, `(H, W)`; None where they are not recorded.
-        n_lost: Steps right before it that are not recorded; None where a new episode begins.
+        frame: The robots' frames and paths, and the step's result.
+        truth: The hidden states, `(H, W)`; None if they are not recorded.
+        n_lost: Number of missing steps right before this one; None if a new episode begins.
     """
 
     server: ServerInfo
@@ -37,10 +38,10 @@ class Step:
 
 
 def steps(records: Iterable[Record]) -> Iterator[Step]:
-    """The steps of the one world that the records are of; a frame published again counts once.
+    """Yields the steps of the records of one world. A frame that was published again counts once.
 
     Warns:
-        UserWarning: Another server's worlds follow, of another kind; they are left out.
+        UserWarning: If worlds of another kind follow, from another server; they are left out.
     """
     server: ServerInfo | None = None
     last: tuple[int, int] | None = None
@@ -68,7 +69,7 @@ def steps(records: Iterable[Record]) -> Iterator[Step]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which steps k to show: every n-th from the first to the last."""
+    """The steps k to show: every `every`-th one from `first` to `last`."""
 
     first: int
     last: float
@@ -79,24 +80,24 @@ class Selection:
         return self.first <= k <= self.last and (k - self.first) % self.every == 0
 
     def shows_gap(self, step: Step) -> bool:
-        """Whether the steps right before it that are not recorded are shown, in one scene."""
+        """Returns whether the missing steps right before `step` are shown, in one scene."""
         k, n_lost = step.frame.result.step, step.n_lost or 0
         return 0 < n_lost <= _MOST_LOST and self.first < k and k - n_lost <= self.last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """What one picture shows. Parts that are not recorded are None.
+    """The contents of one picture. Parts that are not recorded are None.
 
     Attributes:
-        step: The step, or the one behind a gap.
-        k: Number of the step shown: of a gap the last.
-        is_gap: Whether it stands for the steps before `step` that are not recorded.
-        paths: Each robot's cells, the start first, `(n, 2)`.
-        belief: The posterior, of a gap the predictor, `(S, H, W)`; None where no model is known.
+        step: The shown step, or the step after a gap.
+        k: Number of the shown step; in a gap, the last missing one.
+        is_gap: Whether the scene stands for the missing steps before `step`.
+        paths: The cells of each robot, `(n, 2)`, its start first.
+        belief: The posterior, or in a gap the predictor, `(S, H, W)`; None without a model.
         since: The step at which the belief began.
-        n_lost: Steps since then that are not recorded.
-        mean_reward: Of the recorded steps since then.
+        n_lost: Number of missing steps since then.
+        mean_reward: Mean reward of the recorded steps since then.
     """
 
     step: Step
@@ -112,12 +113,12 @@ class Scene:
 def scenes(
     steps: Iterable[Step], selection: Selection, begin: Callable[[int], Belief] | None
 ) -> Iterator[Scene]:
-    """The scenes to show.
+    """Yields the scenes to show.
 
     Args:
-        steps: Every step there is, also those that are not shown.
-        selection: Which to show.
-        begin: The belief before the frame of a step k; None where no model is known.
+        steps: All recorded steps, including the ones that are not shown.
+        selection: The steps to show.
+        begin: Makes the belief before the frame of a step k; None without a model.
     """
     known: Belief | None = None
     since = n_lost = n_rewards = 0
@@ -169,5 +170,5 @@ def _paths(step: Step) -> list[NDArray[np.intp]]:
 
 
 def _kind(server: ServerInfo) -> tuple[object, ...]:
-    """What must be equal for one filter to follow two servers' worlds."""
+    """Returns the settings that two servers must share for one filter to follow both."""
     return server.height, server.width, server.n_observations, server.model
