@@ -1,6 +1,6 @@
 """PyTorch on the same CPU: the peer of `agent/network/benches/network.rs`, measured in the same run.
 
-Measures three networks with torch's own layers: the dynamic autoencoder of REPRODUCTION.md's layer table (hidden size
+Measures three networks with torch's own layers: the dynamic autoencoder of `agent/network/src/autoencoder.rs` (hidden size
 16, windows of 1,000 frames of 64 x 64 cells), a DQN, and the neural belief's network (updates on 16 grids). Uses two
 threads; single inputs and the neural belief are also measured with one. Everything is measured twice: with glibc's
 default allocator, and with an allocator that keeps its memory and uses huge pages.

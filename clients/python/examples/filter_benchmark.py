@@ -1,7 +1,7 @@
 """Scores filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
 
-    python filter_benchmark.py                          # on simulated fires python
-    filter_benchmark.py --fires fires-all.npz    # on recorded fires
+    python filter_benchmark.py                          # on simulated fires
+    python filter_benchmark.py --fires fires-all.npz    # on recorded fires
 
 25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with probability
 1 - (1 - a)**f, where f of its four neighbours burn and a rises from .1 in the first column to .4 in

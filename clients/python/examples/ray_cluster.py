@@ -3,9 +3,9 @@
 Shared memory does not span machines, so each node of the cluster runs its own server. Each runner
 leases a part of the server's worlds. Training survives the death of runners and servers.
 
-    python ray_cluster.py --iterations 50                 # two nodes on this machine python
-    ray_cluster.py --address auto --runners 30     # a running cluster python ray_cluster.py --kill
-    # kills a runner, and later a server
+    python ray_cluster.py --iterations 50                 # two nodes on this machine
+    python ray_cluster.py --address auto --runners 30     # a running cluster
+    python ray_cluster.py --kill                          # kills a runner, and later a server
 """
 
 from __future__ import annotations

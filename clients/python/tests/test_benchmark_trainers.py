@@ -158,7 +158,7 @@ def test_a_model_behind_vec_normalize_scores_as_in_its_own(
         ]
         assert str(vars_of(counts[0])) == str(vars_of(counts[1]))
     assert file.read_bytes() == before
-    with refuses("wrap: VecNormalize has no statistics: save those of the training"):
+    with refuses("wrap: VecNormalize has no statistics: save the training's statistics"):
         ours(model, world, observation=parts, wrap=normalized)
     with refuses("wrap: expected a VecNormalize among the wrappers, as the policy was"):
         ours(model, world, observation=parts, wrap=VecMonitor)

@@ -230,7 +230,7 @@ def test_cut_changed_and_repeated_records_are_shown_once(studio: Studio) -> None
 
 #: Wrong flags, each with words of its error.
 WRONG: list[tuple[list[object], str]] = [
-    (["--world", 7], "--world: expected one of those recorded, [0, 1], got 7"),
+    (["--world", 7], "--world: expected a recorded world, [0, 1], got 7"),
     (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
     (["--from", 5], "expected some of the recorded steps 0 to 1, 4 to 4, got 5 to inf"),
     (["--from", 5, "--to", 4], "--to: expected 5 to inf, got 4"),
@@ -238,7 +238,7 @@ WRONG: list[tuple[list[object], str]] = [
     (["--fps", 0], "--fps: expected 0.1 to 50, got 0.0"),
     (["--fps", "fast"], "invalid float value: 'fast'"),
     (["--scale", 101], "--scale: expected 1 to 100, got 101"),
-    (["--step", 1, "--every", 2], "--step: expected none of --from, --to and --every"),
+    (["--step", 1, "--every", 2], "--step: cannot be combined with --from, --to or --every"),
     (["--out", "lab.mp4"], "--out: expected a .gif, or with --step a .png, got lab.mp4"),
     (["--step", 1, "--out", "a.gif"], "--out: expected a .gif, or with --step a .png"),
     (["--prior", "none"], "invalid choice: 'none'"),

@@ -329,15 +329,15 @@ def test_it_writes_the_same_bytes_draws_them_and_says_what_came_out(
     assert {(0x3B, 0x6E, 0xA5), (0xC8, 0x37, 0x1B), (0x4A, 0x4A, 0x4A)} <= most
 
 
-def test_the_page_has_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (ROOT / "docs" / "landscapes.md").read_text("utf-8")
-    for words, begin, end in (
-        ([], "## Options", "## Time and grid"),
-        (["land"], "## Model files with zones", "## What policies find"),
+def test_the_pages_have_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, name, end in (
+        ([], "landscapes", "## Time and grid"),
+        (["land"], "land", "## Slope and wind"),
     ):
+        page = (ROOT / "docs" / f"{name}.md").read_text("utf-8")
         with pytest.raises(SystemExit):
             main([*words, "--help"])
-        rows = re.findall(r"(?m)^\| `.*?\|", page[page.index(begin) : page.index(end)])
+        rows = re.findall(r"(?m)^\| `.*?\|", page[page.index("## Options") : page.index(end)])
         in_help = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
         assert in_help == set(re.findall("--[a-z-]+", " ".join(rows))) and len(in_help) > 15
 

@@ -107,8 +107,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"robots": [(1, 1), (2, 0)]}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
     ({"paths": [[(0, 0), (-1, 0)]]}, r"path: expected cells .* got \(-1, 0\)"),
     ({"paths": [[(0, 0), (1, 1)]]}, "path: expected consecutive cells to be neighbours"),
-    ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
-    ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
+    ({"frame": FRAME + np.uint8(3)}, "expected values in .0, 1, 2, 255., got 3"),
+    ({"truth": TRUTH + np.uint8(3)}, "expected values in .0, 1, 2., got 3"),
 ]
 
 
@@ -219,8 +219,8 @@ def test_nowhere_to_show_is_said_once(
         screen.close()
     assert screen.kind == "nothing" and capsys.readouterr().out == ""
     assert [record.message for record in caplog.records] == [
-        "render_mode 'human' shows nothing: there is no display with pygame installed, and the "
-        "output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
+        "render_mode 'human' shows nothing: it needs pygame and a display, or a terminal as "
+        "standard output; use 'rgb_array' or 'ansi' to get pictures"
     ]
 
 

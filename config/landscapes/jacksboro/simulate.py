@@ -1,4 +1,4 @@
-"""Simulates the fires of this landscape: PyTorchFire on the terrain of the Jacksboro Fault.
+"""Simulates the fires of this landscape with PyTorchFire, on the terrain of the Jacksboro Fault.
 
 pip install "pytorchfire==1.0.3.post2" matplotlib rasterio torch
 python simulate.py RAW
@@ -15,22 +15,23 @@ from pytorchfire.utils import calculate_slope
 from terrain import CELL, PROJECTION, projected_terrain
 
 N_STEPS = 400
-#: Of each fire: where it begins (share of rows and columns), wind in m/s, where it blows to in
-#: degrees from the east towards the north, seed.
+#: The fires: ignition point (shares of the rows and columns), wind speed in m/s, direction in which
+#: the wind blows (degrees from the east towards the north), and seed.
 FIRES = (
     ((0.55, 0.30), 6.0, 20.0, 1),
     ((0.35, 0.65), 4.0, 230.0, 2),
     ((0.75, 0.60), 7.0, 110.0, 3),
     ((0.30, 0.30), 5.0, 320.0, 5),
 )
-#: As Alexandridis et al. (2008, doi 10.1016/j.amc.2008.06.046), but cells burn longer and slower.
+#: As in Alexandridis et al. (2008, doi 10.1016/j.amc.2008.06.046), but cells burn for longer, and
+#: fires spread more slowly.
 PARAMETERS = {"a": 0.078, "p_h": 0.06, "c_1": 0.045, "c_2": 0.131, "p_continue": 0.85}
-#: Assumed: ground steeper than so many degrees is forest, the rest is farmed.
+#: Assumption: ground steeper than `STEEP` degrees is forest, the rest is farmed land.
 STEEP, FOREST, FARMED = 5.0, 0.4, -0.4
 
 
 def main(raw: Path) -> None:
-    """Writes a GeoTIFF of states for each fire, a band for each step."""
+    """Writes a GeoTIFF for each fire, with a band of states for each step."""
     torch.set_num_threads(1)
     terrain, transform = projected_terrain()
     slope = calculate_slope(torch.from_numpy(terrain), torch.tensor(CELL))
@@ -53,7 +54,7 @@ def simulated(
     towards: float,
     seed: int,
 ) -> np.ndarray:
-    """States of one fire, shape (steps, rows, columns): 0 unburnt, 1 burning, 2 burnt."""
+    """Returns the states of one fire, (steps, rows, columns): 0 unburnt, 1 burning, 2 burnt."""
     shape = slope.shape[:2]
     ignition = torch.zeros(shape, dtype=torch.bool)
     row, column = int(start[0] * shape[0]), int(start[1] * shape[1])

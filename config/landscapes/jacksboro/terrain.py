@@ -1,4 +1,4 @@
-"""The terrain of the Jacksboro Fault on square cells, and a part of it as a GeoTIFF.
+"""Projects the terrain of the Jacksboro Fault to square cells, and writes a part as a GeoTIFF.
 
 pip install matplotlib rasterio
 python terrain.py OUT.tif
@@ -13,15 +13,15 @@ from matplotlib import cbook
 from rasterio.transform import from_bounds
 from rasterio.warp import Resampling, calculate_default_transform, reproject
 
-CELL = 180.0  # metres: twice the 3 arc seconds of the terrain
+CELL = 180.0  # metres; about twice the 3 arc seconds of the source
 PROJECTION = "EPSG:32616"
-MARGIN = 6  # cells that lie outside the terrain after its projection
-#: Of the part: its first row and column, and its side, in cells of 360 m as the fires have them.
+MARGIN = 6  # width of the edge, in cells, that the projection leaves without data
+#: First row, first column and side of the written part, in the fires' cells of 360 m.
 TOP, LEFT, SIDE = 10, 8, 64
 
 
 def main(out: Path) -> None:
-    """Writes the part's elevation in metres, each cell the mean of four."""
+    """Writes the elevation of the part in metres; each cell is the mean of four."""
     terrain, transform = projected_terrain()
     rows, columns = (slice(2 * first, 2 * (first + SIDE)) for first in (TOP, LEFT))
     part = terrain[rows, columns].reshape(SIDE, 2, SIDE, 2).mean(axis=(1, 3))
@@ -32,10 +32,10 @@ def main(out: Path) -> None:
 
 
 def projected_terrain() -> tuple[np.ndarray, rasterio.Affine]:
-    """Elevation in metres on square cells, and where they are."""
+    """Returns the elevation in metres on square cells, and their transform to the projection."""
     file = cbook.get_sample_data("jacksboro_fault_dem.npz")
     elevation = file["elevation"].astype(np.float32)
-    # The file has the northern edge as `ymin`.
+    # The file stores the northern edge as `ymin`.
     west, north, east, south = (float(file[key]) for key in ("xmin", "ymin", "xmax", "ymax"))
     rows, columns = elevation.shape
     bounds = (west, south, east, north)

@@ -497,7 +497,7 @@ def belief_kinds() -> list[tuple[str, str]]:
     """Returns the name and a description of each kind of belief that frames correct."""
 
 def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
-    """Applies Bayes' rule in place: `(S, n, H, W)`, `(S, O)` and `(n, H, W)`."""
+    """Applies Bayes' rule to `beliefs` in place; shapes `(S, n, H, W)`, `(S, O)`, `(n, H, W)`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
     """Returns how often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
@@ -538,5 +538,5 @@ class MeritTally:
 def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
     """Checks one integer below `n_choices` for each row, and returns them as bytes.
 
-    None if the argument is not a plain array of such integers.
+    None if the argument is not a plain array, or not valid.
     """

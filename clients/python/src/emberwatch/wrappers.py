@@ -45,7 +45,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
     - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S). This is an image for
-      convolutional policies, such as those of Stable-Baselines3.
+      convolutional policies, for example in Stable-Baselines3.
     - ``keep=True``: a `Dict` of the original observations (a single frame as ``"frame"``) and
       ``"belief"``.
 

@@ -24,7 +24,7 @@ def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 
 
 def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """Returns equal probabilities of all states, (S, H, W), as in the authors' demonstration."""
+    """Returns equal probabilities of all states, (S, H, W), as in the paper's demonstration."""
     return np.full((model.n_states, height, width), 1.0 / model.n_states)
 
 

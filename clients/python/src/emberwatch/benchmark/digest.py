@@ -236,7 +236,7 @@ def _is_data(value: object) -> bool:
 
 
 def _is_installed(module: object) -> bool:
-    """Returns whether a module is in a library or this package, whose names identify the code."""
+    """Returns whether code belongs to a library or this package, where names identify it."""
     root = str(module).partition(".")[0]
     file = getattr(sys.modules.get(str(module)), "__file__", None)
     if not isinstance(file, str):

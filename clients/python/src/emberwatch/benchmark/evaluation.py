@@ -69,7 +69,7 @@ def evaluate(
     progress: TextIO | None = sys.stderr,
     **keywords: Any,
 ) -> list[Row]:
-    """Scores a policy on several worlds. Defaults are those of `emberwatch-agent compare`.
+    """Scores a policy on several worlds, by default as `emberwatch-agent compare` does.
 
     Args:
         policy: A function that maps stacked observations of several worlds to their actions, or a
@@ -409,7 +409,7 @@ def _check(
 ) -> list[int]:
     """Checks the arguments of an evaluation; returns the seeds as a list."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise invalid("name", "a name for the table: printable text", repr(name))
+        raise invalid("name", "a name for the table", repr(name))
     if estimator is not None and (not isinstance(estimator, str) or not estimator.isprintable()):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("estimator", "a name for the table, or None", repr(estimator))
     if env not in (_MOVES, _PATHS):

@@ -55,7 +55,7 @@ class Row:
     recent_steps: int | None = None
     #: Mean share of the burning cells that count as seen.
     burning_seen_share: float | None = None
-    #: Mean of the smallest number of moves from a robot to a burning cell that does not.
+    #: Mean of the smallest number of moves from a robot to a burning cell that does not count so.
     front_distance: float | None = None
     #: Share of the grid that a robot visited at any time.
     grid_seen_share: float | None = None
@@ -71,7 +71,7 @@ class Row:
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: Each the first of the columns that files of an older release lack.
+#: The first column of each group that releases have added at the end, newest first.
 _LATER: Final = (
     "training_seconds",
     "worlds_fingerprint",

@@ -87,6 +87,6 @@ def _fix(normalize: VecNormalize) -> None:
     # A new `VecNormalize` begins with a count far below 1.
     if any(part.count < 1.0 for part in parts):
         raise InvalidArgumentError(
-            "wrap: VecNormalize has no statistics: save those of the training with its `save`, and "
-            "pass wrap=lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
+            "wrap: VecNormalize has no statistics: save the training's statistics with its `save`, "
+            "and pass wrap=lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
         )

@@ -102,7 +102,7 @@ def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
         return np.asarray(value)
     try:
         given = np.asarray(value)
-    except Exception as error:  # any type, in the library's own words: an array on a GPU, say
+    except Exception as error:  # any type, for example for an array on a GPU
         raise invalid(subject, expected, f"{type(value).__name__}: {error}") from None
     is_sequence = isinstance(value, list | tuple)
     if any(map(_is_masked, cast("list[object]", value))) if is_sequence else _is_masked(value):

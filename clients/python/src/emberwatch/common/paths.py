@@ -30,7 +30,7 @@ def local(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """Escapes characters that standard output cannot write, such as those of undecodable paths."""
+    """Escapes characters that standard output cannot write, for example in undecodable paths."""
     encoding = sys.stdout.encoding or "utf-8"
     try:
         text.encode(encoding, sys.stdout.errors or "strict")

@@ -25,7 +25,7 @@ NOTHING_TO_DRAW: Final = (
 REWARDS: Final = ("share", "team", "marginal")
 Reward: TypeAlias = Literal["share", "team", "marginal"]
 
-#: The mask of moved rows in an environment of one robot: its only row.
+#: The mask that selects the only row of an environment of one robot.
 ONE_ROW: Final = np.ones(1, np.bool_)
 
 

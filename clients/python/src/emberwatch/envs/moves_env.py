@@ -40,8 +40,8 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Observation Space
 
-    `observation` names the parts. They are the parts of `WildfireEnv`, of which `frame` and `image`
-    show the last complete path, and these:
+    `observation` names the parts: the parts of `WildfireEnv`, where `frame` and `image` show the
+    last complete path, and these:
 
     | part | space | meaning |
     |---|---|---|
@@ -219,7 +219,7 @@ class WildfireMovesEnv(WorldEnv):
 class WildfireMovesVectorEnv(WorldVectorEnv):
     """Many robots of `WildfireMovesEnv`, stepped together.
 
-    One message flies the paths of all robots that complete one. The arguments are those of
+    One message flies the paths of all robots that complete one. Takes the arguments of
     `WildfireMovesEnv`, and `num_envs`, `max_episode_steps` (in moves) and `autoreset_mode` of
     `WildfireVectorEnv`.
     """

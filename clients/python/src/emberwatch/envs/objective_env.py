@@ -147,7 +147,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     """Many worlds of `WildfireObjectiveEnv`, stepped and planned for together.
 
-    The arguments are those of `WildfireObjectiveEnv`, and `num_envs`, `max_episode_steps` and
+    Takes the arguments of `WildfireObjectiveEnv`, and `num_envs`, `max_episode_steps` and
     `autoreset_mode` of `WildfireVectorEnv`.
     """
 

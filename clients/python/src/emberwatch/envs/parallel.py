@@ -32,13 +32,13 @@ _OBSERVATIONS: Final = {"move": "local", "path": ("frame", "robot")}
 class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     """All robots of one world, as agents `robot_0`, `robot_1`, ... of PettingZoo's parallel API.
 
-    With `action="move"`, actions, observations and rewards of each agent are those of
-    `WildfireMovesEnv`; with `action="path"`, those of `WildfireEnv`. The robots begin, step and end
+    Actions, observations and rewards of each agent are the same as in `WildfireMovesEnv` with
+    `action="move"`, and as in `WildfireEnv` with `action="path"`. The robots begin, step and end
     their episodes together. Seeds, `resume`, infos and pictures work as in these environments; a
     picture shows the whole team. The action mask of each agent is in `infos[agent]["action_mask"]`,
     or in the observation if `observation` names it. PettingZoo's tools read both.
 
-    The arguments, all by keyword, are those of these environments, and:
+    Takes the arguments of these environments, all by keyword, and:
 
     * `robots`: number of robots (2); a `task` or the server of `instance` determines it.
     * `action`: `"move"`, a `Discrete(4)` (the default), or `"path"`, a `MultiDiscrete([4] * T)`.

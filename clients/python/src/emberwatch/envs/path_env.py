@@ -216,11 +216,11 @@ class WildfireEnv(WorldEnv):
 class WildfireVectorEnv(WorldVectorEnv):
     """Many robots of `WildfireEnv`, stepped together: all robots of one or more worlds.
 
-    Observations, rewards, episode ends and infos equal, field by field, those of Gymnasium's
+    Observations, rewards, episode ends and infos are the same, field by field, as from Gymnasium's
     `SyncVectorEnv` of single environments with the same seeds, in all three autoreset modes. World
     i of `reset(seed=s)` has seed s + i. `options={"reset_mask": mask}` resets only some worlds.
 
-    The arguments are those of `WildfireEnv`, and:
+    Takes the arguments of `WildfireEnv`, and:
 
     * `num_envs`: number of robots, a multiple of `robots`. None: the robots of one world.
     * `robots`: number of robots of each world (1). They begin and end their episodes together.

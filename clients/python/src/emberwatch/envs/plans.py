@@ -47,7 +47,7 @@ class Plans:
         checkpoint: str | PathLike[str] | None,
         prior: FirstBelief,
     ) -> None:
-        """Checks the arguments, which are those of `WildfireObjectiveEnv`."""
+        """Checks the arguments, which `WildfireObjectiveEnv` explains."""
         if session.settings.robot is not None or session.spec.n_robots > 1:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one robot"

@@ -58,8 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
         description="Make a model file with zones from rasters: GeoTIFF (.tif), ESRI ASCII grid "
-        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md describes all rules, "
-        "docs/model-file.md the formula.",
+        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/land.md describes the rules and "
+        "the formula.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -38,7 +38,7 @@ class Description:
     state_colors: tuple[Color, ...]
     """One colour for each state."""
     observation_names: tuple[str, ...]
-    """One name for each observed value. In rings around the path the ring is appended, as in
+    """One name for each observed value. Names for rings around the path end in the ring, as in
     `fire ring 1`."""
     observation_colors: tuple[Color, ...]
     """One colour for each observed value."""

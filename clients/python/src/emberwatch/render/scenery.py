@@ -59,7 +59,7 @@ class Scenery:
     def tint(
         self, colors: NDArray[np.uint8], frame: NDArray[np.uint8], unobserved: Color
     ) -> NDArray[np.uint8]:
-        """Replaces the colours (H, W, 3) of unobserved cells of a frame by those of their zones."""
+        """Returns the colours (H, W, 3) of a frame, with zone colours in unobserved cells."""
         if self.zones is None:
             return colors
         tints = np.array(self.tints(unobserved), np.uint8)[self.zones]
