@@ -233,5 +233,5 @@ def test_worlds_that_do_not_fit_an_evaluation_are_refused(states: Path) -> None:
         evaluate(walk(0), name="mine", **(keywords | {"steps": 13}))
     running = server(worlds=1, robots=4, height=7, width=9, moves=6, model=LIVELY, burn_in=60)
     keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
-    with refuses("robots: expected 4"):
+    with refuses("robots: expected the server.s 4"):
         evaluate(walk(0), name="mine", **keywords)

@@ -237,9 +237,9 @@ IMPOSSIBLE_VECTORS: list[tuple[dict[str, Any], str]] = [
 #: Wrong keyword arguments together with `instance`, for a server of two worlds.
 OTHER_THAN_SERVED: list[tuple[dict[str, Any], str]] = [
     ({"height": 8}, "height: expected the server's 7, or None, got 8"),
-    ({"width": 8}, "width: expected 5, .* got 8"),
-    ({"n_moves": 5}, "n_moves: expected 4, .* got 5"),
-    ({"burn_in": 51}, "burn_in: expected 50, .* got 51"),
+    ({"width": 8}, "width: expected the server's 5, .* got 8"),
+    ({"n_moves": 5}, "n_moves: expected the server's 4, .* got 5"),
+    ({"burn_in": 51}, "burn_in: expected the server's 50, .* got 51"),
     ({"model": "wildfire"}, "model: expected None"),
     ({"start": "corner"}, "start: expected None"),
     ({"world": 2}, "world: expected worlds within 0 to 1, got 2 to 2"),
