@@ -39,6 +39,9 @@ OF_REPOSITORY = re.compile(r"^All documents: .*?\n\n", re.MULTILINE | re.DOTALL)
 #: Hides the list of pages at the side of the home page.
 HOME = "---\nhide: [navigation]\n---\n\n"
 
+#: Ends each guide.
+API = "\n\n---\n\nAPI: [Python]({0}reference.md), [Rust]({0}rust.md)\n"
+
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
 #: The opening of a fence: its language, and further words that are only for tests.
 INFO = re.compile(r"\A(```\w+)[^\n]*")
@@ -127,6 +130,8 @@ def main() -> None:
             place.write_text(page_of(json.loads(path.read_text("utf-8")), path.name), "utf-8")
         elif path.suffix == ".md":
             text = linked(path.read_text("utf-8"), source, found)
+            if source.startswith("docs/") and path.stem not in {"reference", "rust"}:
+                text += API.format("../" * page.count("/"))
             home = page == "index.md"
             place.write_text(HOME + OF_REPOSITORY.sub("", text) if home else text, "utf-8")
         else:
